@@ -1,0 +1,69 @@
+"""Traverses that lie in arrays: frames or ready-made features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dejavu_torch.types import InputError, Traverse
+
+EXPECTED = (
+    "frames (N,H,W) or (N,H,W,3) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) float"
+)
+
+
+class ArrayTraverse(Traverse):
+    """Frames or features that lie in an array or tensor; a memory-mapped array is read as it goes.
+
+    Args:
+        values: uint8 frames (N,H,W) or (N,H,W,3), float frames (N,C,H,W) in [0, 1], or float
+            features (N,D).
+        name: what to call it in messages.
+
+    Raises:
+        InputError: another shape or type, or no frames.
+    """
+
+    def __init__(self, values: Tensor | np.ndarray, name: str = "the array") -> None:
+        shape, kind = tuple(values.shape), str(values.dtype).removeprefix("torch.")
+        pixels = kind == "uint8" and (len(shape) == 3 or (len(shape) == 4 and shape[3] in (1, 3)))
+        floats = kind.startswith(("float", "bfloat")) and len(shape) in (2, 4)
+        if not (pixels or floats):
+            raise InputError(f"{name} is {shape} {kind}; expected {EXPECTED}")
+        if 0 in shape:
+            raise InputError(f"{name} is {shape}, which holds nothing; expected {EXPECTED}")
+        self.name = name
+        self.length = shape[0]
+        self.values = values
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        for start in range(0, len(self.values), size):
+            part = self.values[start : start + size]
+            batch = part if isinstance(part, Tensor) else torch.from_numpy(np.array(part))
+            if batch.dtype == torch.uint8:
+                batch = batch[..., None] if batch.ndim == 3 else batch
+                batch = batch.permute(0, 3, 1, 2).float() / 255
+            elif batch.dtype != torch.float64:
+                batch = batch.float()
+            yield batch
+
+
+def read_array(path: Path) -> ArrayTraverse:
+    """An `.npy` file of frames or features, memory-mapped.
+
+    Raises:
+        InputError: not a whole .npy file, or an array of another shape or type.
+    """
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path} is no whole .npy array ({_line(error)}); expected {EXPECTED}") from error
+    return ArrayTraverse(values, str(path))
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]

@@ -1,0 +1,61 @@
+"""Writing files whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dejavu_torch.types import InputError
+
+
+def check_output_file(path: Path) -> None:
+    """Refuse early, before long work, a file that could not be written.
+
+    Raises:
+        InputError: the parent folder is missing or not writable, or the path is a folder.
+    """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected a file to write")
+    if not path.parent.is_dir():
+        raise InputError(f"{path} cannot be written: the folder {path.parent} does not exist")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"{path} cannot be written: no permission to write in {path.parent}")
+
+
+def make_output_folder(path: Path) -> None:
+    """Create the folder and its parents.
+
+    Raises:
+        InputError: the path is a file, or the folder cannot be made or written in.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path} cannot be made a folder: {error.strerror}; expected a new path") from error
+    if not os.access(path, os.W_OK):
+        raise InputError(f"no permission to write in the folder {path}")
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place only when the block ends well.
+
+    Example:
+        >>> import tempfile
+        >>> target = Path(tempfile.mkdtemp()) / "note.txt"
+        >>> with whole_file(target) as temporary:
+        ...     _ = temporary.write_text("all of it")
+        >>> target.read_text()
+        'all of it'
+    """
+    check_output_file(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"{path} was not written: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)

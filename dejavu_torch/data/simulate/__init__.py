@@ -1,0 +1,1 @@
+"""Routes that are painted rather than filmed, so that the truth is known."""

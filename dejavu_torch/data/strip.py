@@ -1,0 +1,74 @@
+"""A window slid along one long image, as the paper makes its Aerial dataset (section IV-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.folder import read_image
+from dejavu_torch.types import InputError, Traverse
+
+
+class SlidingWindow(Traverse):
+    """Frame i is the window [i * step, i * step + width) of a strip.
+
+    Args:
+        strip: (C,H,W) float in [0, 1].
+        width: width of the window, pixels.
+        step: pixels from one frame to the next.
+        name: what to call it in messages.
+
+    Raises:
+        InputError: not (C,H,W), or a window that does not fit.
+
+    Example:
+        >>> traverse = SlidingWindow(torch.rand(1, 96, 200), width=96)
+        >>> traverse.length, next(traverse.batches(64)).shape
+        (105, torch.Size([64, 1, 96, 96]))
+    """
+
+    def __init__(self, strip: Tensor, width: int, step: int = 1, name: str = "the strip") -> None:
+        if strip.ndim != 3 or not strip.is_floating_point():
+            raise InputError(f"{name} is {tuple(strip.shape)} {strip.dtype}; expected float (C,H,W)")
+        if not 1 <= width <= strip.shape[2] or step < 1:
+            raise InputError(
+                f"{name} is {strip.shape[2]} pixels long, window {width}, step {step}; "
+                f"expected a window of 1 to {strip.shape[2]} pixels and a step of at least 1"
+            )
+        self.name = name
+        self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
+        self.length = len(self.windows)
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        for part in self.windows.split(size):
+            yield part.contiguous()
+
+
+def read_strip(
+    path: Path, width: int, rows: str = "", halve: int = 0, grey: bool = False, step: int = 1
+) -> SlidingWindow:
+    """A window slid along a long image file.
+
+    Args:
+        width: width of the window, pixels after halving.
+        rows: "first:stop" of the rows to keep after halving; "" keeps all.
+        halve: how many times to halve the image with a 2 x 2 box filter.
+        grey: turn colours to luminance first.
+
+    Raises:
+        InputError: an image that cannot be read, or rows outside it.
+    """
+    strip = read_image(path)
+    if grey and strip.shape[0] == 3:
+        strip = (strip * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
+    for _ in range(halve):
+        strip = torch.nn.functional.avg_pool2d(strip, 2)
+    if rows:
+        first, _, stop = rows.partition(":")
+        if not (first.isdigit() and stop.isdigit() and int(first) < int(stop) <= strip.shape[1]):
+            raise InputError(f"{path}: rows {rows}; expected first:stop inside 0:{strip.shape[1]}")
+        strip = strip[:, int(first) : int(stop)]
+    return SlidingWindow(strip, width, step, str(path))

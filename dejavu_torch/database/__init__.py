@@ -1,0 +1,1 @@
+"""Plan + features -> compressed map."""

@@ -1,0 +1,142 @@
+"""The compressed map: layers and their templates in flat buffers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from itertools import accumulate
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.types import FrequencyLayer, InputError, Plan
+
+
+class CompressedMap(nn.Module):
+    """A route in sum(P x F) template numbers instead of N x D; the only fitted state (section III-A).
+
+    Buffers (compressed sparse rows; their size is the storage claim):
+        size: (2,) int64, places N and features D.
+        layers: (L,5) int64, period numerator, period denominator, phases, start, stop.
+        feature_ptr: (L+1,) int64, where each layer's features begin in `feature_index`.
+        feature_index: (sum F,) int32.
+        templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
+
+    Args:
+        plan: the layers.
+        templates: one (P,F) tensor per layer, as `PhaseTemplates` gives them; they may carry
+            gradients.
+        places: N, frames of the reference traverse.
+        dimension: D, features per frame.
+
+    Convention: places are 0..N-1. `load_state_dict` takes the shapes of what it loads, so an empty
+        `CompressedMap()` can receive any map.
+    """
+
+    size: Tensor
+    layers: Tensor
+    feature_ptr: Tensor
+    feature_index: Tensor
+    templates: Tensor
+
+    def __init__(
+        self, plan: Plan = (), templates: Sequence[Tensor] = (), places: int = 0, dimension: int = 0
+    ) -> None:
+        super().__init__()
+        for layer, block in zip(plan, templates, strict=True):
+            if tuple(block.shape) != (layer.phases, len(layer.features)):
+                raise InputError(
+                    f"a layer of {layer.phases} phases and {len(layer.features)} features got templates "
+                    f"{tuple(block.shape)}; expected ({layer.phases}, {len(layer.features)})"
+                )
+        rows = [(*layer.period.as_integer_ratio(), layer.phases, layer.start, layer.stop) for layer in plan]
+        index = [feature for layer in plan for feature in layer.features]
+        pointer = [0, *accumulate(len(layer.features) for layer in plan)]
+        flat = torch.cat([block.flatten() for block in templates]) if plan else torch.zeros(0)
+        device = flat.device
+        self.register_buffer("size", torch.tensor([places, dimension], device=device))
+        self.register_buffer("layers", torch.tensor(rows, dtype=torch.int64, device=device).reshape(-1, 5))
+        self.register_buffer("feature_ptr", torch.tensor(pointer, device=device))
+        self.register_buffer("feature_index", torch.tensor(index, dtype=torch.int32, device=device))
+        self.register_buffer("templates", flat)
+        self._plan: Plan | None = None
+        self.check()
+
+    @property
+    def places(self) -> int:
+        """N, the number of places."""
+        return int(self.size[0])
+
+    @property
+    def dimension(self) -> int:
+        """D, the number of features per frame."""
+        return int(self.size[1])
+
+    @property
+    def plan(self) -> Plan:
+        """The layers, rebuilt from the buffers."""
+        if self._plan is None:
+            pointer, index = self.feature_ptr.tolist(), self.feature_index.tolist()
+            self._plan = tuple(
+                FrequencyLayer(Fraction(a, b), phases, start, stop, tuple(index[pointer[j] : pointer[j + 1]]))
+                for j, (a, b, phases, start, stop) in enumerate(self.layers.tolist())
+            )
+        return self._plan
+
+    def blocks(self) -> list[Tensor]:
+        """Templates of each layer, (P,F) views of the flat buffer."""
+        sizes = [layer.phases * len(layer.features) for layer in self.plan]
+        parts = self.templates.split(sizes) if sizes else ()
+        return [part.view(layer.phases, -1) for part, layer in zip(parts, self.plan, strict=True)]
+
+    def layer_features(self) -> list[Tensor]:
+        """Feature indices of each layer, (F,) int64."""
+        sizes = self.feature_ptr.diff().tolist()
+        return list(self.feature_index.long().split(sizes)) if sizes else []
+
+    def check(self) -> None:
+        """Refuse buffers that do not fit together.
+
+        Raises:
+            InputError: naming the first disagreement.
+        """
+        problem = self._disagreement()
+        if problem:
+            raise InputError(f"the map does not fit together: {problem}")
+
+    def _disagreement(self) -> str:
+        if tuple(self.size.shape) != (2,) or self.layers.ndim != 2 or self.layers.shape[1] != 5:
+            return f"size {tuple(self.size.shape)}, layers {tuple(self.layers.shape)}; expected (2,), (L,5)"
+        pointer = self.feature_ptr.tolist()
+        if len(pointer) != len(self.layers) + 1 or pointer[0] != 0 or sorted(pointer) != pointer:
+            return f"feature_ptr does not rise from 0 over {len(self.layers)} layers"
+        if pointer[-1] != len(self.feature_index):
+            return f"{len(self.feature_index)} feature indices; expected {pointer[-1]}"
+        if bool((self.layers[:, 1] < 1).any()):
+            return "a period with a denominator below 1"
+        for layer in self.plan:  # each layer checks itself as it is built
+            if layer.stop > self.places or layer.features[-1] >= self.dimension:
+                return (
+                    f"a layer covers [{layer.start}, {layer.stop}) and feature {layer.features[-1]}; "
+                    f"expected it inside {self.places} places of {self.dimension} features"
+                )
+        numbers = sum(layer.phases * len(layer.features) for layer in self.plan)
+        if self.templates.ndim != 1 or len(self.templates) != numbers:
+            return f"templates {tuple(self.templates.shape)}; expected ({numbers},)"
+        return ""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        for name, buffer in list(self.named_buffers(recurse=False)):
+            if prefix + name in state_dict:
+                loaded = state_dict[prefix + name]
+                setattr(self, name, torch.empty_like(loaded, device=buffer.device))
+        self._plan = None
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self.check()
+
+    def extra_repr(self) -> str:
+        return (
+            f"places={self.places}, dimension={self.dimension}, layers={len(self.plan)}, "
+            f"template_numbers={self.templates.numel()}"
+        )

@@ -1,0 +1,1 @@
+"""Frames (N,C,H,W) -> features (N,D)."""

@@ -1,0 +1,80 @@
+"""Features of a traverse, batch by batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from dejavu_torch.types import InputError, Traverse
+
+
+def feature_batches(
+    traverse: Traverse,
+    module: nn.Module,
+    batch_size: int = 64,
+    device: torch.device | str = "cpu",
+    progress: str | None = None,
+) -> Iterator[Tensor]:
+    """Run the frames of a traverse through a feature module, in order, without gradients.
+
+    Args:
+        traverse: frames (B,C,H,W), or ready features (B,D), which pass as they are.
+        module: (B,C,H,W) -> (B,D). Runs in eval mode; its own mode is restored.
+        progress: text of a progress bar on stderr, shown on a terminal only; None is no bar.
+
+    Shape: yields (B,D) float.
+
+    Raises:
+        InputError: features that are not (B,D) or not finite, or no frames at all.
+    """
+    done = 0
+    training = module.training
+    bar = tqdm(
+        total=traverse.length, desc=progress, unit="frame", disable=None if progress else True, leave=False
+    )
+    try:
+        module.eval()
+        for batch in traverse.batches(batch_size):
+            with torch.no_grad():
+                features = features_of(batch.to(device), module, traverse.name)
+            bad = ~features.isfinite().all(1)
+            if bad.any():
+                first = done + int(bad.nonzero()[0])
+                raise InputError(
+                    f"{traverse.name}: frame {first} gives NaN or infinite features; expected finite numbers"
+                )
+            done += len(features)
+            bar.update(len(features))
+            yield features
+    finally:
+        bar.close()
+        module.train(training)
+    if done == 0:
+        raise InputError(f"{traverse.name} holds no frames; expected at least one")
+
+
+def features_of(batch: Tensor, module: nn.Module, name: str = "the input") -> Tensor:
+    """Features of one batch: (B,C,H,W) frames through the module, (B,D) features as they are."""
+    if batch.ndim == 2 and batch.is_floating_point():
+        return batch
+    if batch.ndim != 4 or not batch.is_floating_point():
+        raise InputError(
+            f"{name} gives batches {tuple(batch.shape)} {batch.dtype}; "
+            "expected float frames (B,C,H,W) in [0, 1] or float features (B,D)"
+        )
+    features: Tensor = module(batch)
+    if features.ndim != 2 or len(features) != len(batch):
+        raise InputError(
+            f"{type(module).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
+            f"expected features ({len(batch)}, D)"
+        )
+    return features
+
+
+def holds_features(traverse: Traverse) -> bool:
+    """Whether a traverse gives ready features (B,D) and not frames."""
+    return any(batch.ndim == 2 for batch in islice(traverse.batches(1), 1))

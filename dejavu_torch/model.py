@@ -1,0 +1,236 @@
+"""The whole method as one module; reads like section III of the paper."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.certificate import Certificate, certify
+from dejavu_torch.database.compressed import CompressedMap
+from dejavu_torch.database.mapfile import Recipe, build, map_size, read_map, recipe_of, write_map
+from dejavu_torch.database.phase import PhaseTemplates
+from dejavu_torch.features.extract import feature_batches, features_of, holds_features
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.distance import Metric
+from dejavu_torch.recognition.scores import Matcher, Reduction
+from dejavu_torch.recognition.select import best_match
+from dejavu_torch.types import InputError, Match, Traverse
+
+log = logging.getLogger("dejavu_torch")
+
+SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
+
+
+class DejaVu(nn.Module):
+    """Learn a compressed map of a route from what repeats along it, and find places on it (section III).
+
+    Args:
+        features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
+        periods: finds the layers; None is SpectrogramAnalysis with its defaults.
+        metric: distance of eq. 3, see `phase_distances`.
+        reduction: how layers combine in eq. 4, see `combine_layers`.
+        threshold: accept a match when its score is below; None accepts every finite score.
+        batch_size: frames in memory at a time.
+
+    Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
+
+    Example:
+        >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])  # two features that repeat
+        >>> model = DejaVu(periods=SpectrogramAnalysis(window=64, strongest=1)).learn(wave)
+        >>> model.localize(wave[20:22]).index
+        tensor([20, 21])
+    """
+
+    def __init__(
+        self,
+        features: nn.Module | None = None,
+        periods: PeriodFinder | None = None,
+        metric: Metric = "l1",
+        reduction: Reduction = "mean",
+        threshold: float | None = None,
+        batch_size: int = 64,
+    ) -> None:
+        super().__init__()
+        if batch_size < 1:
+            raise InputError(f"batch_size is {batch_size}; expected at least 1")
+        if threshold is not None and math.isnan(threshold):
+            raise InputError("the threshold is NaN; expected a number")
+        self.features = HOG() if features is None else features
+        self.periods = SpectrogramAnalysis() if periods is None else periods
+        self.templates = PhaseTemplates()
+        self.matcher = Matcher(metric, reduction)
+        self.threshold = threshold
+        self.batch_size = batch_size
+        self.map = CompressedMap()
+        self.ready_features = False  # the map was learnt from features made elsewhere
+
+    def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
+        """Section III-A: features, their periods, layers, and the templates of eq. 1.
+
+        Args:
+            traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
+            progress: show a progress bar on a terminal.
+
+        Returns:
+            self, with the map in `self.map`. A route in which nothing repeats gives a map without
+            layers, on which every place scores +inf.
+
+        Raises:
+            InputError: no frames, too few, NaN, or mixed sizes.
+        """
+        traverse = as_traverse(traverse)
+        features = self.extract_all(traverse, "learning" if progress else None)
+        return self.learn_features(features, ready=holds_features(traverse))
+
+    def learn_features(self, features: Tensor, ready: bool = False) -> DejaVu:
+        """As `learn`, from features that are there already.
+
+        Args:
+            features: (N,D) float.
+            ready: they were made elsewhere, not by `self.features`; the map then refuses frames.
+        """
+        plan = self.periods.plan(features)
+        with torch.no_grad():
+            templates = self.templates(features, plan)
+        self.map = CompressedMap(plan, templates, *features.shape).to(features.device)
+        self.ready_features = ready
+        return self
+
+    def forward(self, queries: Tensor) -> Tensor:
+        """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
+        self._require_map()
+        scores: Tensor = self.matcher(features_of(queries, self.features, "the query"), self.map)
+        return scores
+
+    def localize(self, queries: Traverse | Tensor, progress: bool = False) -> Match:
+        """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
+
+        Args:
+            queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D).
+
+        Shape: -> Match of (Q,) on the CPU.
+
+        Raises:
+            InputError: no map, no frames, NaN, or features of another dimension than the map's.
+        """
+        matches = list(self.matches(queries, progress))
+        return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
+
+    def matches(self, queries: Traverse | Tensor, progress: bool = False) -> Iterator[Match]:
+        """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
+        self._require_map()
+        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
+        queries = as_traverse(queries)
+        if self.ready_features and not holds_features(queries):
+            raise InputError(
+                f"{queries.name} holds frames, but the map was learnt from ready features; "
+                f"expected features (Q, {self.map.dimension})"
+            )
+        for features in self.extract(queries, "localizing" if progress else None):
+            for part in features.split(at_once):
+                with torch.no_grad():
+                    match = best_match(self.matcher(part, self.map), self.threshold)
+                yield Match(*(column.cpu() for column in match))
+
+    def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
+        """Features of a traverse in batches (B,D), without gradients."""
+        return feature_batches(traverse, self.features, self.batch_size, self.map.size.device, progress)
+
+    def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
+        """Features of a whole traverse, (N,D)."""
+        return torch.cat(list(self.extract(traverse, progress)))
+
+    def save(self, path: str | Path) -> None:
+        """Write the map, with the feature module's weights, as one safetensors file.
+
+        Raises:
+            InputError: nothing learnt yet, or the file cannot be written.
+        """
+        self._require_map()
+        write_map(Path(path), *self._file())
+
+    @classmethod
+    def load(cls, path: str | Path, features: nn.Module | None = None) -> DejaVu:
+        """Read a map file.
+
+        Args:
+            features: the module that made the map's features, needed where it is not one of this
+                package; its weights come from the file.
+
+        Raises:
+            InputError: missing, truncated, foreign or newer file, or other features than the map's.
+        """
+        tensors, header = read_map(Path(path))
+        try:
+            made_by = Recipe(**header["features"])
+            found_by = Recipe(**header["periods"])
+            settings = {name: header[name] for name in ("metric", "reduction", "threshold", "batch_size")}
+            ready = bool(header["ready_features"])
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                f"{path} has a header without {error}; expected a map of `dejavu learn`"
+            ) from error
+        if features is None:
+            features = build(made_by)
+        elif recipe_of(features).class_path != made_by.class_path:
+            raise InputError(
+                f"{path} was learnt with {made_by.class_path}; got {recipe_of(features).class_path}"
+            )
+        # only learning needs what found the periods: one from elsewhere need not be built
+        periods = build(found_by) if found_by.class_path.startswith("dejavu_torch.") else None
+        if not isinstance(periods, PeriodFinder | None):
+            raise InputError(f"{path} names {found_by.class_path} as period finder, which it is not")
+        model = cls(features, periods, **settings)
+        try:
+            model.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise InputError(f"{path} does not fit its modules: {' '.join(str(error).split())}") from error
+        model.ready_features = ready
+        return model
+
+    @property
+    def map_bytes(self) -> int:
+        """Size of the map file: all that `localize` needs beyond the installed package."""
+        return map_size(*self._file())
+
+    @property
+    def backbone_bytes(self) -> int:
+        """The part of `map_bytes` that is weights of the feature module."""
+        return sum(t.numel() * t.element_size() for t in self.features.state_dict().values())
+
+    @property
+    def certificate(self) -> Certificate:
+        """What the map can tell apart and what it costs."""
+        return certify(self.map.plan, self.map.places, self.map_bytes)
+
+    def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        if callable(self.matcher.metric):
+            raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
+        header = {
+            "features": recipe_of(self.features)._asdict(),
+            "periods": recipe_of(self.periods)._asdict(),
+            "metric": self.matcher.metric,
+            "reduction": self.matcher.reduction,
+            "threshold": self.threshold,
+            "batch_size": self.batch_size,
+            "ready_features": self.ready_features,
+        }
+        return self.state_dict(), header
+
+    def _require_map(self) -> None:
+        if not self.map.places:
+            raise InputError("there is no map yet; expected learn(...) or load(...) first")
+
+
+def as_traverse(source: Traverse | Tensor) -> Traverse:
+    """A tensor of frames or features as a traverse; a traverse as it is."""
+    return source if isinstance(source, Traverse) else ArrayTraverse(source)

@@ -1,0 +1,1 @@
+"""Features -> which of them repeat, where, and how often."""

@@ -1,0 +1,223 @@
+"""The spectrogram of each feature through time and the periods read off it (section III-A)."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.periods.layers import cluster_layers
+from dejavu_torch.periods.stft import Spectrogram
+from dejavu_torch.types import InputError, Plan
+
+log = logging.getLogger("dejavu_torch")
+
+
+class Spectrum(NamedTuple):
+    """Power of every feature at every frequency of one chunk [start, stop), n = stop - start frames.
+
+    power: (n // 2 + 1, D); bin k is the frequency k / n per frame, the period n / k frames.
+    """
+
+    start: int
+    stop: int
+    power: Tensor
+
+
+def bin_period(length: int, k: int) -> int:
+    """Period, in whole frames, of bin k of a spectrum over `length` frames: round(length / k).
+
+    Example:
+        >>> bin_period(1024, 11), bin_period(1024, 6)  # the paper's two periods
+        (93, 171)
+    """
+    return (2 * length + k) // (2 * k)
+
+
+def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", "local"]) -> Tensor:
+    """The `count` strongest bins of each feature among bins 2..last, strongest first (section III-A).
+
+    Args:
+        power: (K,D) power of each bin and feature.
+        count: how many bins per feature.
+        last: the largest bin allowed, that is the shortest period.
+        peaks: "bins" ranks all bins by power; "local" ranks only local maxima, so that a peak and
+            its own leakage into the next bin are not taken for two periods.
+
+    Shape: (K,D) -> (count,D) int64, -1 where a feature has no more such bins.
+
+    Convention: a bin without power is no candidate; of equal bins the lower one wins.
+    """
+    bins, features = power.shape
+    candidates = torch.zeros_like(power, dtype=torch.bool)
+    candidates[2 : last + 1] = power[2 : last + 1] > 0
+    if peaks == "local":
+        beyond = torch.cat([power[1:], power.new_full((1, features), -math.inf)])
+        before = torch.cat([power.new_full((1, features), -math.inf), power[:-1]])
+        candidates &= (power > before) & (power >= beyond)
+    ranked = power.masked_fill(~candidates, -math.inf)
+    order = ranked.argsort(dim=0, descending=True, stable=True)[:count]
+    found = order.masked_fill(~candidates.gather(0, order), -1)
+    return nn.functional.pad(found, (0, 0, 0, max(0, count - bins)), value=-1)
+
+
+def noise_share(bins: int, features: int, false_alarm: float) -> float:
+    """Share of its power that a feature of white noise holds in one bin only by a rare accident.
+
+    Fisher's test for a hidden period: the largest of K shares exceeds g with a probability of at
+    most K * (1 - g)**(K - 1); Bonferroni's bound over the D features of a chunk.
+
+    Args:
+        bins: K, bins the power is shared among. features: D.
+        false_alarm: accepted probability that any feature of a chunk of pure noise exceeds it.
+
+    Source: R. A. Fisher, Tests of significance in harmonic analysis, Proc. R. Soc. A 125 (1929).
+
+    Example:
+        >>> round(noise_share(512, 1764, 1e-3), 3)
+        0.04
+    """
+    return float(1 - (false_alarm / (bins * features)) ** (1 / max(bins - 1, 1)))
+
+
+class SpectrogramAnalysis(PeriodFinder):
+    """Which features repeat, where and how often, by the spectrogram of each (section III-A).
+
+    Args:
+        window: frames per spectrum, which is also the length of a chunk.
+        hop: frames from one chunk to the next; None is `window`, chunks side by side.
+        min_period: shortest period considered, frames. The longest is half the window (bin 2):
+            bins 0 and 1 hold the mean and its leakage through the Hann window.
+        strongest: how many of its strongest frequencies a feature keeps.
+        peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
+        false_alarm: a frequency is kept only where its share of the feature's power is more than
+            white noise would show anywhere in the chunk with this probability (`noise_share`), so
+            that a route in which nothing repeats gets no layers. None keeps every frequency (the
+            paper).
+        similar: features share a layer when their frequencies lie within this many bins of the
+            layer's most common period; 0 means the same rounded period (the paper).
+        short: what to do with a traverse shorter than the window: "shrink" the window to the
+            traverse and log it, or "refuse".
+
+    Shape: features (N,D) -> tuple of G spectra, one for each chunk, each (n // 2 + 1, D).
+
+    Convention: Hann window, not centred. What remains after the last whole window is a shorter
+        window of its own; a remainder under two of the shortest periods can show none and is left
+        out. A feature that does not vary inside a chunk has no power there.
+
+    Raises:
+        InputError: not (N,D), not finite, fewer than two of the shortest periods, or a traverse
+            shorter than the window where `short` is "refuse".
+
+    Example:
+        >>> wave = torch.sin(torch.arange(256) * 2 * torch.pi / 32)[:, None]
+        >>> [(layer.period, layer.stop) for layer in SpectrogramAnalysis(256, strongest=1).plan(wave)]
+        [(Fraction(32, 1), 256)]
+    """
+
+    def __init__(
+        self,
+        window: int = 1024,
+        hop: int | None = None,
+        min_period: int = 8,
+        strongest: int = 2,
+        peaks: Literal["local", "bins"] = "local",
+        false_alarm: float | None = 1e-3,
+        similar: float = 0.0,
+        short: Literal["shrink", "refuse"] = "shrink",
+    ) -> None:
+        super().__init__()
+        if min_period < 2 or window < 2 * min_period or strongest < 1:
+            raise InputError(
+                f"spectrogram got window={window}, min_period={min_period}, strongest={strongest}; "
+                "expected min_period >= 2, window >= 2 * min_period, strongest >= 1"
+            )
+        if hop is not None and not 1 <= hop <= window:
+            raise InputError(f"spectrogram got hop={hop}; expected 1..{window} (the window)")
+        if peaks not in ("local", "bins") or short not in ("shrink", "refuse") or similar < 0:
+            raise InputError(
+                f"spectrogram got peaks={peaks!r}, short={short!r}, similar={similar}; expected peaks "
+                "'local' or 'bins', short 'shrink' or 'refuse', similar >= 0"
+            )
+        if false_alarm is not None and not 0 < false_alarm < 1:
+            raise InputError(
+                f"spectrogram got false_alarm={false_alarm}; expected None or a number in (0, 1)"
+            )
+        self.window = window
+        self.hop = hop
+        self.min_period = min_period
+        self.strongest = strongest
+        self.peaks = peaks
+        self.false_alarm = false_alarm
+        self.similar = similar
+        self.short = short
+
+    def chunks(self, frames: int) -> list[tuple[int, int]]:
+        """The chunks [start, stop) that a traverse of `frames` frames is cut into."""
+        shortest = 2 * self.min_period
+        if frames < shortest:
+            raise InputError(
+                f"the traverse has {frames} frame{'s' * (frames != 1)}; expected at least {shortest}, "
+                f"two periods of {self.min_period}"
+            )
+        window = self.window
+        if frames < window:
+            if self.short == "refuse":
+                raise InputError(f"the traverse has {frames} frames; expected at least {window}, the window")
+            log.warning("window shrunk from %d to %d frames, the whole traverse", window, frames)
+            window = frames
+        hop = min(self.hop or window, window)
+        starts = range(0, frames - window + 1, hop)
+        chunks = [(start, start + window) for start in starts]
+        rest = chunks[-1][1] if hop == window else starts[-1] + hop
+        if chunks[-1][1] < frames and frames - rest >= shortest:
+            chunks.append((rest, frames))
+        return chunks
+
+    def forward(self, features: Tensor) -> tuple[Spectrum, ...]:
+        if features.ndim != 2 or not features.is_floating_point():
+            raise InputError(
+                f"spectrogram got {tuple(features.shape)} {features.dtype}; expected float features (N,D)"
+            )
+        if not features.isfinite().all():
+            raise InputError("spectrogram got features that are not finite; expected finite numbers")
+        return tuple(
+            Spectrum(start, stop, _power(features[start:stop])) for start, stop in self.chunks(len(features))
+        )
+
+    def plan(self, features: Tensor) -> Plan:
+        """The layers of a traverse, the one place where gradients stop.
+
+        Shape: features (N,D) -> plan, ordered by chunk and then by period.
+        """
+        with torch.no_grad():
+            layers = []
+            for start, stop, power in self(features.detach()):
+                length = stop - start
+                bins = strongest_bins(power, self.strongest, length // self.min_period, self.peaks)
+                if self.false_alarm is not None:
+                    share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
+                    least = noise_share(len(power) - 1, power.shape[1], self.false_alarm)
+                    bins = bins.masked_fill(~(share > least), -1)
+                layers += cluster_layers(bins, start, stop, self.similar)
+            return tuple(layers)
+
+    def extra_repr(self) -> str:
+        names = ("window", "hop", "min_period", "strongest", "peaks", "false_alarm", "similar", "short")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+
+
+def _power(chunk: Tensor) -> Tensor:
+    """Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
+    length = len(chunk)
+    centred = chunk - chunk.mean(0)
+    # rounding leaves a constant feature a trace of power: zero it, or noise would name its period
+    constant = centred.abs().amax(0) <= 1e-6 * chunk.abs().amax(0)
+    centred = centred.masked_fill(constant, 0.0)
+    transform = Spectrogram(n_fft=length, hop_length=length, center=False, power=2.0)
+    power: Tensor = transform.to(chunk)(centred.T)[..., 0].T
+    return power

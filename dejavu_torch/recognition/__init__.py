@@ -1,0 +1,1 @@
+"""Query features + compressed map -> place."""

@@ -1,0 +1,70 @@
+"""Distance of a query to every phase of a layer (section III-B, eq. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.types import InputError
+
+Metric = str | Callable[[Tensor, Tensor], Tensor]
+
+
+def _l1(query: Tensor, templates: Tensor) -> Tensor:
+    return torch.cdist(query, templates, p=1.0)
+
+
+def _l2(query: Tensor, templates: Tensor) -> Tensor:
+    # the matrix-product form loses the small distances that decide a match
+    return torch.cdist(query, templates, p=2.0, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _cosine(query: Tensor, templates: Tensor) -> Tensor:
+    unit = torch.nn.functional.normalize
+    return 1 - unit(query, dim=-1) @ unit(templates, dim=-1).T
+
+
+METRICS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"l1": _l1, "l2": _l2, "cosine": _cosine}
+
+
+def check_metric(metric: Metric) -> None:
+    """Refuse a metric that is neither known by name nor callable.
+
+    Raises:
+        InputError: naming what is known.
+    """
+    if not callable(metric) and metric not in METRICS:
+        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(METRICS)} or a callable")
+
+
+def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> Tensor:
+    """Distance of each query to the template of each phase: eq. 3 for all k at once.
+
+    Args:
+        query: H, the *query's* values of the layer's features.
+        templates: mu(H, tau, k).
+        metric: "l1" (the paper: sum over features of |H - mu|), "l2" (Euclidean), "cosine"
+            (1 - cosine similarity), or a callable (Q,F), (P,F) -> (Q,P).
+
+    Shape: (Q,F), (P,F) -> (Q,P).
+
+    Convention: computed in float32 whatever the autocast (float64 stays float64). Nothing of
+        Q x P x F is built.
+
+    Example:
+        >>> phase_distances(torch.tensor([[1.0, 2.0]]), torch.tensor([[1.0, 2.0], [0.0, 4.0]]))
+        tensor([[0., 3.]])
+    """
+    check_metric(metric)
+    function = metric if callable(metric) else METRICS[metric]
+    dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
+    with torch.autocast(query.device.type, enabled=False):
+        distances = function(query.to(dtype), templates.to(dtype))
+    if distances.shape != (len(query), len(templates)):
+        raise InputError(
+            f"the metric gave {tuple(distances.shape)} for {len(query)} queries and {len(templates)} "
+            f"phases; expected ({len(query)}, {len(templates)})"
+        )
+    return distances

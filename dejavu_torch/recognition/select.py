@@ -1,0 +1,36 @@
+"""The best place and whether to believe it (section III-C, eq. 5 and eq. 6)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.types import InputError, Match
+
+
+def best_match(scores: Tensor, threshold: float | None = None) -> Match:
+    """b = argmin_i S(i) (eq. 5), accepted where S(b) < threshold (eq. 6).
+
+    Args:
+        scores: S, lower is better.
+        threshold: None accepts every query with a finite score.
+
+    Shape: (Q,N) -> Match of (Q,).
+
+    Convention: S is a difference, so a match is *below* the threshold: the text of section III-C,
+        not eq. 6 as printed. Of equal scores the lowest place wins. A query whose best score is
+        +inf reports nothing: place -1, not accepted.
+
+    Raises:
+        InputError: not (Q,N) with N >= 1.
+
+    Example:
+        >>> best_match(torch.tensor([[3.0, 1.0, 1.0], [2.0, 4.0, 9.0]]), threshold=2.0)
+        Match(index=tensor([1, 0]), score=tensor([1., 2.]), accepted=tensor([ True, False]))
+    """
+    if scores.ndim != 2 or scores.shape[1] < 1:
+        raise InputError(f"scores are {tuple(scores.shape)}; expected (Q,N) with N >= 1")
+    score, index = scores.min(1)
+    found = score.isfinite()
+    accepted = found if threshold is None else found & (score < threshold)
+    return Match(torch.where(found, index, -1), score, accepted)

@@ -1,0 +1,112 @@
+"""The data that crosses a room boundary, and its validation. Nothing here computes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class InputError(ValueError):
+    """Bad input, told in one line: what was seen and what was expected."""
+
+
+class Traverse(ABC):
+    """Frames along a route, in order, read in batches: never all of them in memory.
+
+    A traverse can be iterated any number of times and yields the same values each time,
+    whatever the batch size.
+
+    Attributes:
+        name: what to call it in messages, a path or a `sim:` address.
+        length: number of frames N, or None where only reading to the end can tell.
+        place: (N,) float64, the true position of each frame in units of reference frames,
+            or None where it is unknown.
+    """
+
+    name: str = "traverse"
+    length: int | None = None
+    place: Tensor | None = None
+
+    @abstractmethod
+    def batches(self, size: int) -> Iterator[Tensor]:
+        """Yield the frames in order, at most `size` at a time.
+
+        Shape: each batch is (B,C,H,W) float32 in [0,1], or (B,D) float where the traverse
+        holds ready-made features.
+        """
+
+
+@dataclass(frozen=True)
+class FrequencyLayer:
+    """Features that repeat with one period inside one chunk of the route (section III-A).
+
+    Args:
+        period: tau, in frames; any positive rational, for example 93 or Fraction(195, 2).
+        phases: P, the number of templates per feature. The paper's case is phases = period.
+        start, stop: the chunk [start, stop) in reference frames.
+        features: the indices of the features that take part, increasing.
+
+    Convention: frames count from 0 and phase(i) = floor((i mod period) * phases / period)
+    counts from absolute frame 0, not from the start of the chunk.
+    """
+
+    period: Fraction
+    phases: int
+    start: int
+    stop: int
+    features: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "period", Fraction(self.period))
+        if self.period <= 0 or self.phases < 1:
+            raise InputError(
+                f"a layer has period {self.period} and {self.phases} phases; expected period > 0, phases >= 1"
+            )
+        if not 0 <= self.start < self.stop:
+            raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
+        ascending = all(a < b for a, b in pairwise(self.features))
+        if not self.features or self.features[0] < 0 or not ascending:
+            raise InputError(
+                "a layer's feature indices must be non-empty, non-negative and strictly increasing"
+            )
+
+    def phase(self, frames: Tensor) -> Tensor:
+        """Phase of each frame, in exact integer arithmetic. (n,) int64 -> (n,) int64 in 0..P-1."""
+        a, b = self.period.numerator, self.period.denominator
+        return (frames * b).remainder(a) * self.phases // a
+
+    @property
+    def place_phases(self) -> Tensor:
+        """Phase of every frame of the chunk, (stop - start,) int64."""
+        return self.phase(torch.arange(self.start, self.stop))
+
+
+Plan = tuple[FrequencyLayer, ...]
+
+
+class Match(NamedTuple):
+    """Where each query was found (eq. 5) and whether to believe it (eq. 6).
+
+    index: (Q,) int64, the reported place, -1 where no place has a finite score.
+    score: (Q,) float, the lowest S; lower is better, +inf where nothing covers.
+    accepted: (Q,) bool, score below the threshold.
+    """
+
+    index: Tensor  # type: ignore[assignment]  # the field shadows tuple.index
+    score: Tensor
+    accepted: Tensor
+
+
+class PRCurve(NamedTuple):
+    """Precision and recall when every query with score <= threshold reports; each (T,) float64."""
+
+    precision: Tensor
+    recall: Tensor
+    threshold: Tensor

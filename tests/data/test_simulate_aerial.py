@@ -1,0 +1,204 @@
+"""The painted route: what repeats, what does not, and what two flights share."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.data.simulate.aerial import (
+    CHEVRON_PERIOD,
+    DASH_PERIOD,
+    HEIGHT,
+    MARGIN,
+    VIEW,
+    AerialRoad,
+    paint_route,
+    road_markings,
+)
+from dejavu_torch.types import InputError, Traverse
+
+FRAMES = 600
+
+
+def film(road: Traverse, batch: int = 64) -> Tensor:
+    return torch.cat(list(road.batches(batch)))
+
+
+def looks(frames: Tensor) -> Tensor:
+    """Grey frames at a quarter of the size, each with mean 0 and norm 1, (N,D)."""
+    grey = F.avg_pool2d(frames.mean(1, keepdim=True), 4).flatten(1)
+    return F.normalize(grey - grey.mean(1, keepdim=True), dim=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Many small operations: on a busy machine two threads mostly wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def flights() -> tuple[Tensor, Tensor]:
+    return film(AerialRoad(seed=3, traverse=0, frames=FRAMES)), film(
+        AerialRoad(seed=3, traverse=1, frames=FRAMES)
+    )
+
+
+def test_a_road_describes_itself() -> None:
+    road = AerialRoad(seed=2, traverse=1, frames=50)
+    assert road.name == "sim:aerial?seed=2&traverse=1&frames=50"
+    assert AerialRoad(frames=5, size=32).name == "sim:aerial?seed=0&traverse=0&frames=5&size=32"
+    assert road.length == 50
+    assert torch.equal(road.place, torch.arange(50, dtype=torch.float64))
+
+
+def test_frames_have_the_promised_shape_and_range(flights: tuple[Tensor, Tensor]) -> None:
+    for frames in flights:
+        assert frames.shape == (FRAMES, 3, 64, 64)
+        assert frames.dtype == torch.float32
+        assert frames.min() >= 0
+        assert frames.max() <= 1
+        assert frames.std() > 0.1
+
+
+def test_batches_hold_at_most_size_frames() -> None:
+    assert [len(batch) for batch in AerialRoad(frames=20).batches(8)] == [8, 8, 4]
+
+
+@pytest.mark.parametrize("traverse", [0, 1])
+def test_frames_do_not_depend_on_the_batch_size(traverse: int) -> None:
+    road = AerialRoad(seed=5, traverse=traverse, frames=70)
+    whole = film(road, 70)
+    for batch in (1, 7, 64, 1000):
+        assert torch.equal(film(road, batch), whole)
+
+
+def test_the_same_arguments_give_the_same_frames_and_others_do_not() -> None:
+    first = film(AerialRoad(seed=1, traverse=1, frames=30))
+    assert torch.equal(film(AerialRoad(seed=1, traverse=1, frames=30)), first)
+    assert not torch.allclose(film(AerialRoad(seed=2, traverse=1, frames=30)), first, atol=0.1)
+    assert not torch.allclose(film(AerialRoad(seed=1, traverse=2, frames=30)), first, atol=0.1)
+
+
+def test_the_route_is_painted_from_the_seed_alone() -> None:
+    image = paint_route(100, seed=4)
+    assert image.shape == (3, HEIGHT, 100 + VIEW + 2 * MARGIN)
+    assert image.min() >= 0
+    assert image.max() <= 1
+    assert torch.equal(paint_route(100, seed=4), image)
+    assert not torch.allclose(paint_route(100, seed=5), image, atol=0.1)
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_markings_repeat_exactly_and_no_sooner(scale: int) -> None:
+    for mask, period in zip(road_markings(800, scale), (DASH_PERIOD, CHEVRON_PERIOD), strict=True):
+        assert mask.shape == (HEIGHT * scale, 800 * scale)
+        assert mask.max() == 1
+        assert mask.min() == 0
+        same = [lag for lag in range(1, 400) if torch.equal(mask[:, lag * scale :], mask[:, : -lag * scale])]
+        assert same == list(range(period, 400, period))
+    assert (DASH_PERIOD, CHEVRON_PERIOD) == (93, 171)
+
+
+def test_markings_stand_out_in_the_painted_image() -> None:
+    image = paint_route(FRAMES, seed=6).mean(0)
+    for mask in road_markings(image.shape[1]):
+        rows = mask.amax(1) == 1
+        marked, bare = (image[rows][here[rows]] for here in (mask == 1, mask == 0))
+        assert marked.mean() > bare.mean() + 0.3
+
+
+def test_the_camera_moves_one_column_per_frame() -> None:
+    frames = film(AerialRoad(frames=40, noise=0, drift=0, yaw=0))
+    assert torch.allclose(frames[1:, :, :, :-1], frames[:-1, :, :, 1:], atol=0.02)
+
+
+@pytest.mark.parametrize(("period", "rows"), [(DASH_PERIOD, slice(22, 27)), (CHEVRON_PERIOD, slice(27, 35))])
+def test_the_frames_show_both_periods(period: int, rows: slice, flights: tuple[Tensor, Tensor]) -> None:
+    for frames in flights:
+        lane = frames.mean(1)[:, rows].mean(1)
+        lane = F.normalize(lane - lane.mean(1, keepdim=True), dim=1)
+        lags = range(period - 40, period + 41)
+        likeness = torch.stack([(lane[lag:] * lane[:-lag]).sum(1).median() for lag in lags])
+        assert abs(lags[int(likeness.argmax())] - period) <= 1
+
+
+def test_two_flights_see_the_same_route(flights: tuple[Tensor, Tensor]) -> None:
+    first, second = (looks(frames) for frames in flights)
+    same = (first * second).sum(1)
+    shuffled = (first * second.roll(FRAMES // 3, 0)).sum(1)
+    assert same.mean() > shuffled.mean() + 0.3
+    found = (second @ first.T).argmax(1)
+    assert ((found - torch.arange(FRAMES)).abs() <= 3).float().mean() > 0.6
+
+
+def test_two_flights_have_light_and_vehicles_of_their_own(flights: tuple[Tensor, Tensor]) -> None:
+    first, second = flights
+    assert (first.mean((2, 3)) - second.mean((2, 3))).abs().mean() > 0.03
+    still = [film(AerialRoad(seed=3, traverse=t, frames=FRAMES, noise=0, drift=0, yaw=0)) for t in (0, 1)]
+    grey = [
+        looks(frames).view(FRAMES, 16, 16)[:, 3:9] for frames in still
+    ]  # the road, after any change of light
+    assert ((grey[0] - grey[1]).abs().amax((1, 2)) > 0.1).float().mean() > 0.2
+
+
+def test_noise_has_the_promised_strength_and_differs_in_every_frame() -> None:
+    noise = [
+        film(AerialRoad(traverse=t, frames=40, noise=0.02)) - film(AerialRoad(traverse=t, frames=40, noise=0))
+        for t in (0, 1)
+    ]
+    for values in noise:
+        assert values.std() == pytest.approx(0.02, rel=0.05)
+    flat = F.normalize(torch.cat(noise).flatten(1), dim=1)
+    assert (flat @ flat.T - torch.eye(80)).abs().max() < 0.1
+
+
+def test_a_smaller_frame_shows_the_same_view() -> None:
+    quiet = [film(AerialRoad(frames=10, size=size, noise=0)) for size in (64, 32, 128)]
+    assert quiet[1].shape == (10, 3, 32, 32)
+    assert quiet[2].shape == (10, 3, 128, 128)
+    assert torch.allclose(F.avg_pool2d(quiet[0], 2), quiet[1], atol=0.02)
+    assert (F.avg_pool2d(quiet[2], 2) - quiet[0]).abs().mean() < 0.02
+
+
+def test_one_frame_is_a_route() -> None:
+    assert film(AerialRoad(frames=1)).shape == (1, 3, 64, 64)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"frames": 0}, r"frames=0; expected 1 <= frames"),
+        ({"frames": 10**6}, r"frames=1000000; expected 1 <= frames <= 32768"),
+        ({"seed": -1}, r"seed=-1; expected 0 <= seed"),
+        ({"traverse": -1}, r"traverse=-1; expected 0 <= traverse"),
+        ({"size": 8}, r"size=8; expected 16 <= size <= 256"),
+        ({"noise": -0.1}, r"noise=-0\.1; expected 0 <= noise <= 1"),
+        ({"noise": float("nan")}, r"noise=nan; expected"),
+        ({"drift": 20.0}, r"drift=20\.0; expected 0 <= drift <= 8"),
+        ({"yaw": -2.0}, r"yaw=-2\.0; expected 0 <= yaw <= 5"),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(arguments: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        AerialRoad(**arguments)  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+
+
+def test_an_empty_batch_is_refused() -> None:
+    with pytest.raises(InputError, match="0 frames; expected at least 1"):
+        next(AerialRoad(frames=3).batches(0))
+
+
+def test_global_random_states_are_left_alone() -> None:
+    before = torch.get_rng_state(), random.getstate()
+    film(AerialRoad(frames=10, traverse=1))
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert random.getstate() == before[1]
