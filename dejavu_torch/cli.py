@@ -7,6 +7,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,6 +35,10 @@ class HelpFormatter(jsonargparse.DefaultHelpFormatter):
         return re.sub(r"<class '(\w+)'>", r"\1", re.sub(r", known subclasses: [^()]*", "", text))
 
 
+class UsageError(InputError):
+    """A command line or config file that does not say what the commands understand."""
+
+
 class Parser(jsonargparse.ArgumentParser):
     """An argument parser whose errors are one line."""
 
@@ -41,8 +46,10 @@ class Parser(jsonargparse.ArgumentParser):
         super().__init__(*args, formatter_class=HelpFormatter, **kwargs)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        lines = [line.strip() for line in message.splitlines() if line.strip()]
-        fail(" ".join(lines[:3]) + " (see --help)")
+        # of a union's complaints the first is the one about what the user wrote
+        union = re.search(r"Errors:\n\s*- (.*?)(?=\n\s*- |\n  Given|\Z)", message, re.DOTALL)
+        key = message.partition(":")[0]
+        raise UsageError(f"{key}: {union[1]}" if union else message) from ex
 
 
 def fail(message: str) -> NoReturn:
@@ -52,6 +59,7 @@ def fail(message: str) -> NoReturn:
 
 
 def run_demo(out: Path, seed: int) -> None:
+    """The main job on the built-in route."""
     make_output_folder(out)
     reference = open_source(f"sim:aerial?seed={seed}")
     query = open_source(f"sim:aerial?seed={seed}&traverse=1")
@@ -60,6 +68,7 @@ def run_demo(out: Path, seed: int) -> None:
 
 
 def run_learn(source: str, map: Path, model: DejaVu) -> None:
+    """Learn a map and print its plan."""
     check_output_file(map)
     model.learn(open_source(source), progress=True)
     model.save(map)
@@ -67,6 +76,7 @@ def run_learn(source: str, map: Path, model: DejaVu) -> None:
 
 
 def run_localize(map: Path, source: str, out: Path, threshold: float | None, features: Any) -> None:
+    """Find the frames of a source on a map; one csv row each."""
     check_output_file(out)
     model = DejaVu.load(map, features)
     model.threshold = model.threshold if threshold is None else threshold
@@ -85,6 +95,7 @@ def run_compare(
     out: Path,
     model: DejaVu,
 ) -> None:
+    """Learn, localize and judge; report beside baselines and null control."""
     make_output_folder(out)
     pair = open_source(reference), open_source(query)
     result = compare(*pair, truth, model, tolerance, leave_out, progress=True)
@@ -92,6 +103,7 @@ def run_compare(
 
 
 def run_info(map: Path, features: Any) -> None:
+    """Tell what is in a map."""
     model = DejaVu.load(map, features)
     _print_plan(model)
     matcher = model.matcher
@@ -178,19 +190,28 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `dejavu` command."""
     logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
+    given = list(sys.argv[1:] if arguments is None else arguments)
     parser = build_parser()
     try:
-        parsed = parser.parse_args(list(sys.argv[1:] if arguments is None else arguments))
+        parsed = parser.parse_args(given)
         if parsed.command is None:
             parser.print_help()
             raise SystemExit(2)
-        chosen = parser.instantiate_classes(parsed)[parsed.command].as_dict()
+        chosen = parser.instantiate(parsed)[parsed.command].as_dict()
         chosen.pop("config", None)
         if parsed.command in ("learn", "compare"):
             chosen["model"] = DejaVu(**{name: chosen.pop(name) for name in MODEL})
         COMMANDS[parsed.command](**chosen)
+    except UsageError as error:
+        config = [value for name, value in pairwise(given) if name == "--config"]
+        fail(f"{error} (with --config {config[0]})" if config else f"{error} (see --help)")
     except (InputError, OSError) as error:
         fail(str(error))
+    except ValueError as error:  # a constructor's own refusal arrives wrapped
+        cause = error.__cause__ or error.__context__
+        if not isinstance(cause, InputError):
+            raise
+        fail(str(cause))
     except KeyboardInterrupt:
         fail("interrupted; nothing half-written was left")
 

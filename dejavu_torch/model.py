@@ -108,6 +108,7 @@ class DejaVu(nn.Module):
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
+        self._require_features(queries.ndim == 2, "the query")
         scores: Tensor = self.matcher(features_of(queries, self.features, "the query"), self.map)
         return scores
 
@@ -130,11 +131,7 @@ class DejaVu(nn.Module):
         self._require_map()
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         queries = as_traverse(queries)
-        if self.ready_features and not holds_features(queries):
-            raise InputError(
-                f"{queries.name} holds frames, but the map was learnt from ready features; "
-                f"expected features (Q, {self.map.dimension})"
-            )
+        self._require_features(holds_features(queries), queries.name)
         for features in self.extract(queries, "localizing" if progress else None):
             for part in features.split(at_once):
                 with torch.no_grad():
@@ -171,30 +168,33 @@ class DejaVu(nn.Module):
         """
         tensors, header = read_map(Path(path))
         try:
-            made_by = Recipe(**header["features"])
-            found_by = Recipe(**header["periods"])
+            made_by, found_by = Recipe(**header["features"]), Recipe(**header["periods"])
+            if features is None:
+                features = build(made_by)
+            elif recipe_of(features).class_path != made_by.class_path:
+                raise InputError(
+                    f"{path} was learnt with {made_by.class_path}; got {recipe_of(features).class_path}"
+                )
+            # only learning needs what found the periods: one from elsewhere need not be built
+            ours = found_by.class_path.startswith("dejavu_torch.")
+            periods = build(found_by) if ours else None
+            if not isinstance(periods, PeriodFinder | None):
+                raise InputError(f"it names {found_by.class_path} as what finds periods, which it does not")
             settings = {name: header[name] for name in ("metric", "reduction", "threshold", "batch_size")}
-            ready = bool(header["ready_features"])
-        except (KeyError, TypeError) as error:
-            raise InputError(
-                f"{path} has a header without {error}; expected a map of `dejavu learn`"
-            ) from error
-        if features is None:
-            features = build(made_by)
-        elif recipe_of(features).class_path != made_by.class_path:
-            raise InputError(
-                f"{path} was learnt with {made_by.class_path}; got {recipe_of(features).class_path}"
-            )
-        # only learning needs what found the periods: one from elsewhere need not be built
-        periods = build(found_by) if found_by.class_path.startswith("dejavu_torch.") else None
-        if not isinstance(periods, PeriodFinder | None):
-            raise InputError(f"{path} names {found_by.class_path} as period finder, which it is not")
-        model = cls(features, periods, **settings)
-        try:
-            model.load_state_dict(tensors)
+            model = cls(features, periods, **settings)
+            model.ready_features = bool(header["ready_features"])
+            loaded = model.load_state_dict(tensors, strict=False)
+            missing = [name for name in loaded.missing_keys if not name.startswith("periods.")]
+            if missing or loaded.unexpected_keys:
+                raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
         except RuntimeError as error:
             raise InputError(f"{path} does not fit its modules: {' '.join(str(error).split())}") from error
-        model.ready_features = ready
+        except (AttributeError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{path} does not hold what a map holds: {' '.join(str(error).split())}"
+            ) from error
         return model
 
     @property
@@ -224,7 +224,16 @@ class DejaVu(nn.Module):
             "batch_size": self.batch_size,
             "ready_features": self.ready_features,
         }
-        return self.state_dict(), header
+        # what found the periods is not needed any more
+        tensors = {f"map.{name}": t for name, t in self.map.state_dict().items()}
+        return tensors | {f"features.{name}": t for name, t in self.features.state_dict().items()}, header
+
+    def _require_features(self, given: bool, name: str) -> None:
+        if self.ready_features and not given:
+            raise InputError(
+                f"{name} holds frames, but the map was learnt from ready features; "
+                f"expected features (Q, {self.map.dimension})"
+            )
 
     def _require_map(self) -> None:
         if not self.map.places:

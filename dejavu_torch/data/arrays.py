@@ -31,7 +31,7 @@ class ArrayTraverse(Traverse):
     def __init__(self, values: Tensor | np.ndarray, name: str = "the array") -> None:
         shape, kind = tuple(values.shape), str(values.dtype).removeprefix("torch.")
         pixels = kind == "uint8" and (len(shape) == 3 or (len(shape) == 4 and shape[3] in (1, 3)))
-        floats = kind.startswith(("float", "bfloat")) and len(shape) in (2, 4)
+        floats = kind in ("float16", "bfloat16", "float32", "float64") and len(shape) in (2, 4)
         if not (pixels or floats):
             raise InputError(f"{name} is {shape} {kind}; expected {EXPECTED}")
         if 0 in shape:
@@ -60,6 +60,8 @@ def read_array(path: Path) -> ArrayTraverse:
     """
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(values, np.ndarray):
+            raise ValueError("several arrays in one file")
     except (ValueError, OSError, EOFError) as error:
         raise InputError(f"{path} is no whole .npy array ({_line(error)}); expected {EXPECTED}") from error
     return ArrayTraverse(values, str(path))

@@ -60,8 +60,9 @@ def read_image(path: Path) -> Tensor:
     """
     try:
         with Image.open(path) as image:
-            if image.mode.startswith(("I", "F")):  # 16-bit grey
-                pixels = np.asarray(image, dtype=np.float32)[..., None] / 65535
+            if image.mode.startswith(("I", "F")):  # 16-bit grey, or floats that are in [0, 1] already
+                scale = 65535 if image.mode.startswith("I") else 1
+                pixels = np.asarray(image, dtype=np.float32)[..., None] / scale
             else:
                 pixels = np.asarray(image.convert("L" if image.mode in ("1", "L", "LA") else "RGB"))
                 pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.float32) / 255

@@ -64,6 +64,11 @@ def read_strip(
     strip = read_image(path)
     if grey and strip.shape[0] == 3:
         strip = (strip * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
+    if halve < 0 or min(strip.shape[1:]) >> halve < 1:
+        raise InputError(
+            f"{path} is {strip.shape[1]} x {strip.shape[2]} pixels, to be halved {halve} times; "
+            "expected at least 0 times, and a pixel to be left"
+        )
     for _ in range(halve):
         strip = torch.nn.functional.avg_pool2d(strip, 2)
     if rows:

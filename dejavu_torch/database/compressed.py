@@ -106,7 +106,13 @@ class CompressedMap(nn.Module):
             raise InputError(f"the map does not fit together: {problem}")
 
     def _disagreement(self) -> str:
-        if tuple(self.size.shape) != (2,) or self.layers.ndim != 2 or self.layers.shape[1] != 5:
+        shapes = {"size": "(2,)", "layers": "(L,5)", "feature_ptr": "(L+1,)", "feature_index": "(F,)"}
+        for name, shape in shapes.items():
+            buffer = getattr(self, name)
+            whole = not (buffer.is_floating_point() or buffer.is_complex() or buffer.dtype == torch.bool)
+            if buffer.ndim != 1 + (name == "layers") or not whole:
+                return f"{name} {tuple(buffer.shape)}; expected whole numbers {shape}, got {buffer.dtype}"
+        if tuple(self.size.shape) != (2,) or self.layers.shape[1] != 5:
             return f"size {tuple(self.size.shape)}, layers {tuple(self.layers.shape)}; expected (2,), (L,5)"
         pointer = self.feature_ptr.tolist()
         if len(pointer) != len(self.layers) + 1 or pointer[0] != 0 or sorted(pointer) != pointer:
@@ -124,6 +130,8 @@ class CompressedMap(nn.Module):
         numbers = sum(layer.phases * len(layer.features) for layer in self.plan)
         if self.templates.ndim != 1 or len(self.templates) != numbers:
             return f"templates {tuple(self.templates.shape)}; expected ({numbers},)"
+        if not self.templates.is_floating_point() or not self.templates.isfinite().all():
+            return "templates that are not finite floats"
         return ""
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:

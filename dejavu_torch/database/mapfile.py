@@ -42,8 +42,8 @@ def build(recipe: Recipe) -> nn.Module:
     Raises:
         InputError: a class outside this package, or one that is not there.
     """
-    module_name, _, class_name = recipe.class_path.rpartition(".")
-    if not recipe.class_path.startswith(PACKAGE + "."):
+    module_name, _, class_name = str(recipe.class_path).rpartition(".")
+    if not str(recipe.class_path).startswith(PACKAGE + "."):
         raise InputError(
             f"the map's features come from {recipe.class_path}, which only the caller can load; "
             "expected --features CLASS, or features=... in Python"
@@ -87,7 +87,8 @@ def write_map(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) ->
 
 
 def _plain(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    # a clone, since weights that share memory are refused
+    return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
 
 
 def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -110,5 +111,7 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                 )
             header = json.loads(metadata["config"])
             return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118
-    except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
+    except InputError:
+        raise
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error

@@ -82,6 +82,8 @@ class PhaseTemplates(nn.Module):
     """
 
     def forward(self, features: Tensor, plan: Sequence[FrequencyLayer]) -> tuple[Tensor, ...]:
+        if features.ndim != 2:
+            raise InputError(f"the features are {tuple(features.shape)}; expected (N,D)")
         frames, dimension = features.shape
         templates = []
         for layer in plan:

@@ -7,7 +7,7 @@ from itertools import islice
 
 import torch
 from torch import Tensor, nn
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from dejavu_torch.types import InputError, Traverse
 
@@ -32,7 +32,7 @@ def feature_batches(
         InputError: features that are not (B,D) or not finite, or no frames at all.
     """
     done = 0
-    training = module.training
+    modes = [(part, part.training) for part in module.modules()]  # a frozen part stays as it was
     bar = tqdm(
         total=traverse.length, desc=progress, unit="frame", disable=None if progress else True, leave=False
     )
@@ -40,7 +40,7 @@ def feature_batches(
         module.eval()
         for batch in traverse.batches(batch_size):
             with torch.no_grad():
-                features = features_of(batch.to(device), module, traverse.name)
+                features = features_of(batch.to(device), module, traverse.name).detach()
             bad = ~features.isfinite().all(1)
             if bad.any():
                 first = done + int(bad.nonzero()[0])
@@ -52,7 +52,8 @@ def feature_batches(
             yield features
     finally:
         bar.close()
-        module.train(training)
+        for part, training in modes:
+            part.training = training
     if done == 0:
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
 

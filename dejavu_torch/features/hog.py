@@ -20,7 +20,7 @@ def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
     columns[..., 1:-1] = frames[..., 2:] - frames[..., :-2]
     if frames.shape[1] == 1:
         return rows[:, 0], columns[:, 0]
-    strongest = (rows.detach().square() + columns.detach().square()).argmax(1, keepdim=True)
+    strongest = torch.hypot(rows.detach(), columns.detach()).argmax(1, keepdim=True)
     return rows.gather(1, strongest)[:, 0], columns.gather(1, strongest)[:, 0]
 
 
@@ -128,7 +128,7 @@ class HOG(nn.Module):
         self.orientations = orientations
         self.cell = cell
         self.block = block
-        self.resize = resize
+        self.resize = None if resize is None else (int(resize[0]), int(resize[1]))  # a map gives a list
 
     def forward(self, frames: Tensor) -> Tensor:
         return hog(frames, self.orientations, self.cell, self.block, self.resize)

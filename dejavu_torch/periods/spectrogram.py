@@ -95,7 +95,7 @@ class SpectrogramAnalysis(PeriodFinder):
         strongest: how many of its strongest frequencies a feature keeps.
         peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
         false_alarm: a frequency is kept only where its share of the feature's power is more than
-            white noise would show anywhere in the chunk with this probability (`noise_share`), so
+            white noise would show anywhere in the chunk with at most this probability (`noise_share`), so
             that a route in which nothing repeats gets no layers. None keeps every frequency (the
             paper).
         similar: features share a layer when their frequencies lie within this many bins of the
@@ -216,8 +216,10 @@ def _power(chunk: Tensor) -> Tensor:
     length = len(chunk)
     centred = chunk - chunk.mean(0)
     # rounding leaves a constant feature a trace of power: zero it, or noise would name its period
-    constant = centred.abs().amax(0) <= 1e-6 * chunk.abs().amax(0)
+    constant = centred.abs().amax(0) <= 8 * torch.finfo(chunk.dtype).eps * chunk.abs().amax(0)
     centred = centred.masked_fill(constant, 0.0)
-    transform = Spectrogram(n_fft=length, hop_length=length, center=False, power=2.0)
+    transform = Spectrogram(
+        n_fft=length, hop_length=length, center=False, power=2.0, wkwargs={"dtype": chunk.dtype}
+    )
     power: Tensor = transform.to(chunk)(centred.T)[..., 0].T
     return power

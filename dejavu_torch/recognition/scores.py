@@ -54,7 +54,12 @@ def combine_layers(
 
     Convention: L in eq. 4 is the set of layers whose chunk holds i. A place that no layer covers
         scores +inf.
+
+    Raises:
+        InputError: no layers.
     """
+    if not distances:
+        raise InputError("there are no layers to combine; expected at least one")
     parts = []
     for start, stop, members in segments(plan, places):
         if not members:
@@ -99,7 +104,8 @@ class Matcher(nn.Module):
                 f"the query features are {tuple(features.shape)}; the map expects (Q, {route.dimension})"
             )
         if not route.plan:
-            return features.new_full((len(features), route.places), math.inf)
+            dtype = torch.promote_types(features.dtype, torch.float32)
+            return features.new_full((len(features), route.places), math.inf, dtype=dtype)
         distances = [
             phase_distances(features.index_select(1, index), block, self.metric)
             for index, block in zip(route.layer_features(), route.blocks(), strict=True)

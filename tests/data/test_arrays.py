@@ -1,0 +1,157 @@
+"""Arrays as traverses: values, batches, and files that are none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.arrays import ArrayTraverse, read_array
+from dejavu_torch.types import InputError, Traverse
+
+RANDOM = np.random.default_rng(0)
+GREY = RANDOM.integers(0, 256, (7, 4, 5), np.uint8)
+COLOUR = RANDOM.integers(0, 256, (7, 4, 5, 3), np.uint8)
+FRAMES = RANDOM.random((7, 1, 4, 5), np.float32)
+FEATURES = RANDOM.random((7, 6))
+
+
+@contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """The block is refused in one line that holds these words."""
+    with pytest.raises(InputError) as caught:
+        yield
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+def all_of(traverse: Traverse, batch: int = 64) -> Tensor:
+    return torch.cat(list(traverse.batches(batch)))
+
+
+@pytest.mark.parametrize("kind", ["array", "tensor", "file"])
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (GREY, torch.tensor(GREY)[:, None] / 255),
+        (COLOUR, torch.tensor(COLOUR).permute(0, 3, 1, 2) / 255),
+        (COLOUR[..., :1], torch.tensor(COLOUR)[:, None, :, :, 0] / 255),
+        (FRAMES, torch.tensor(FRAMES)),
+        (FEATURES, torch.tensor(FEATURES)),
+        (FEATURES.astype(np.float16), torch.tensor(FEATURES.astype(np.float16)).float()),
+        (GREY[::-1], torch.tensor(GREY[::-1].copy())[:, None] / 255),
+        (np.asfortranarray(FEATURES), torch.tensor(FEATURES)),
+    ],
+    ids=["grey", "colour", "one-channel", "float", "features", "half", "reversed", "fortran"],
+)
+def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path) -> None:
+    if kind == "file":
+        np.save(tmp_path / "a.npy", values)
+        traverse = read_array(tmp_path / "a.npy")
+    else:
+        traverse = ArrayTraverse(torch.tensor(values.copy()) if kind == "tensor" else values)
+    found = all_of(traverse)
+    assert found.dtype == expected.dtype
+    assert torch.equal(found, expected)
+    assert traverse.length == 7
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3, 7, 100])
+@pytest.mark.parametrize(
+    "values", [GREY, COLOUR, FRAMES, FEATURES], ids=["grey", "colour", "float", "features"]
+)
+def test_the_batch_size_changes_nothing(values: np.ndarray, batch: int) -> None:
+    traverse = ArrayTraverse(values)
+    sizes = [len(part) for part in traverse.batches(batch)]
+    assert max(sizes) <= batch
+    assert torch.equal(all_of(traverse, batch), all_of(traverse))
+    assert torch.equal(all_of(traverse, batch), all_of(traverse, batch)), "a second reading differs"
+
+
+def test_a_batch_is_a_copy_of_a_file(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", FEATURES)
+    traverse = read_array(tmp_path / "a.npy")
+    next(traverse.batches(3)).zero_()
+    assert torch.equal(all_of(traverse), torch.tensor(FEATURES))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.zeros((3, 4), np.uint8),
+        np.zeros((3, 4), np.int64),
+        np.zeros((3, 4), bool),
+        np.zeros((3, 4), np.complex64),
+        np.zeros(3),
+        np.zeros(()),
+        np.zeros((3, 4, 5)),
+        np.zeros((3, 4, 5, 2), np.uint8),
+        np.zeros((3, 4, 5), np.uint16),
+        np.zeros((2, 3, 4, 5, 6)),
+        np.zeros((0, 4)),
+        np.zeros((3, 0)),
+        np.zeros((0, 4, 5), np.uint8),
+        np.array(["a", "b"]),
+    ],
+    ids=lambda values: f"{values.shape}{values.dtype}",
+)
+def test_another_shape_or_type_is_refused(values: np.ndarray, tmp_path: Path) -> None:
+    with refused("the array", str(values.shape), "expected frames (N,H,W)"):
+        ArrayTraverse(values)
+    path = tmp_path / "a.npy"
+    np.save(path, values)
+    with refused(str(path), "expected frames (N,H,W)"):
+        read_array(path)
+
+
+def test_a_number_type_torch_does_not_know_is_refused() -> None:
+    with refused("float128", "expected frames"):
+        all_of(ArrayTraverse(np.zeros((3, 4), np.longdouble)))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"not an array\n" * 9, b"\x80\x04\x95 a pickle"])
+def test_a_file_that_is_no_array_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.npy"
+    path.write_bytes(content)
+    with refused(str(path), "no whole .npy array", "expected frames (N,H,W)"):
+        read_array(path)
+
+
+def test_an_archive_named_npy_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", FEATURES)
+    path = (tmp_path / "a.npz").rename(tmp_path / "a.npy")
+    with refused(str(path), "expected frames"):
+        read_array(path)
+
+
+def test_a_truncated_array_is_refused_at_any_length(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, FEATURES)
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 7):
+        path.write_bytes(whole[:length])
+        with refused(str(path), "no whole .npy array"):
+            read_array(path)
+
+
+def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[object, tuple[Path]]:
+            return Path.touch, (tmp_path / "ran",)
+
+    path = tmp_path / "a.npy"
+    np.save(path, np.array([Trap()], dtype=object), allow_pickle=True)
+    with refused(str(path), "no whole .npy array"):
+        read_array(path)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with refused("missing.npy", "expected frames"):
+        read_array(tmp_path / "missing.npy")

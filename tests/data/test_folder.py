@@ -1,0 +1,201 @@
+"""Folders of images: order, pixel formats, and images that do not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from dejavu_torch.data.folder import ImageFolder, read_image
+from dejavu_torch.types import InputError
+
+GREY = np.arange(20, dtype=np.uint8).reshape(4, 5) * 10
+COLOUR = np.stack([GREY, 255 - GREY, GREY // 2], 2)
+
+
+@contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """The block is refused in one line that holds these words."""
+    with pytest.raises(InputError) as caught:
+        yield
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+def write(path: Path, *names: str) -> None:
+    """Grey images, the j-th all of value j."""
+    for j, name in enumerate(names):
+        Image.new("L", (5, 4), j).save(path / name)
+
+
+def all_of(folder: ImageFolder, batch: int = 64) -> Tensor:
+    return torch.cat(list(folder.batches(batch)))
+
+
+def with_alpha(pixels: np.ndarray) -> np.ndarray:
+    return np.concatenate([pixels.reshape(4, 5, -1), np.full((4, 5, 1), 90, np.uint8)], 2)
+
+
+@pytest.mark.parametrize(
+    ("image", "name", "expected"),
+    [
+        (Image.fromarray(GREY), "a.png", GREY[..., None] / 255),
+        (Image.fromarray(COLOUR), "a.png", COLOUR / 255),
+        (Image.fromarray(with_alpha(COLOUR)), "a.png", COLOUR / 255),
+        (Image.fromarray(with_alpha(GREY), "LA"), "a.png", GREY[..., None] / 255),
+        (Image.fromarray(GREY.astype(np.uint16) * 257), "a.png", GREY[..., None] / 255),
+        (Image.fromarray(GREY.astype(np.uint16) * 257), "a.tif", GREY[..., None] / 255),
+        (Image.fromarray(GREY > 90), "a.png", (GREY > 90)[..., None]),
+        (Image.fromarray(COLOUR).quantize(256), "a.png", COLOUR / 255),
+        (Image.fromarray(COLOUR), "a.bmp", COLOUR / 255),
+        (Image.fromarray(COLOUR), "a.PPM", COLOUR / 255),
+        (Image.fromarray(GREY), "a.pgm", GREY[..., None] / 255),
+    ],
+    ids=[
+        "grey",
+        "colour",
+        "alpha",
+        "grey-alpha",
+        "16-bit",
+        "16-bit-tif",
+        "1-bit",
+        "palette",
+        "bmp",
+        "ppm",
+        "pgm",
+    ],
+)
+def test_pixel_formats(image: Image.Image, name: str, expected: np.ndarray, tmp_path: Path) -> None:
+    image.save(tmp_path / name)
+    found = read_image(tmp_path / name)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, torch.tensor(expected).float().permute(2, 0, 1), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.JPEG", "a.webp"])
+def test_lossy_formats(name: str, tmp_path: Path) -> None:
+    Image.new("RGB", (16, 8), (200, 100, 50)).save(tmp_path / name)
+    found = all_of(ImageFolder(tmp_path))
+    assert found.shape == (1, 3, 8, 16)
+    torch.testing.assert_close(found[0, :, 4, 8], torch.tensor([200, 100, 50]) / 255, atol=0.02, rtol=0)
+
+
+def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
+    names = [
+        "f1.png",
+        "f2.png",
+        "f9.png",
+        "f10.png",
+        "f010b.png",
+        "f100.png",
+        "g1_2.png",
+        "g1_10.png",
+        "x.png",
+    ]
+    write(tmp_path, *names)
+    assert [file.name for file in ImageFolder(tmp_path).files] == names
+    assert torch.equal(all_of(ImageFolder(tmp_path))[:, 0, 0, 0] * 255, torch.arange(9.0))
+
+
+def test_names_that_begin_with_numbers_and_names_that_do_not(tmp_path: Path) -> None:
+    write(tmp_path, "10.png", "9.png", "a.png", "007.png", "7.png")
+    assert [file.name for file in ImageFolder(tmp_path).files] == [
+        "007.png",
+        "7.png",
+        "9.png",
+        "10.png",
+        "a.png",
+    ]
+
+
+@pytest.mark.parametrize("batch", [1, 2, 4, 5, 100])
+def test_the_batch_size_changes_nothing(tmp_path: Path, batch: int) -> None:
+    write(tmp_path, *(f"{j}.png" for j in range(5)))
+    folder = ImageFolder(str(tmp_path))
+    assert folder.length == 5
+    assert max(len(part) for part in folder.batches(batch)) <= batch
+    assert torch.equal(all_of(folder, batch), all_of(folder))
+
+
+def test_other_files_and_folders_are_passed_over(tmp_path: Path) -> None:
+    write(tmp_path, "1.png", "2.png")
+    (tmp_path / "truth.csv").write_text("query,place")
+    (tmp_path / "3.png").mkdir()
+    assert ImageFolder(tmp_path).length == 2
+
+
+def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    with refused("missing", "expected a folder"):
+        ImageFolder(tmp_path / "missing")
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    write(tmp_path, "1.png")
+    with refused("1.png", "expected a folder"):
+        ImageFolder(tmp_path / "1.png")
+
+
+def test_a_folder_without_images_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    with refused(str(tmp_path), "no images", "expected"):
+        ImageFolder(tmp_path)
+
+
+@pytest.mark.parametrize("batch", [1, 64])
+@pytest.mark.parametrize(
+    ("odd", "seen"),
+    [
+        (Image.new("L", (5, 6)), "6 x 5 pixels of 1 channel"),
+        (Image.new("RGB", (5, 4)), "4 x 5 pixels of 3 channels"),
+    ],
+    ids=["size", "channels"],
+)
+def test_mixed_images_are_refused_by_name(tmp_path: Path, odd: Image.Image, seen: str, batch: int) -> None:
+    write(tmp_path, *(f"{j}.png" for j in range(5)))
+    odd.save(tmp_path / "3.png")
+    with refused("3.png", seen, "expected 4 x 5 pixels of 1 channel", "0.png"):
+        all_of(ImageFolder(tmp_path), batch)
+
+
+@pytest.mark.parametrize("content", [b"", b"no image at all\nbut text\n"])
+def test_an_unreadable_image_in_the_middle_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+    write(tmp_path, *(f"{j}.png" for j in range(5)))
+    (tmp_path / "2.png").write_bytes(content)
+    frames = ImageFolder(tmp_path).batches(1)
+    assert next(frames).shape == next(frames).shape
+    with refused("2.png", "cannot be read as an image"):
+        next(frames)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.bmp", "a.tif", "a.webp", "a.ppm"])
+def test_a_truncated_image_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
+    path = tmp_path / name
+    Image.fromarray(noise).save(path)
+    whole = path.read_bytes()
+    for part in (0.01, 0.1, 0.3, 0.6):
+        path.write_bytes(whole[: int(part * len(whole))])
+        with refused(str(path), "cannot be read as an image"):
+            read_image(path)
+
+
+def test_a_damaged_image_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    random, path = np.random.default_rng(0), tmp_path / "a.png"
+    Image.fromarray(COLOUR).save(path)
+    whole = path.read_bytes()
+    for _ in range(200):
+        damaged = bytearray(whole)
+        damaged[random.integers(len(whole))] = random.integers(256)
+        path.write_bytes(damaged)
+        try:
+            read_image(path)
+        except InputError as error:
+            assert str(path) in str(error)  # noqa: PT017
+            assert "\n" not in str(error)  # noqa: PT017

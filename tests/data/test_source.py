@@ -1,0 +1,107 @@
+"""SOURCE, as every command takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.folder import ImageFolder
+from dejavu_torch.data.simulate.aerial import AerialRoad
+from dejavu_torch.data.source import open_source
+from dejavu_torch.types import InputError
+
+
+@contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """The block is refused in one line that holds these words."""
+    with pytest.raises(InputError) as caught:
+        yield
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_folder(tmp_path: Path, kind: type) -> None:
+    Image.new("L", (5, 4)).save(tmp_path / "1.png")
+    source = open_source(kind(tmp_path))
+    assert isinstance(source, ImageFolder)
+    assert (source.length, source.name) == (1, str(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.NPY", "with space?.npy"])
+def test_an_array(tmp_path: Path, name: str) -> None:
+    with (tmp_path / name).open("wb") as file:
+        np.save(file, np.ones((3, 2)))
+    source = open_source(tmp_path / name)
+    assert isinstance(source, ArrayTraverse)
+    assert (source.length, source.name) == (3, str(tmp_path / name))
+
+
+def test_a_simulator() -> None:
+    source = open_source("sim:aerial?seed=3&traverse=1&frames=40&noise=0.1")
+    assert isinstance(source, AerialRoad)
+    assert (source.seed, source.traverse, source.length, source.noise) == (3, 1, 40, 0.1)
+    assert torch.equal(source.place, torch.arange(40.0, dtype=torch.float64))
+
+
+def test_a_simulator_with_its_defaults() -> None:
+    source = open_source("sim:aerial")
+    assert isinstance(source, AerialRoad)
+    assert (source.seed, source.traverse, source.length) == (0, 0, 3072)
+
+
+def test_a_source_gives_the_same_frames_whatever_the_batch() -> None:
+    source = open_source("sim:aerial?frames=40&size=16")
+    assert torch.equal(torch.cat(list(source.batches(7))), torch.cat(list(source.batches(40))))
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("nowhere", ["nowhere", "not there", "folder of images", ".npy", "sim:aerial"]),
+        ("sim:moon?seed=1", ["'moon'", "expected aerial"]),
+        ("sim:", ["simulator ''", "expected aerial"]),
+        ("sim:aerial?speed=3", ["unknown 'speed'", "expected seed, traverse, frames"]),
+        ("sim:aerial?path=3", ["unknown 'path'", "expected seed"]),
+        ("sim:aerial?frames=many", ["frames is 'many'", "expected int"]),
+        ("sim:aerial?frames=", ["frames is ''", "expected int"]),
+        ("sim:aerial?frames=3.5", ["frames is '3.5'", "expected int"]),
+        ("sim:aerial?noise=loud", ["noise is 'loud'", "expected float"]),
+        ("sim:aerial?noise=nan", ["noise=nan", "expected 0 <= noise <= 1"]),
+        ("sim:aerial?frames=0", ["frames=0", "expected 1 <= frames"]),
+        ("sim:aerial?frames=-5", ["frames=-5", "expected 1 <= frames"]),
+        ("strip:road.png", ["width is missing", "expected width="]),
+        ("strip:road.png?width=wide", ["width is 'wide'", "expected int"]),
+        ("strip:road.png?width=3&height=3", ["unknown 'height'", "expected width, rows"]),
+        ("strip:road.png?path=3&width=3", ["unknown 'path'", "expected width, rows"]),
+    ],
+)
+def test_what_cannot_be_opened_is_refused(source: str, words: list[str]) -> None:
+    with refused(*words):
+        open_source(source)
+
+
+def test_a_single_image_is_no_traverse(tmp_path: Path) -> None:
+    Image.new("L", (5, 4)).save(tmp_path / "1.png")
+    with refused("1.png is a single image", "expected a folder of images"):
+        open_source(tmp_path / "1.png")
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "archive.npz", "plain"])
+def test_a_file_of_another_kind_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with refused(name, "none of the kinds", "expected a folder of images"):
+        open_source(tmp_path / name)
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    with refused(str(tmp_path), "no images"):
+        open_source(tmp_path)

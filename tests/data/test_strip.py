@@ -1,0 +1,107 @@
+"""A window slid along one long image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from dejavu_torch.data.source import open_source
+from dejavu_torch.data.strip import SlidingWindow, read_strip
+from dejavu_torch.types import InputError, Traverse
+
+
+@contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """The block is refused in one line that holds these words."""
+    with pytest.raises(InputError) as caught:
+        yield
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+def all_of(traverse: Traverse, batch: int = 64) -> Tensor:
+    return torch.cat(list(traverse.batches(batch)))
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 40, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "road.png")
+    return tmp_path / "road.png"
+
+
+def pixels_of(path: Path) -> Tensor:
+    return torch.tensor(np.asarray(Image.open(path))).permute(2, 0, 1).double() / 255
+
+
+@pytest.mark.parametrize(("width", "step"), [(1, 1), (3, 1), (4, 2), (4, 5), (9, 1), (9, 100)])
+@pytest.mark.parametrize("batch", [1, 3, 100])
+def test_frame_i_begins_at_column_i_times_step(width: int, step: int, batch: int) -> None:
+    strip = torch.rand(2, 5, 9)
+    traverse = SlidingWindow(strip, width, step)
+    starts = range(0, 9 - width + 1, step)
+    assert traverse.length == len(starts)
+    assert torch.equal(all_of(traverse, batch), torch.stack([strip[:, :, i : i + width] for i in starts]))
+
+
+def test_a_file_is_cut_as_asked(image: Path) -> None:
+    grey = (pixels_of(image) * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
+    halved = (grey[:, ::2, ::2] + grey[:, 1::2, ::2] + grey[:, ::2, 1::2] + grey[:, 1::2, 1::2]) / 4
+    expected = torch.stack([halved[:, 2:8, i : i + 7] for i in range(14)])
+    for traverse in (
+        read_strip(image, width=7, rows="2:8", halve=1, grey=True),
+        open_source(f"strip:{image}?grey=1&halve=1&rows=2:8&width=7"),
+    ):
+        torch.testing.assert_close(all_of(traverse), expected.float(), atol=1e-6, rtol=0)
+        assert traverse.length == 14
+
+
+def test_a_file_as_it_is(image: Path) -> None:
+    frames = all_of(open_source(f"strip:{image}?width=40"))
+    torch.testing.assert_close(frames[0], pixels_of(image).float(), atol=1e-6, rtol=0)
+    assert len(frames) == 1
+
+
+def test_halving_twice_and_stepping(image: Path) -> None:
+    assert all_of(open_source(f"strip:{image}?width=2&halve=2&step=3")).shape == (3, 3, 5, 2)
+
+
+@pytest.mark.parametrize("rows", ["5", "5:", ":5", "a:b", "3:3", "8:3", "-3:5", "19:21", "1:2:3", "0.5:3"])
+def test_rows_outside_the_image_are_refused(image: Path, rows: str) -> None:
+    with refused("road.png", rows, "expected first:stop inside 0:20"):
+        open_source(f"strip:{image}?width=8&rows={rows}")
+
+
+@pytest.mark.parametrize(("width", "step"), [(0, 1), (41, 1), (-1, 1), (8, 0)])
+def test_a_window_that_does_not_fit_is_refused(image: Path, width: int, step: int) -> None:
+    with refused("road.png", "40 pixels", f"window {width}", f"step {step}", "expected"):
+        open_source(f"strip:{image}?width={width}&step={step}")
+
+
+def test_halving_to_nothing_is_refused(image: Path) -> None:
+    with refused("road.png", "halve"):
+        open_source(f"strip:{image}?width=1&halve=6")
+
+
+@pytest.mark.parametrize(
+    "strip", [torch.rand(5, 9), torch.rand(1, 1, 5, 9), torch.zeros(1, 5, 9, dtype=torch.uint8)]
+)
+def test_what_is_no_strip_is_refused(strip: Tensor) -> None:
+    with refused(str(tuple(strip.shape)), "expected float (C,H,W)"):
+        SlidingWindow(strip, 3)
+
+
+def test_a_missing_or_broken_image_is_refused(tmp_path: Path) -> None:
+    with refused("missing.png", "cannot be read"):
+        open_source(f"strip:{tmp_path}/missing.png?width=3")
+    (tmp_path / "text.png").write_text("text")
+    with refused("text.png", "cannot be read"):
+        open_source(f"strip:{tmp_path}/text.png?width=3")

@@ -1,0 +1,76 @@
+"""What a map can tell apart and what it costs."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+
+from dejavu_torch import FrequencyLayer
+from dejavu_torch.database.certificate import certify, describe
+from dejavu_torch.types import Plan
+
+PLAN: Plan = (
+    FrequencyLayer(Fraction(93), 93, 0, 1024, (0, 1, 2)),
+    FrequencyLayer(Fraction(171), 171, 0, 1024, (1, 3)),
+    FrequencyLayer(Fraction(195, 2), 98, 1500, 2000, (0,)),
+    FrequencyLayer(Fraction(4), 4, 1900, 2100, (0, 1)),
+    FrequencyLayer(Fraction(6), 6, 1900, 2100, (2,)),
+    FrequencyLayer(Fraction(15), 15, 1900, 2100, (3,)),
+)
+
+
+def test_numbers_of_a_plan_made_by_hand() -> None:
+    certificate = certify(PLAN, places=2500, map_bytes=10_000)
+    assert certificate.places == 2500
+    assert certificate.covered == 1024 + 600  # the last two chunks overlap
+    assert certificate.templates == 93 + 171 + 98 + 4 + 6 + 15
+    assert certificate.template_numbers == 93 * 3 + 171 * 2 + 98 + 4 * 2 + 6 + 15
+    assert certificate.map_bytes == 10_000
+    assert certificate.bytes_per_place == pytest.approx(4.0)
+
+
+def test_chunks_of_a_plan_made_by_hand() -> None:
+    first, second, third = certify(PLAN, places=2500, map_bytes=1).chunks
+    assert (first.start, first.stop, first.periods, first.features) == (0, 1024, (93, 171), (3, 2))
+    assert first.common_period == 5301  # not the product, 15903
+    assert first.shared_factors == (3,)
+    assert (second.periods, second.common_period, second.shared_factors) == (
+        (Fraction(195, 2),),
+        Fraction(195, 2),
+        (),
+    )
+    assert (third.start, third.stop, third.common_period) == (1900, 2100, 60)
+    assert third.shared_factors == (2, 1, 3)  # 4 and 6, 4 and 15, 6 and 15
+
+
+def test_the_order_of_the_layers_does_not_matter_to_the_totals() -> None:
+    a, b = certify(PLAN, 2500, 1), certify(PLAN[::-1], 2500, 1)
+    assert a[:6] == b[:6]
+    assert [(x.start, x.stop, x.common_period) for x in a.chunks] == [
+        (x.start, x.stop, x.common_period) for x in b.chunks
+    ]
+
+
+def test_a_plan_without_layers() -> None:
+    certificate = certify((), places=50, map_bytes=200)
+    assert certificate == (50, 0, 0, 0, 200, 4.0, ())
+    assert certify((), places=0, map_bytes=200).bytes_per_place == 200
+
+
+def test_description_tells_the_numbers() -> None:
+    lines = describe(certify(PLAN, places=2500, map_bytes=10_000)).splitlines()
+    assert len(lines) == 4
+    for number in ("0-1023", "93", "171", "5301", "gcd 3"):
+        assert number in lines[0]
+    assert "97.5" in lines[1]
+    assert "gcd 1 to 3" in lines[2]
+    for number in ("1624 of 2500", "387 templates", "748 numbers", "10000 bytes", "4.0 per place"):
+        assert number in lines[3]
+
+
+def test_description_of_many_layers_stays_short() -> None:
+    plan = tuple(FrequencyLayer(Fraction(p), p, 0, 1024, (0,)) for p in range(8, 108))
+    first, _ = describe(certify(plan, 1024, 1)).splitlines()
+    assert "100 layers" in first
+    assert len(first) < 300

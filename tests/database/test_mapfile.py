@@ -1,0 +1,568 @@
+"""A map as one file: what comes back, what is refused, and that no file runs code."""
+
+from __future__ import annotations
+
+import errno
+import json
+import pickle
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors.torch
+import torch
+from safetensors import safe_open
+from torch import Tensor, nn
+
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.model import DejaVu
+from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.types import FrequencyLayer, InputError, Plan
+
+WINDOW = SpectrogramAnalysis(window=64, strongest=1)
+
+
+class Small(nn.Module):
+    """A backbone that is not of the package."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(1, 3, 3), nn.BatchNorm2d(3), nn.AdaptiveAvgPool2d(1), nn.Flatten()
+        )
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return self.layers(frames)
+
+
+class Other(Small):
+    """Same weights, another class."""
+
+
+class Tied(nn.Module):
+    """Two layers that share one weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encode = nn.Linear(8, 8)
+        self.again = nn.Linear(8, 8)
+        self.again.weight = self.encode.weight
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return self.again(self.encode(frames.mean((1, 2))))
+
+
+class Fixed(PeriodFinder):
+    """Layers that are known beforehand."""
+
+    def __init__(self, *layers: FrequencyLayer) -> None:
+        super().__init__()
+        self.layers = layers
+
+    def plan(self, features: Tensor) -> Plan:
+        return self.layers
+
+
+class Stateful(Fixed):
+    """A period finder with a buffer of its own."""
+
+    def __init__(self, *layers: FrequencyLayer) -> None:
+        super().__init__(*layers)
+        self.register_buffer("prior", torch.ones(3))
+
+
+@contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """The block is refused in one line that holds these words."""
+    with pytest.raises(InputError) as caught:
+        yield
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+def waves(frames: int = 64) -> Tensor:
+    """Two features that repeat, after 8 and after 9 frames."""
+    return torch.arange(frames)[:, None] % torch.tensor([8.0, 9.0])
+
+
+def pictures(frames: int = 64, size: int = 24) -> Tensor:
+    """Frames that repeat after 8."""
+    random = torch.Generator().manual_seed(0)
+    return torch.rand(8, 1, size, size, generator=random)[torch.arange(frames) % 8]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "route.safetensors"
+
+
+@pytest.fixture
+def saved(path: Path) -> Path:
+    DejaVu(periods=WINDOW).learn(waves()).save(path)
+    return path
+
+
+def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
+
+
+def craft(
+    path: Path,
+    tensors: dict[str, Tensor] | None = None,
+    metadata: dict[str, str | None] | None = None,
+    **config: Any,
+) -> None:
+    """Change a map file: tensors, metadata (None takes an entry away), or entries of its config."""
+    old_tensors, old_metadata = contents(path)
+    header = json.loads(old_metadata["config"]) | config
+    new = {**old_metadata, "config": json.dumps(header), **(metadata or {})}
+    path.unlink()
+    safetensors.torch.save_file(
+        old_tensors | (tensors or {}), path, {name: text for name, text in new.items() if text is not None}
+    )
+
+
+# what comes back
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+def test_scores_are_equal_bit_for_bit(path: Path, metric: str, reduction: Any) -> None:
+    model = DejaVu(periods=WINDOW, metric=metric, reduction=reduction, batch_size=7).learn(waves())
+    model.save(path)
+    again = DejaVu.load(path)
+    query = waves() + 0.3 * torch.rand(64, 2)
+    assert torch.equal(again(query), model(query))
+    assert again.map.plan == model.map.plan
+    assert (again.matcher.metric, again.matcher.reduction, again.batch_size) == (metric, reduction, 7)
+    assert again.certificate == model.certificate
+
+
+def test_a_map_of_frames_comes_back_with_its_features_and_periods(path: Path) -> None:
+    model = DejaVu(
+        HOG(cell=4, resize=(16, 16)), SpectrogramAnalysis(window=64, peaks="bins", false_alarm=None)
+    )
+    model.learn(pictures()).save(path)
+    again = DejaVu.load(path)
+    query = pictures(20) + 0.1 * torch.rand(20, 1, 24, 24)
+    assert torch.equal(again(query), model(query))
+    assert torch.equal(again.learn(pictures()).map.templates, model.map.templates)
+    assert again.map.plan == model.map.plan
+
+
+def test_a_map_without_layers_comes_back(path: Path) -> None:
+    DejaVu().learn(torch.ones(64, 3)).save(path)
+    again = DejaVu.load(path)
+    assert (again.map.plan, again.map.places, again.map.dimension) == ((), 64, 3)
+    assert again.localize(torch.ones(2, 3)).index.tolist() == [-1, -1]
+
+
+def test_a_fractional_period_survives(path: Path) -> None:
+    """97.5 frames in 98 phases."""
+    layer = FrequencyLayer(Fraction(195, 2), 98, 10, 300, (0, 3))
+    model = DejaVu(periods=Fixed(layer)).learn(torch.rand(310, 5))
+    model.save(path)
+    again = DejaVu.load(path)
+    assert again.map.plan == (layer,)
+    query = torch.rand(20, 5)
+    assert torch.equal(again(query), model(query))
+    assert torch.equal(again.map.plan[0].place_phases, layer.place_phases)
+
+
+@pytest.mark.parametrize("threshold", [None, 0.0, 0.7, float("inf")])
+def test_the_threshold_is_stored(path: Path, threshold: float | None) -> None:
+    model = DejaVu(periods=WINDOW, threshold=threshold).learn(waves())
+    model.save(path)
+    again = DejaVu.load(path)
+    assert again.threshold == threshold
+    query = waves() + 2 * torch.rand(64, 2)
+    assert torch.equal(again.localize(query).accepted, model.localize(query).accepted)
+
+
+@pytest.mark.parametrize("ready", [True, False])
+def test_a_map_of_ready_features_stays_one(path: Path, ready: bool) -> None:
+    DejaVu(periods=WINDOW).learn_features(waves(), ready=ready).save(path)
+    assert DejaVu.load(path).ready_features is ready
+
+
+def test_float64_templates_stay_float64(path: Path) -> None:
+    model = DejaVu(periods=WINDOW).learn(waves().double() / 3)
+    model.save(path)
+    assert torch.equal(DejaVu.load(path).map.templates, model.map.templates)
+    assert model.map.templates.dtype == torch.float64
+
+
+# the file
+
+
+def test_one_file_of_the_size_the_map_claims(saved: Path) -> None:
+    assert list(saved.parent.iterdir()) == [saved]
+    model = DejaVu.load(saved)
+    assert saved.stat().st_size == model.map_bytes == model.certificate.map_bytes
+    assert model.certificate.bytes_per_place == model.map_bytes / 64
+
+
+@pytest.mark.parametrize("features", [HOG(), Small()])
+def test_the_claimed_size_holds_with_any_features(path: Path, features: nn.Module) -> None:
+    model = DejaVu(features, WINDOW).learn(pictures())
+    model.save(path)
+    assert path.stat().st_size == model.map_bytes
+    assert DejaVu.load(path, features).map_bytes == model.map_bytes
+
+
+def test_metadata_names_format_version_plan_and_config(saved: Path) -> None:
+    tensors, metadata = contents(saved)
+    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", 1)
+    plan = json.loads(metadata["plan"])
+    assert tensors[plan["tensor"]].tolist() == [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
+    assert plan["columns"] == ["period_numerator", "period_denominator", "phases", "start", "stop"]
+    config = json.loads(metadata["config"])
+    assert config["features"]["class_path"] == "dejavu_torch.features.hog.HOG"
+    assert config["periods"]["init_args"]["window"] == 64
+    assert (config["metric"], config["reduction"], config["threshold"]) == ("l1", "mean", None)
+
+
+def test_no_pickle_is_written_or_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = DejaVu(Small(), WINDOW).learn(pictures())
+
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("pickle was used")
+
+    for module, names in (
+        (pickle, ("dump", "dumps", "load", "loads", "Pickler", "Unpickler")),
+        (torch, ("load", "save")),
+    ):
+        for name in names:
+            monkeypatch.setattr(module, name, forbidden)
+    model.save(path)
+    DejaVu.load(path, Small())
+
+
+def test_saving_over_an_old_map(saved: Path) -> None:
+    DejaVu(periods=WINDOW).learn(waves(80)).save(saved)
+    assert DejaVu.load(saved).map.places == 80
+
+
+def test_a_full_disk_keeps_the_old_map(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, before = DejaVu.load(saved), saved.read_bytes()
+
+    def half(_: object, path: Path, *__: object) -> None:
+        path.write_bytes(before[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(safetensors.torch, "save_file", half)
+    with refused(str(saved), "No space left on device"):
+        model.save(saved)
+    assert list(saved.parent.iterdir()) == [saved]
+    assert saved.read_bytes() == before
+
+
+def test_where_a_map_cannot_be_written(tmp_path: Path) -> None:
+    model = DejaVu(periods=WINDOW).learn(waves())
+    with refused("missing", "does not exist"):
+        model.save(tmp_path / "missing" / "a.safetensors")
+    with refused(str(tmp_path), "is a folder"):
+        model.save(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_saved(path: Path) -> None:
+    with refused("no map yet", "learn"):
+        DejaVu().save(path)
+    with refused("callable metric", "expected a metric by name"):
+        DejaVu(periods=WINDOW, metric=lambda q, t: torch.cdist(q, t, 1)).learn(waves()).save(path)
+    assert not path.exists()
+
+
+# files that are no whole map
+
+
+def test_a_truncated_map_is_refused_at_any_length(saved: Path) -> None:
+    whole = saved.read_bytes()
+    for length in [0, 1, 7, 8, 9, *range(20, len(whole), 61), len(whole) - 1]:
+        saved.write_bytes(whole[:length])
+        with refused(str(saved), "truncated", "expected a whole one"):
+            DejaVu.load(saved)
+
+
+@pytest.mark.parametrize("content", [b"just text\n" * 50, b"\x80\x04\x95", b"\x93NUMPY" * 30, b"\0" * 500])
+def test_another_kind_of_file_is_refused(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    with refused(str(path), "no map file"):
+        DejaVu.load(path)
+
+
+@pytest.mark.parametrize("metadata", [None, {"format": "pt"}])
+def test_a_foreign_safetensors_file_is_refused(path: Path, metadata: dict[str, str] | None) -> None:
+    safetensors.torch.save_file({"weight": torch.zeros(3)}, path, metadata)
+    with refused(str(path), "no map of dejavu_torch"):
+        DejaVu.load(path)
+
+
+def test_a_missing_file_and_a_folder_are_refused(path: Path) -> None:
+    with refused(str(path), "not there"):
+        DejaVu.load(path)
+    with refused(str(path.parent), "not there"):
+        DejaVu.load(path.parent)
+
+
+def test_a_newer_format_is_refused(saved: Path) -> None:
+    craft(saved, metadata={"version": "2"})
+    with refused(str(saved), "format 2", "up to 1", "newer"):
+        DejaVu.load(saved)
+
+
+@pytest.mark.parametrize(
+    "metadata", [{"version": None}, {"config": None}, {"config": "{"}, {"config": "[]"}, {"config": "{}"}]
+)
+def test_damaged_metadata_is_refused(saved: Path, metadata: dict[str, str | None]) -> None:
+    craft(saved, metadata=metadata)
+    with refused(str(saved)):
+        DejaVu.load(saved)
+
+
+def test_a_version_that_is_no_number_is_refused(saved: Path) -> None:
+    craft(saved, metadata={"version": "one"})
+    with refused(str(saved)):
+        DejaVu.load(saved)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"metric": "l7"},
+        {"reduction": "median"},
+        {"batch_size": 0},
+        {"features": None},
+        {"features": {}},
+        {"features": {"class_path": "dejavu_torch.features.hog.HOG", "init_args": {"cells": 8}}},
+        {"features": {"class_path": "dejavu_torch.features.hog.HOG", "init_args": {"cell": 0}}},
+        {"features": {"class_path": "dejavu_torch.features.hog.SIFT", "init_args": {}}},
+        {"features": {"class_path": "dejavu_torch.types.InputError", "init_args": {}}},
+        {"features": {"class_path": "dejavu_torch.features.hog.hog", "init_args": {}}},
+        {"periods": {"class_path": "dejavu_torch.features.hog.HOG", "init_args": {}}},
+    ],
+    ids=str,
+)
+def test_a_damaged_config_is_refused(saved: Path, config: dict[str, Any]) -> None:
+    craft(saved, **config)
+    with refused():
+        DejaVu.load(saved)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"metric": ["l1"]},
+        {"threshold": "low"},
+        {"batch_size": "many"},
+        {"batch_size": None},
+        {"features": {"class_path": 5, "init_args": {}}},
+    ],
+    ids=str,
+)
+def test_config_values_of_another_type_are_refused(saved: Path, config: dict[str, Any]) -> None:
+    craft(saved, **config)
+    with refused():
+        DejaVu.load(saved)
+
+
+LAYERS = [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("layers", [[8, 1, 8, 0, 65], LAYERS[1]]),
+        ("layers", [[8, 1, 8, 64, 64], LAYERS[1]]),
+        ("layers", [[8, 1, 8, -1, 64], LAYERS[1]]),
+        ("layers", [[8, 1, 9, 0, 64], LAYERS[1]]),
+        ("layers", [[8, 1, 0, 0, 64], LAYERS[1]]),
+        ("layers", [[8, 0, 8, 0, 64], LAYERS[1]]),
+        ("layers", [[-8, 1, 8, 0, 64], LAYERS[1]]),
+        ("layers", [[-8, -1, 8, 0, 64], LAYERS[1]]),
+        ("layers", LAYERS[:1]),
+        ("layers", [8, 1, 8, 0, 64]),
+        ("layers", [[8, 1, 8, 0], [9, 1, 9, 0]]),
+        ("size", [63, 2]),
+        ("size", [64, 1]),
+        ("size", [64]),
+        ("size", [64, 2, 1]),
+        ("feature_ptr", [0, 2, 1]),
+        ("feature_ptr", [1, 1, 2]),
+        ("feature_ptr", [0, 1, 3]),
+        ("feature_ptr", [0, 0, 2]),
+        ("feature_ptr", [0, 2]),
+        ("feature_index", [0, 2]),
+        ("feature_index", [-1, 1]),
+        ("feature_index", [0]),
+        ("feature_index", [0, 1, 1]),
+        ("templates", [0.0] * 16),
+        ("templates", [0.0] * 18),
+        ("templates", [[0.0] * 17]),
+    ],
+)
+def test_buffers_that_do_not_fit_together_are_refused(saved: Path, name: str, value: list[Any]) -> None:
+    old = contents(saved)[0][f"map.{name}"]
+    craft(saved, {f"map.{name}": torch.tensor(value, dtype=old.dtype)})
+    with refused():
+        DejaVu.load(saved)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("layers", torch.tensor(LAYERS).double()),
+        ("feature_ptr", torch.tensor([0.0, 1.0, 2.0])),
+        ("feature_ptr", torch.tensor(0)),
+        ("feature_index", torch.tensor(0)),
+    ],
+)
+def test_buffers_of_another_type_are_refused(saved: Path, name: str, value: Tensor) -> None:
+    craft(saved, {f"map.{name}": value})
+    with refused():
+        DejaVu.load(saved)
+
+
+@pytest.mark.parametrize("name", ["size", "layers", "feature_ptr", "feature_index", "templates"])
+def test_a_missing_buffer_is_refused(saved: Path, name: str) -> None:
+    tensors, metadata = contents(saved)
+    del tensors[f"map.{name}"]
+    safetensors.torch.save_file(tensors, saved, metadata)
+    with refused():
+        DejaVu.load(saved)
+
+
+def test_a_tensor_too_many_is_refused(saved: Path) -> None:
+    craft(saved, {"features.weight": torch.zeros(3)})
+    with refused(str(saved), "features.weight"):
+        DejaVu.load(saved)
+
+
+# features from elsewhere
+
+
+@pytest.fixture
+def small_map(path: Path) -> tuple[Path, DejaVu]:
+    torch.manual_seed(0)
+    model = DejaVu(Small(), SpectrogramAnalysis(window=64, false_alarm=None)).learn(pictures())
+    model.save(path)
+    return path, model
+
+
+def test_features_from_elsewhere_get_their_weights_from_the_file(small_map: tuple[Path, DejaVu]) -> None:
+    path, model = small_map
+    torch.manual_seed(1)
+    features = Small()
+    again = DejaVu.load(path, features)
+    assert again.features is features
+    for name, weight in model.features.state_dict().items():
+        assert torch.equal(features.state_dict()[name], weight), name
+    query = pictures(5)
+    assert torch.equal(again.localize(query).score, model.localize(query).score)
+    assert model.map.plan, "a test on a map without layers shows nothing"
+
+
+def test_features_from_elsewhere_must_be_given(small_map: tuple[Path, DejaVu]) -> None:
+    with refused("Small", "--features"):
+        DejaVu.load(small_map[0])
+
+
+def test_other_features_are_refused(small_map: tuple[Path, DejaVu], tmp_path: Path) -> None:
+    for wrong in (Other(), HOG(), nn.Flatten()):
+        with refused(str(small_map[0]), "Small", type(wrong).__name__):
+            DejaVu.load(small_map[0], wrong)
+    DejaVu(periods=WINDOW).learn(pictures()).save(tmp_path / "hog.safetensors")
+    with refused("HOG", "Small"):
+        DejaVu.load(tmp_path / "hog.safetensors", Small())
+
+
+def test_features_of_another_size_are_refused(small_map: tuple[Path, DejaVu]) -> None:
+    wider = Small()
+    wider.layers[0] = nn.Conv2d(1, 4, 3)
+    with refused(str(small_map[0]), "does not fit"):
+        DejaVu.load(small_map[0], wider)
+
+
+def test_weights_are_counted(small_map: tuple[Path, DejaVu]) -> None:
+    model = small_map[1]
+    # convolution 3 x 9 + 3, batch norm 4 x 3 floats, and its int64 counter
+    assert model.backbone_bytes == 4 * (30 + 12) + 8
+    assert DejaVu(HOG()).backbone_bytes == 0
+    without = DejaVu(HOG(), WINDOW)
+    without.map = model.map
+    assert model.map_bytes > without.map_bytes + model.backbone_bytes
+
+
+def test_tied_weights_can_be_saved(path: Path) -> None:
+    model = DejaVu(Tied(), WINDOW).learn(pictures(size=8))
+    model.save(path)
+    query = pictures(5, 8)
+    assert torch.equal(DejaVu.load(path, Tied()).localize(query).score, model.localize(query).score)
+
+
+def test_a_map_made_with_a_period_finder_of_its_own_state_can_be_read(path: Path) -> None:
+    DejaVu(periods=Stateful(FrequencyLayer(Fraction(8), 8, 0, 64, (0,)))).learn(waves()).save(path)
+    DejaVu.load(path)
+
+
+# no file names code to import
+
+
+@pytest.fixture
+def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Importable modules that leave a mark when they are imported."""
+    folder, mark = tmp_path / "importable", tmp_path / "mark"
+    (folder / "dejavu_torch_extra").mkdir(parents=True)
+    code = f"from pathlib import Path\nPath({str(mark)!r}).touch()\nfrom torch.nn import Flatten as Net\n"
+    (folder / "trap_module.py").write_text(code)
+    (folder / "dejavu_torch_extra" / "__init__.py").write_text(code)
+    monkeypatch.syspath_prepend(folder)
+    yield mark
+    sys.modules.pop("trap_module", None)
+    sys.modules.pop("dejavu_torch_extra", None)
+
+
+@pytest.mark.parametrize(
+    "class_path",
+    [
+        "trap_module.Net",
+        "dejavu_torch_extra.Net",
+        "os.system",
+        "builtins.exec",
+        "Net",
+        "",
+        ".trap_module.Net",
+        "dejavu_torch.types.torch.nn.Flatten",
+        "dejavu_torch...trap_module.Net",
+    ],
+)
+@pytest.mark.parametrize("init_args", [{}, {"command": "touch mark"}])
+def test_no_foreign_class_path_is_imported(
+    saved: Path, trap: Path, class_path: str, init_args: dict[str, str]
+) -> None:
+    foreign = {"class_path": class_path, "init_args": init_args}
+    craft(saved, features=foreign)
+    with refused():
+        DejaVu.load(saved)
+    with refused("HOG"):
+        DejaVu.load(saved, HOG())
+    assert not trap.exists()
+    assert not {"trap_module", "dejavu_torch_extra"} & sys.modules.keys()
+
+
+@pytest.mark.parametrize("class_path", ["trap_module.Net", "dejavu_torch_extra.Net", "os.system"])
+def test_a_foreign_period_finder_is_not_imported_and_not_needed(
+    saved: Path, trap: Path, class_path: str
+) -> None:
+    expected = DejaVu.load(saved).localize(waves())
+    craft(saved, periods={"class_path": class_path, "init_args": {}})
+    assert torch.equal(DejaVu.load(saved).localize(waves()).index, expected.index)
+    assert not trap.exists()

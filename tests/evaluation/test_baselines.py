@@ -1,0 +1,101 @@
+"""What a user would store instead."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
+
+DISTANCES = {
+    "l1": lambda a, b: (a - b).abs().sum(),
+    "l2": lambda a, b: (a - b).square().sum().sqrt(),
+    "cosine": lambda a, b: 1 - torch.nn.functional.cosine_similarity(a, b, dim=0),
+}
+
+
+def literal_nearest(reference: Tensor, query: Tensor, k: int, metric: str) -> list[tuple[int, float]]:
+    """The first of the nearest stored frames, one pair at a time."""
+    found = []
+    for q in query:
+        distances = [(DISTANCES[metric](q, reference[i]).item(), i) for i in range(0, len(reference), k)]
+        best = min(distances)
+        found.append((best[1], best[0]))
+    return found
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+def test_the_nearest_stored_frame(metric: str) -> None:
+    torch.manual_seed(0)
+    reference, query = torch.rand(23, 5, dtype=torch.float64), torch.rand(9, 5, dtype=torch.float64)
+    for k, match in zip((1, 2, 7, 50), nearest_frames(reference, query, (1, 2, 7, 50), metric), strict=True):
+        expected = literal_nearest(reference, query, k, metric)
+        assert match.index.tolist() == [index for index, _ in expected]
+        assert match.score.tolist() == pytest.approx([score for _, score in expected], abs=1e-12)
+        assert match.accepted.all()
+
+
+def test_of_equally_near_frames_the_first_is_reported() -> None:
+    reference = torch.tensor([[2.0], [0.0], [2.0], [0.0]])
+    (match,) = nearest_frames(reference, torch.tensor([[0.0], [1.0], [2.0]]))
+    assert match.index.tolist() == [1, 0, 0]
+
+
+def test_the_uncompressed_reference_finds_its_own_frames() -> None:
+    reference = torch.rand(50, 8)
+    (match,) = nearest_frames(reference, reference)
+    assert match.index.tolist() == list(range(50))
+    assert match.score.tolist() == [0.0] * 50
+
+
+def test_distances_in_parts_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    reference, query = torch.rand(20, 4), torch.rand(11, 4)
+    whole = nearest_frames(reference, query, (1, 3))
+    for numbers in (1, 20, 45):
+        monkeypatch.setattr("dejavu_torch.evaluation.baselines.DISTANCES_AT_ONCE", numbers)
+        for a, b in zip(nearest_frames(reference, query, (1, 3)), whole, strict=True):
+            assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("frames", "k", "kept"), [(10, 1, 10), (10, 3, 4), (9, 3, 3), (10, 10, 1), (10, 99, 1)]
+)
+def test_bytes_of_every_kth_frame(frames: int, k: int, kept: int) -> None:
+    assert stride_bytes(frames, dimension=6, itemsize=4, k=k) == kept * 24
+    assert len(range(0, frames, k)) == kept
+
+
+@given(
+    st.integers(1, 60), st.integers(1, 4), st.sampled_from([1, 4]), st.integers(0, 1500), st.integers(0, 8)
+)
+def test_convention_8_the_fair_stride_stores_at_least_the_map(
+    frames: int, dimension: int, itemsize: int, map_bytes: int, tolerance: int
+) -> None:
+    k = fair_stride(frames, dimension, itemsize, map_bytes, tolerance)
+    fits = [
+        j for j in range(1, 2 * tolerance + 1) if len(range(0, frames, j)) * dimension * itemsize >= map_bytes
+    ]
+    assert k == (max(fits) if fits else 1)
+
+
+@pytest.mark.parametrize(
+    ("map_bytes", "tolerance", "k"),
+    [
+        (0, 5, 10),
+        (4000, 5, 10),
+        (4001, 5, 9),
+        (40000, 5, 1),
+        (40001, 5, 1),
+        (20000, 5, 2),
+        (0, 1, 2),
+        (0, 0, 1),
+    ],
+)
+def test_convention_8_the_stride_is_at_most_twice_the_tolerance(
+    map_bytes: int, tolerance: int, k: int
+) -> None:
+    """1000 frames of 10 numbers of 4 bytes."""
+    assert fair_stride(1000, 10, 4, map_bytes, tolerance) == k

@@ -1,0 +1,230 @@
+"""Controls: maps learnt from shuffled frames, and queries taken out of their own templates."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from dejavu_torch.evaluation.controls import leave_out_match, null_control, relearn
+from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.model import DejaVu
+from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.types import FrequencyLayer, InputError, Match, Plan
+
+
+class Fixed(PeriodFinder):
+    """Layers that are known beforehand."""
+
+    def __init__(self, *layers: FrequencyLayer) -> None:
+        super().__init__()
+        self.layers = layers
+
+    def plan(self, features: Tensor) -> Plan:
+        return self.layers
+
+
+def layer(
+    period: Fraction | int, start: int, stop: int, *features: int, phases: int | None = None
+) -> FrequencyLayer:
+    return FrequencyLayer(Fraction(period), phases or int(period), start, stop, features)
+
+
+def route(frames: int, dimension: int = 80, noise: float = 0.2, seed: int = 0) -> Tensor:
+    """Waves of 16 and of 27 frames, each feature with its own phase; each traverse has its own noise."""
+    fixed, fresh = torch.Generator().manual_seed(99), torch.Generator().manual_seed(seed)
+    period = torch.tensor([16.0, 27.0]).repeat(dimension // 2)
+    turn = torch.arange(frames)[:, None] / period + torch.rand(dimension, generator=fixed)
+    return torch.cos(2 * torch.pi * turn) + noise * torch.randn(frames, dimension, generator=fresh)
+
+
+def recall(match: Match, tolerance: int = 0) -> float:
+    return judge(match, torch.arange(len(match.index))[:, None], tolerance).recall_at_1
+
+
+# the null control
+
+
+def test_convention_8_the_null_of_a_repeating_route_finds_no_layers() -> None:
+    """White noise plus a strong periodic part: in shuffled order it is white noise."""
+    reference, query = route(432), route(432, seed=1)
+    model = DejaVu(periods=SpectrogramAnalysis(window=432, false_alarm=1e-6)).learn(reference)
+    ours, null = model.localize(query), null_control(model, reference, query)
+    assert recall(ours) > 0.9
+    assert null.index.tolist() == [-1] * 432
+    assert not null.accepted.any()
+    assert judge(null, torch.arange(432)[:, None], 5) == (0.0,) * 6
+
+
+def test_convention_8_the_null_of_the_paper_is_at_chance() -> None:
+    reference, query = route(432), route(432, seed=1)
+    paper = SpectrogramAnalysis(window=432, peaks="bins", false_alarm=None)
+    model = DejaVu(periods=paper, reduction="sum").learn(reference)
+    null = null_control(model, reference, query)
+    # its second strongest bins are leakage, which costs it many a place, but not all
+    assert recall(model.localize(query)) > 0.3
+    assert (null.index >= 0).all()
+    assert recall(null) < 0.05
+
+
+def test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored() -> None:
+    """One template for each frame: every frame is found, wherever the shuffling has put it."""
+    reference = torch.rand(50, 6)
+    model = DejaVu(periods=Fixed(layer(50, 0, 50, 0, 1, 2, 3, 4, 5))).learn(reference)
+    match = null_control(model, reference, reference)
+    assert match.index.tolist() == list(range(50))
+    assert match.score.tolist() == [0.0] * 50
+
+
+def test_the_null_shuffles_by_its_seed_and_leaves_the_model_alone() -> None:
+    reference, query = torch.rand(64, 3), torch.rand(64, 3)
+    model = DejaVu(periods=Fixed(layer(8, 0, 64, 0, 1, 2)), threshold=0.2).learn(reference)
+    before = model(query)
+    first, again, other = (null_control(model, reference, query, seed) for seed in (0, 0, 1))
+    assert torch.equal(first.index, again.index)
+    assert torch.equal(first.score, again.score)
+    assert not torch.equal(first.score, other.score)
+    assert torch.equal(model(query), before)
+    assert torch.equal(first.accepted, first.score < 0.2)
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+def test_relearning_keeps_the_settings(metric: str) -> None:
+    model = DejaVu(
+        periods=Fixed(layer(8, 0, 64, 0, 1)), metric=metric, reduction="sum", threshold=0.1, batch_size=5
+    )
+    model.learn(torch.rand(64, 2))
+    other = relearn(model, torch.rand(64, 2))
+    assert (other.matcher.metric, other.matcher.reduction) == (metric, "sum")
+    assert (other.threshold, other.batch_size, other.ready_features) == (0.1, 5, True)
+    assert other.map.plan == model.map.plan
+    assert not torch.equal(other.map.templates, model.map.templates)
+
+
+# leave out
+
+DISTANCES = {
+    "l1": lambda a, b: (a - b).abs().sum().item(),
+    "l2": lambda a, b: (a - b).square().sum().sqrt().item(),
+    "cosine": lambda a, b: 1 - torch.nn.functional.cosine_similarity(a, b, dim=0).item(),
+}
+WEIGHTS = {"l1": lambda f: f, "l2": math.sqrt, "cosine": lambda f: 1}
+
+
+def literal_leave_out(
+    features: Tensor, plan: Plan, width: int, metric: str, reduction: str
+) -> tuple[list[int], list[float]]:
+    """Learn anew for each query without the frames near it, then look the query up; loops only."""
+    index, best = [], []
+    for q in range(len(features)):
+        scores = []
+        for i in range(len(features)):
+            total, weight = 0.0, 0.0
+            for part in plan:
+                if not part.start <= i < part.stop:
+                    continue
+                chosen = list(part.features)
+                phase = [
+                    math.floor((j % part.period) * part.phases / part.period) for j in range(len(features))
+                ]
+                kept = [
+                    features[j, chosen]
+                    for j in range(part.start, part.stop)
+                    if phase[j] == phase[i] and abs(j - q) > width
+                ]
+                mean = torch.stack(kept).mean(0) if kept else None
+                total += math.inf if mean is None else DISTANCES[metric](features[q, chosen], mean)
+                weight += WEIGHTS[metric](len(chosen))
+            scores.append(math.inf if not weight else total / weight if reduction == "mean" else total)
+        lowest = min(scores)
+        best.append(lowest)
+        index.append(scores.index(lowest) if lowest < math.inf else -1)
+    return index, best
+
+
+PLANS = {
+    "whole": (layer(5, 0, 24, 0, 2), layer(7, 0, 24, 1)),
+    "fractional": (
+        layer(Fraction(11, 2), 0, 24, 0, 1, 2, phases=6),
+        layer(Fraction(15, 4), 0, 24, 1, phases=3),
+    ),
+    "chunks": (layer(4, 0, 10, 0), layer(3, 2, 16, 1, 2), layer(6, 16, 22, 0, 2)),
+    "once": (layer(24, 0, 24, 0, 1, 2),),
+}
+
+
+@pytest.mark.parametrize("width", [0, 1, 3])
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+@pytest.mark.parametrize(
+    ("metric", "reduction"), [("l1", "mean"), ("l1", "sum"), ("l2", "mean"), ("cosine", "mean")]
+)
+def test_convention_8_leave_out_equals_learning_without_those_frames(
+    plan: Plan, width: int, metric: str, reduction: Any
+) -> None:
+    features = torch.rand(24, 3, generator=torch.Generator().manual_seed(width), dtype=torch.float64)
+    model = DejaVu(periods=Fixed(*plan), metric=metric, reduction=reduction).learn(features)
+    found = leave_out_match(model, features, width)
+    index, score = literal_leave_out(features, plan, width, metric, reduction)
+    assert found.score.tolist() == pytest.approx(score, abs=1e-9)
+    assert found.index.tolist() == index
+
+
+def test_a_phase_left_without_frames_is_no_place() -> None:
+    """One frame to a phase: without itself the query finds the places of other frames only."""
+    features = torch.arange(6.0)[:, None]
+    model = DejaVu(periods=Fixed(layer(6, 0, 6, 0))).learn(features)
+    assert model.localize(features).index.tolist() == list(range(6))
+    assert leave_out_match(model, features, 0).index.tolist() == [1, 0, 1, 2, 3, 4]
+    everything = leave_out_match(model, features, 6)
+    assert everything.index.tolist() == [-1] * 6
+    assert everything.score.tolist() == [math.inf] * 6
+    assert not everything.accepted.any()
+
+
+def test_convention_8_the_self_match_trap() -> None:
+    """Pure noise, folded, recognises itself; not so when each query is taken out of the means."""
+    noise, fresh = torch.randn(2, 256, 400, generator=torch.Generator().manual_seed(0))
+    chosen = range(400)
+    model = DejaVu(periods=Fixed(layer(29, 0, 256, *chosen), layer(43, 0, 256, *chosen))).learn(noise)
+    assert recall(model.localize(noise)) > 0.99
+    assert recall(leave_out_match(model, noise, 0)) < 0.03
+    assert recall(model.localize(fresh)) < 0.03
+    assert recall(null_control(model, noise, fresh)) < 0.03
+
+
+def test_convention_8_on_sliding_footage_the_neighbours_carry_the_answer() -> None:
+    """Each frame equals its neighbours but for little: width 0 cures nothing, a wider one does."""
+    steps = torch.randn(256, 300, generator=torch.Generator().manual_seed(0))
+    kernel = torch.hann_window(9, periodic=False)
+    sliding = torch.nn.functional.conv1d(steps.T[:, None], kernel[None, None], padding="same")[:, 0].T
+    model = DejaVu(periods=Fixed(*(layer(p, 0, 256, *range(300)) for p in (29, 43)))).learn(sliding)
+    assert recall(leave_out_match(model, sliding, 0), tolerance=5) > 0.8
+    assert recall(leave_out_match(model, sliding, 10), tolerance=5) < 0.2
+
+
+def test_what_repeats_survives_leaving_out() -> None:
+    reference = route(432, noise=0.1)
+    model = DejaVu(periods=SpectrogramAnalysis(window=432)).learn(reference)
+    assert recall(leave_out_match(model, reference, 5)) > 0.9
+
+
+def test_the_threshold_and_an_empty_map() -> None:
+    features = torch.rand(40, 3)
+    model = DejaVu(periods=Fixed(layer(4, 0, 40, 0, 1, 2)), threshold=0.25).learn(features)
+    match = leave_out_match(model, features)
+    assert torch.equal(match.accepted, match.score < 0.25)
+    empty = DejaVu(periods=Fixed()).learn(features)
+    assert leave_out_match(empty, features).index.tolist() == [-1] * 40
+    assert null_control(empty, features, features).index.tolist() == [-1] * 40
+
+
+@pytest.mark.parametrize(("shape", "width"), [((39, 3), 0), ((40, 2), 0), ((40, 3), -1)])
+def test_other_features_than_the_map_s_are_refused(shape: tuple[int, int], width: int) -> None:
+    model = DejaVu(periods=Fixed(layer(4, 0, 40, 0, 1, 2))).learn(torch.rand(40, 3))
+    with pytest.raises(InputError, match=r"\Aleave-out got width [^\n]*expected width >= 0 and \(40, 3\)\Z"):
+        leave_out_match(model, torch.rand(*shape), width)

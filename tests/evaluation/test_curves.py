@@ -1,0 +1,261 @@
+"""Precision and recall against literal loops, and by hand."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import pairwise
+from typing import Literal
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch.evaluation.curves import (
+    Scores,
+    area,
+    curve_of,
+    judge,
+    pr_curve,
+    recall_at_full_precision,
+)
+from dejavu_torch.types import InputError, Match, PRCurve
+
+INF = float("inf")
+Recall = Literal["all", "reported"]
+BOTH = pytest.mark.parametrize("recall", ["all", "reported"])
+# few values, so that scores tie
+SCORE = st.sampled_from([-1.5, 0.0, 0.5, 1.0, 2.0, INF])
+QUERIES = st.lists(st.tuples(SCORE, st.booleans(), st.booleans()), max_size=14)
+PLACED = st.lists(
+    st.tuples(SCORE, st.integers(0, 9), st.lists(st.integers(-1, 9), min_size=2, max_size=2)),
+    min_size=1,
+    max_size=14,
+)
+
+
+def columns(queries: list[tuple[float, bool, bool]]) -> tuple[Tensor, Tensor, Tensor]:
+    score, right, answerable = zip(*queries, strict=True) if queries else ((), (), ())
+    return (
+        torch.tensor(score, dtype=torch.float64),
+        torch.tensor(right, dtype=torch.bool),
+        torch.tensor(answerable, dtype=torch.bool),
+    )
+
+
+def literal_curve(
+    queries: list[tuple[float, bool, bool]], recall: Recall
+) -> list[tuple[float, float, float]]:
+    """(precision, recall, threshold), one query and one threshold at a time."""
+    points = []
+    for threshold in sorted({score for score, _, _ in queries if score < INF}):
+        reports = [(right, answerable) for score, right, answerable in queries if score <= threshold]
+        tp = sum(right and answerable for right, answerable in reports)
+        answerables = sum(answerable for _, _, answerable in queries)
+        silent = sum(answerable for score, _, answerable in queries if score > threshold)
+        relevant = answerables if recall == "all" else tp + silent
+        points.append((tp / len(reports), tp / relevant if tp else 0.0, threshold))
+    return points
+
+
+def literal_area(points: list[tuple[float, float, float]]) -> float:
+    return sum((b[1] - a[1]) * (a[0] + b[0]) / 2 for a, b in pairwise(points))
+
+
+def flat(points: list[tuple[float, float, float]]) -> list[float]:
+    return [number for point in points for number in point]
+
+
+def points_of(curve: PRCurve) -> list[tuple[float, float, float]]:
+    return list(zip(*(column.tolist() for column in curve), strict=True))
+
+
+@BOTH
+@given(queries=QUERIES)
+def test_every_distinct_score_is_a_threshold(queries: list[tuple[float, bool, bool]], recall: Recall) -> None:
+    curve, expected = pr_curve(*columns(queries), recall), literal_curve(queries, recall)
+    assert flat(points_of(curve)) == pytest.approx(flat(expected))
+    assert area(curve) == pytest.approx(literal_area(expected))
+    assert recall_at_full_precision(curve) == max((r for p, r, _ in expected if p == 1), default=0.0)
+
+
+@BOTH
+@given(queries=QUERIES, order=st.randoms())
+def test_the_order_of_queries_changes_nothing(
+    queries: list[tuple[float, bool, bool]], order: object, recall: Recall
+) -> None:
+    mixed = list(queries)
+    order.shuffle(mixed)  # type: ignore[attr-defined]
+    assert points_of(pr_curve(*columns(mixed), recall)) == points_of(pr_curve(*columns(queries), recall))
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "transform", [torch.exp, lambda s: 3 * s - 7, lambda s: s**3], ids=["exp", "line", "cube"]
+)
+@given(queries=QUERIES)
+def test_only_the_order_of_scores_counts(
+    transform: object, queries: list[tuple[float, bool, bool]], recall: Recall
+) -> None:
+    assert callable(transform)
+    score, right, answerable = columns(queries)
+    before, after = (pr_curve(s, right, answerable, recall) for s in (score, transform(score)))
+    assert torch.equal(before.precision, after.precision)
+    assert torch.equal(before.recall, after.recall)
+
+
+@given(queries=QUERIES)
+def test_the_reported_recall_is_never_the_smaller(queries: list[tuple[float, bool, bool]]) -> None:
+    every, reported = (pr_curve(*columns(queries), recall) for recall in ("all", "reported"))
+    assert (reported.recall >= every.recall).all()
+    assert (every.recall.diff() >= 0).all()
+    assert (reported.recall.diff() >= 0).all()
+
+
+def test_by_hand() -> None:
+    """Five queries: right, right, wrong, right, and one that reports nothing; all had an answer."""
+    score = torch.tensor([1.0, 2.0, 3.0, 4.0, INF])
+    right = torch.tensor([True, True, False, True, False])
+    every = pr_curve(score, right, torch.ones(5, dtype=torch.bool))
+    assert every.precision.tolist() == [1, 1, 2 / 3, 3 / 4]
+    assert every.recall.tolist() == pytest.approx([1 / 5, 2 / 5, 2 / 5, 3 / 5])
+    assert every.threshold.tolist() == [1, 2, 3, 4]
+    reported = pr_curve(score, right, torch.ones(5, dtype=torch.bool), "reported")
+    assert reported.recall.tolist() == pytest.approx([1 / 5, 2 / 5, 2 / 4, 3 / 4])
+    # the steps of recall times the mean precision, no point added at recall 0
+    assert area(every) == pytest.approx(1 / 5 * 1 + 0 + 1 / 5 * (2 / 3 + 3 / 4) / 2)
+    assert area(reported) == pytest.approx(1 / 5 + 1 / 10 * (1 + 2 / 3) / 2 + 1 / 4 * (2 / 3 + 3 / 4) / 2)
+    assert recall_at_full_precision(every) == pytest.approx(2 / 5)
+
+
+def test_queries_with_equal_scores_report_together() -> None:
+    curve = pr_curve(torch.ones(4), torch.tensor([True, False, True, True]), torch.ones(4, dtype=torch.bool))
+    assert points_of(curve) == [(0.75, 0.75, 1.0)]
+
+
+def test_an_unanswerable_query_costs_precision_and_no_recall() -> None:
+    curve = pr_curve(torch.tensor([1.0, 2.0]), torch.tensor([False, True]), torch.tensor([False, True]))
+    assert points_of(curve) == [(0.0, 0.0, 1.0), (0.5, 1.0, 2.0)]
+
+
+@BOTH
+@pytest.mark.parametrize("queries", [0, 3])
+def test_a_curve_without_reports_is_empty(queries: int, recall: Recall) -> None:
+    silent, none = torch.full((queries,), INF), torch.zeros(queries, dtype=torch.bool)
+    curve = pr_curve(silent, none, ~none, recall)
+    assert [len(column) for column in curve] == [0, 0, 0]
+    assert area(curve) == recall_at_full_precision(curve) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("score", "right", "answerable"),
+    [
+        (torch.zeros(3), torch.ones(2) > 0, torch.ones(3) > 0),
+        (torch.zeros(3), torch.ones(3) > 0, torch.ones(4) > 0),
+        (torch.zeros(3, 1), torch.ones(3, 1) > 0, torch.ones(3, 1) > 0),
+        (torch.tensor([0.0, torch.nan]), torch.ones(2) > 0, torch.ones(2) > 0),
+    ],
+)
+def test_what_is_no_column_of_scores_is_refused(score: Tensor, right: Tensor, answerable: Tensor) -> None:
+    with pytest.raises(InputError, match=r"\A[^\n]*expected[^\n]*\Z"):
+        pr_curve(score, right, answerable)
+
+
+# matches and truth
+
+
+def match_of(index: list[int], score: list[float] | None = None) -> Match:
+    scores = torch.arange(len(index)).float() if score is None else torch.tensor(score)
+    places = torch.where(scores.isfinite(), torch.tensor(index), -1)
+    return Match(places, scores, scores.isfinite())
+
+
+@given(PLACED, st.integers(0, 3))
+def test_judge_equals_literal_loops(rows: list[tuple[float, int, list[int]]], tolerance: int) -> None:
+    match = match_of([index for _, index, _ in rows], [score for score, _, _ in rows])
+    queries = []
+    for score, index, truth in rows:
+        places = [t for t in truth if t >= 0]
+        queries.append((score, any(abs(index - t) <= tolerance for t in places), bool(places)))
+    every, reported = literal_curve(queries, "all"), literal_curve(queries, "reported")
+    right = sum(r for score, r, _ in queries if score < INF)
+    expected = Scores(
+        auc=literal_area(every),
+        auc_reported=literal_area(reported),
+        recall_at_100_precision=max((r for p, r, _ in every if p == 1), default=0.0),
+        recall_at_100_precision_reported=max((r for p, r, _ in reported if p == 1), default=0.0),
+        precision_at_100_recall=right / max(1, sum(score < INF for score, _, _ in queries)),
+        recall_at_1=right / max(1, sum(a for _, _, a in queries)),
+    )
+    assert judge(match, torch.tensor([truth for _, _, truth in rows]), tolerance) == pytest.approx(expected)
+
+
+def test_a_perfect_matcher_scores_one_save_for_the_missing_starting_point() -> None:
+    scores = judge(match_of(list(range(10))), torch.arange(10)[:, None], 0)
+    # the curve begins at recall 1/10, and no point is added before it
+    assert scores.auc == scores.auc_reported == pytest.approx(0.9)
+    assert scores[2:] == (1.0, 1.0, 1.0, 1.0)
+
+
+def test_a_matcher_that_reports_nothing_scores_zero() -> None:
+    assert judge(match_of([0] * 4, [INF] * 4), torch.arange(4)[:, None], 5) == (0.0,) * 6
+
+
+def test_without_any_right_answer_all_scores_are_zero() -> None:
+    assert judge(match_of([0, 1]), torch.full((2, 1), -1), 5) == (0.0,) * 6
+
+
+def test_convention_5_tolerance_is_inclusive_in_every_score() -> None:
+    match, truth = match_of([5, 6]), torch.zeros(2, 1, dtype=torch.int64)
+    assert judge(match, truth, 4).recall_at_1 == 0.0
+    assert judge(match, truth, 5).recall_at_1 == 0.5
+    assert judge(match, truth, 6).recall_at_1 == 1.0
+    assert curve_of(match, truth, 5).precision.tolist() == [1.0, 0.5]
+
+
+def test_convention_6_recall_is_of_all_answerable_queries_and_reported_forgives_wrong_reports() -> None:
+    """Two right reports, one wrong one, one silent query, one query without an answer."""
+    match = match_of([0, 1, 9, 0, 4], [1.0, 2.0, 3.0, INF, 4.0])
+    truth = torch.tensor([[0], [1], [2], [3], [-1]])
+    assert curve_of(match, truth, 0).recall[-1] == 2 / 4
+    assert curve_of(match, truth, 0, "reported").recall[-1] == pytest.approx(2 / 3)
+    scores = judge(match, truth, 0)
+    assert scores.recall_at_1 == scores.recall_at_100_precision == 2 / 4
+    assert scores.recall_at_100_precision_reported == 2 / 4  # at score 2 two answerable queries are silent
+    assert scores.precision_at_100_recall == 2 / 4
+
+
+def test_convention_6_the_paper_s_figures_fit_the_reported_recall() -> None:
+    """Every query reports, 95 of 100 rightly: 95 % precision at 100 % recall."""
+    match, truth = match_of([0] * 95 + [9] * 5), torch.zeros(100, 1, dtype=torch.int64)
+    assert curve_of(match, truth, 5, "reported").recall[-1] == 1.0
+    assert curve_of(match, truth, 5, "all").recall[-1] == pytest.approx(0.95)
+    assert judge(match, truth, 5).precision_at_100_recall == pytest.approx(0.95)
+
+
+def test_convention_7_curves_are_plain_tensors_without_torchmetrics() -> None:
+    for column in curve_of(match_of([0, 1, 2]), torch.arange(3)[:, None], 0):
+        assert type(column) is Tensor
+        assert (column.dtype, column.ndim) == (torch.float64, 1)
+    code = "import sys, dejavu_torch.evaluation.curves; sys.exit('torchmetrics' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_convention_7_thresholds_are_the_scores_themselves() -> None:
+    """No sigmoid: distances that differ by little at a large value stay apart."""
+    score = torch.tensor([1000.0, 1000.001, 1000.002], dtype=torch.float64)
+    curve = pr_curve(score, torch.tensor([True, False, True]), torch.ones(3, dtype=torch.bool))
+    assert torch.equal(curve.threshold, score)
+
+
+@pytest.mark.parametrize("truth", [torch.zeros(3, 1), torch.zeros(2), torch.zeros(2, 1, 1)])
+def test_a_truth_that_does_not_fit_is_refused(truth: Tensor) -> None:
+    with pytest.raises(InputError, match=r"\Athe truth is \([^\n]*expected \(2, R\)[^\n]*\Z"):
+        judge(match_of([0, 1]), truth.long(), 5)
+
+
+def test_a_negative_tolerance_is_refused() -> None:
+    with pytest.raises(InputError, match=r"\Athe tolerance is -1; expected at least 0\Z"):
+        judge(match_of([0, 1]), torch.zeros(2, 1).long(), -1)

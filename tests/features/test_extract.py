@@ -1,0 +1,145 @@
+"""Features of a traverse, batch by batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch import HOG, ArrayTraverse, InputError, Traverse
+from dejavu_torch.features.extract import feature_batches, features_of, holds_features
+
+
+class Pooled(nn.Module):
+    """Channel means through a layer with weights; remembers in which mode it ran."""
+
+    def __init__(self, channels: int = 1) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(channels)
+        self.modes: list[bool] = []
+
+    def forward(self, frames: Tensor) -> Tensor:
+        self.modes.append(self.training)
+        return self.norm(frames).mean((2, 3))
+
+
+class Listed(Traverse):
+    """The given batches, whatever they are."""
+
+    name = "the list"
+
+    def __init__(self, *batches: Tensor) -> None:
+        self.list = batches
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        yield from self.list
+
+
+def test_frames_go_through_the_module_in_order() -> None:
+    frames = torch.rand(10, 1, 24, 24)
+    whole = HOG()(frames)
+    for size in (1, 3, 10, 64):
+        batches = list(feature_batches(ArrayTraverse(frames), HOG(), size))
+        assert max(len(batch) for batch in batches) <= size
+        torch.testing.assert_close(torch.cat(batches), whole, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_runs_in_eval_mode_and_restores_the_mode(training: bool) -> None:
+    module = Pooled().train(training)
+    list(feature_batches(ArrayTraverse(torch.rand(5, 1, 4, 4)), module, 2))
+    assert module.modes == [False] * 3
+    assert module.training is training
+    assert module.norm.training is training
+    assert int(module.norm.num_batches_tracked) == 0
+
+
+def test_restores_the_mode_after_an_error_and_when_abandoned() -> None:
+    module = Pooled().train()
+    frames = torch.rand(6, 1, 4, 4)
+    batches = feature_batches(ArrayTraverse(frames), module, 2)
+    next(batches)
+    batches.close()
+    assert module.training
+    frames[3] = torch.nan
+    with pytest.raises(InputError):
+        list(feature_batches(ArrayTraverse(frames), module, 2))
+    assert module.training
+
+
+def test_restores_the_mode_of_frozen_parts() -> None:
+    module = Pooled().train()
+    module.norm.eval()
+    list(feature_batches(ArrayTraverse(torch.rand(2, 1, 4, 4)), module))
+    assert module.training
+    assert not module.norm.training
+
+
+def test_keeps_no_gradients() -> None:
+    frames = torch.rand(4, 1, 4, 4, requires_grad=True)
+    for features in feature_batches(ArrayTraverse(frames), Pooled(), 2):
+        assert not features.requires_grad
+
+
+def test_keeps_no_gradients_of_ready_features() -> None:
+    features = torch.rand(4, 3, requires_grad=True)
+    assert not next(feature_batches(ArrayTraverse(features), HOG())).requires_grad
+
+
+def test_ready_features_pass_as_they_are() -> None:
+    module = Pooled()
+    features = torch.rand(7, 3)
+    assert torch.equal(torch.cat(list(feature_batches(ArrayTraverse(features), module, 2))), features)
+    assert module.modes == []
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("size", [1, 2, 64])
+def test_a_bad_frame_is_named_by_its_number(bad: float, size: int) -> None:
+    frames = torch.rand(8, 1, 16, 16)
+    frames[5, 0, 8, 8] = bad
+    with pytest.raises(InputError, match=r"frame 5 gives NaN or infinite features; expected finite"):
+        list(feature_batches(ArrayTraverse(frames), HOG(), size))
+    features = torch.rand(8, 3)
+    features[5, 1] = bad
+    with pytest.raises(InputError, match=r"frame 5 "):
+        list(feature_batches(ArrayTraverse(features), HOG(), size))
+
+
+@pytest.mark.parametrize(
+    "module",
+    [nn.Identity(), nn.Flatten(0), nn.Sequential(nn.Flatten(), nn.Unflatten(0, (1, 4)), nn.Flatten())],
+    ids=["images", "one vector", "one row"],
+)
+def test_a_module_that_makes_no_feature_rows_is_refused(module: nn.Module) -> None:
+    with pytest.raises(InputError, match=r"made .* of \(4, 1, 2, 2\); expected features \(4, D\)"):
+        list(feature_batches(ArrayTraverse(torch.rand(4, 1, 2, 2)), module))
+
+
+@pytest.mark.parametrize(
+    "batch", [torch.rand(2, 3, 4), torch.zeros(2, 1, 4, 4, dtype=torch.uint8), torch.zeros(2, 3).long()]
+)
+def test_a_batch_that_is_neither_frames_nor_features_is_refused(batch: Tensor) -> None:
+    with pytest.raises(InputError, match=r"the list gives batches .*; expected float frames"):
+        list(feature_batches(Listed(batch), HOG()))
+
+
+def test_a_traverse_without_frames_is_refused() -> None:
+    module = Pooled().train()
+    with pytest.raises(InputError, match=r"the list holds no frames; expected at least one"):
+        list(feature_batches(Listed(), module))
+    assert module.training
+
+
+def test_features_of_keeps_gradients() -> None:
+    frames = torch.rand(2, 1, 16, 16, requires_grad=True)
+    features_of(frames, HOG()).sum().backward()
+    assert frames.grad is not None
+
+
+def test_holds_features() -> None:
+    assert holds_features(ArrayTraverse(torch.rand(3, 2)))
+    assert not holds_features(ArrayTraverse(torch.rand(3, 1, 4, 4)))
+    assert not holds_features(Listed())

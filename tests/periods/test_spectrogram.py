@@ -1,0 +1,322 @@
+"""Which features repeat, by the spectrogram of each: known waves go in, known periods come out."""
+
+from __future__ import annotations
+
+import logging
+import math
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import InputError, SpectrogramAnalysis
+from dejavu_torch.periods.spectrogram import bin_period, noise_share, strongest_bins
+from dejavu_torch.types import Plan
+
+
+def wave(frames: int, cycles: float, over: int | None = None, phase: float = 0.3) -> Tensor:
+    """A sine of so many cycles per `over` frames (default: all), (N,) float64."""
+    return torch.sin(2 * math.pi * cycles * torch.arange(frames).double() / (over or frames) + phase)
+
+
+def literal(window: int = 1024, **other: object) -> SpectrogramAnalysis:
+    """The paper's letter."""
+    return SpectrogramAnalysis(window, **{"peaks": "bins", "false_alarm": None, "short": "refuse", **other})
+
+
+def periods_of(plan: Plan, feature: int) -> list[int]:
+    return [int(layer.period) for layer in plan if feature in layer.features]
+
+
+@pytest.mark.parametrize(("k", "period"), [(11, 93), (6, 171), (2, 512), (128, 8), (3, 341), (10, 102)])
+def test_golden_bins_of_1024(k: int, period: int) -> None:
+    assert bin_period(1024, k) == period
+
+
+@given(st.integers(16, 4096), st.data())
+def test_a_bin_names_the_nearest_whole_period(length: int, data: st.DataObject) -> None:
+    k = data.draw(st.integers(1, length // 2))
+    assert abs(bin_period(length, k) - Fraction(length, k)) <= Fraction(1, 2)
+
+
+@pytest.mark.parametrize("peaks", ["bins", "local"])
+@pytest.mark.parametrize(("cycles", "period"), [(11, 93), (6, 171), (2, 512), (128, 8)])
+def test_a_known_sine_is_found(cycles: int, period: int, peaks: str) -> None:
+    plan = SpectrogramAnalysis(peaks=peaks, strongest=1).plan(wave(1024, cycles)[:, None])
+    assert [(layer.period, layer.phases, layer.start, layer.stop, layer.features) for layer in plan] == [
+        (Fraction(period), period, 0, 1024, (0,))
+    ]
+
+
+def test_power_is_that_of_numpy() -> None:
+    features = torch.randn(50, 3, dtype=torch.float64)
+    (spectrum,) = SpectrogramAnalysis(50)(features)
+    centred = features.numpy() - features.numpy().mean(0)
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(50) / 50)
+    expected = np.abs(np.fft.rfft(centred * hann[:, None], axis=0)) ** 2
+    np.testing.assert_allclose(spectrum.power.numpy(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_hann_window_spreads_a_sine_over_three_bins() -> None:
+    (spectrum,) = SpectrogramAnalysis(256)(wave(256, 20)[:, None])
+    share = (spectrum.power / spectrum.power.sum())[:, 0]
+    torch.testing.assert_close(share[19:22], torch.tensor([1, 4, 1]).double() / 6, rtol=1e-4, atol=0)
+
+
+def test_strongest_bins_by_hand() -> None:
+    power = torch.tensor([[9.0, 8.0, 0.0, 1.0, 4.0, 3.0, 0.0, 2.0, 0.5, 7.0]]).T
+    assert strongest_bins(power, 2, 8, "bins").T.tolist() == [[4, 5]]  # the second is leakage of the first
+    assert strongest_bins(power, 2, 8, "local").T.tolist() == [[4, 7]]
+    # bins 0 and 1 and those beyond `last` never count, also as peaks
+    assert strongest_bins(power, 3, 7, "local").T.tolist() == [[4, 7, -1]]
+    assert strongest_bins(power, 9, 8, "bins").T.tolist() == [[4, 5, 7, 3, 8, -1, -1, -1, -1]]
+
+
+@pytest.mark.parametrize("peaks", ["bins", "local"])
+def test_of_equal_bins_the_lower_wins(peaks: str) -> None:
+    power = torch.tensor([[0.0, 0.0, 1.0, 5.0, 1.0, 5.0, 1.0, 5.0, 0.0]]).T
+    assert strongest_bins(power, 2, 8, peaks).T.tolist() == [[3, 5]]
+
+
+def test_a_plateau_is_one_peak() -> None:
+    power = torch.tensor([[0.0, 0.0, 1.0, 5.0, 5.0, 5.0, 1.0, 0.0]]).T
+    assert strongest_bins(power, 2, 7, "local").T.tolist() == [[3, -1]]
+
+
+@pytest.mark.parametrize("peaks", ["bins", "local"])
+def test_bins_without_power_are_no_candidates(peaks: str) -> None:
+    assert strongest_bins(torch.zeros(9, 2), 3, 8, peaks).tolist() == [[-1, -1]] * 3
+
+
+def test_bins_takes_leakage_for_a_period_and_local_does_not() -> None:
+    # amplitude 0.4: power 0.16 at bin 20, less than the 0.25 that bin 8 leaks into bins 7 and 9
+    features = (wave(256, 8.1) + 0.4 * wave(256, 20))[:, None]
+    assert periods_of(literal(256).plan(features), 0) == [bin_period(256, 9), 32]
+    assert periods_of(SpectrogramAnalysis(256).plan(features), 0) == [13, 32]
+
+
+@pytest.mark.parametrize(("strongest", "periods"), [(1, [32]), (2, [13, 32]), (3, [9, 13, 32])])
+def test_as_many_periods_as_asked_for(strongest: int, periods: list[int]) -> None:
+    features = (wave(256, 8) + 0.8 * wave(256, 20) + 0.6 * wave(256, 28))[:, None]
+    assert periods_of(SpectrogramAnalysis(256, strongest=strongest).plan(features), 0) == periods
+
+
+@pytest.mark.parametrize("peaks", ["bins", "local"])
+def test_periods_lie_between_the_shortest_and_half_the_window(peaks: str) -> None:
+    plan = SpectrogramAnalysis(100, min_period=10, peaks=peaks, false_alarm=None).plan(torch.randn(100, 40))
+    assert plan
+    assert all(10 <= layer.period <= 50 for layer in plan)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "frames", "chunks"),
+    [
+        ({"window": 100}, 300, [(0, 100), (100, 200), (200, 300)]),
+        ({"window": 100}, 350, [(0, 100), (100, 200), (200, 300), (300, 350)]),
+        ({"window": 100}, 316, [(0, 100), (100, 200), (200, 300), (300, 316)]),
+        ({"window": 100}, 315, [(0, 100), (100, 200), (200, 300)]),  # under two periods of 8
+        ({"window": 100, "min_period": 30}, 350, [(0, 100), (100, 200), (200, 300)]),
+        ({"window": 100, "hop": 50}, 250, [(0, 100), (50, 150), (100, 200), (150, 250)]),
+        ({"window": 100, "hop": 50}, 230, [(0, 100), (50, 150), (100, 200), (150, 230)]),
+        ({"window": 100, "hop": 100}, 200, [(0, 100), (100, 200)]),
+        ({"window": 100}, 60, [(0, 60)]),
+        ({"window": 100, "hop": 80}, 60, [(0, 60)]),
+    ],
+)
+def test_chunks(arguments: dict[str, int], frames: int, chunks: list[tuple[int, int]]) -> None:
+    analysis = SpectrogramAnalysis(**arguments)
+    assert analysis.chunks(frames) == chunks
+    spectra = analysis(torch.randn(frames, 2))
+    assert [(spectrum.start, spectrum.stop) for spectrum in spectra] == chunks
+    assert all(s.power.shape == ((s.stop - s.start) // 2 + 1, 2) for s in spectra)
+
+
+@given(st.integers(16, 60), st.integers(1, 60), st.integers(16, 400))
+def test_chunks_leave_out_less_than_two_of_the_shortest_periods(window: int, hop: int, frames: int) -> None:
+    chunks = SpectrogramAnalysis(window, hop=min(hop, window)).chunks(frames)
+    assert all(16 <= stop - start <= window for start, stop in chunks)
+    assert chunks[0][0] == 0
+    assert all(b[0] <= a[1] for a, b in pairwise(chunks))
+    assert 0 <= frames - chunks[-1][1] < 16
+
+
+def test_each_chunk_has_its_own_periods() -> None:
+    features = torch.cat([wave(100, 10), wave(100, 5), wave(50, 5)])[:, None]
+    plan = SpectrogramAnalysis(100, strongest=1).plan(features)
+    assert [(layer.start, layer.stop, int(layer.period)) for layer in plan] == [
+        (0, 100, 10),
+        (100, 200, 20),
+        (200, 250, 10),
+    ]
+
+
+def test_convention_3_hann_window_of_1024_not_centred_remainder_of_its_own() -> None:
+    analysis = SpectrogramAnalysis()
+    assert (analysis.window, analysis.min_period, analysis.strongest) == (1024, 8, 2)
+    assert analysis.chunks(3072) == [(0, 1024), (1024, 2048), (2048, 3072)]
+    assert analysis.chunks(2500)[-1] == (2048, 2500)
+    features = torch.randn(2500, 1)
+    alone = analysis(features[1024:2048])[0].power  # nothing beyond the chunk is read
+    torch.testing.assert_close(analysis(features)[1].power, alone)
+
+
+def test_convention_3_others_shrink_a_long_window_and_say_so(caplog: pytest.LogCaptureFixture) -> None:
+    features = wave(300, 10)[:, None]
+    with caplog.at_level(logging.WARNING, "dejavu_torch"):
+        (layer,) = SpectrogramAnalysis(1024, strongest=1).plan(features)
+    assert (layer.period, layer.start, layer.stop) == (30, 0, 300)
+    (record,) = caplog.records
+    assert "1024" in record.getMessage()
+    assert "300" in record.getMessage()
+
+
+def test_convention_3_the_paper_refuses_a_long_window() -> None:
+    with pytest.raises(InputError, match=r"300 frames; expected at least 1024, the window"):
+        literal()(torch.randn(300, 1))
+    assert len(literal()(torch.randn(1024, 1))) == 1
+
+
+@pytest.mark.parametrize("frames", [64, 256, 1000])
+def test_white_noise_gives_no_layers(frames: int) -> None:
+    for _ in range(5):
+        assert SpectrogramAnalysis(256).plan(torch.randn(frames, 30)) == ()
+
+
+def test_false_alarms_are_as_rare_as_promised() -> None:
+    analysis = SpectrogramAnalysis(64, false_alarm=0.1)
+    alarms = sum(bool(analysis.plan(torch.randn(64, 4))) for _ in range(200))
+    assert alarms <= 0.1 * 200
+    assert all(literal(64).plan(torch.randn(64, 4)) for _ in range(20))  # no gate: noise has periods too
+
+
+def test_a_periodic_feature_survives_among_noise() -> None:
+    features = torch.randn(512, 20)
+    features[:, 7] += 1.5 * wave(512, 16).float()
+    pulses = (torch.arange(512) % 20 < 4).float()
+    features[:, 3] = pulses + 0.2 * torch.randn(512)
+    plan = SpectrogramAnalysis(512, strongest=1).plan(features)
+    assert {(int(layer.period), layer.features) for layer in plan} == {(20, (3,)), (32, (7,))}
+
+
+def test_noise_share_is_fishers_test() -> None:
+    """Shares of independent, exponentially distributed powers: the case the bound is made for."""
+    least = noise_share(64, 5, 0.2)
+    power = torch.empty(4000, 64, 5).exponential_()
+    exceeded = (power / power.sum(1, keepdim=True) > least).flatten(1).any(1).double().mean()
+    assert 0.14 < exceeded < 0.21
+    assert noise_share(64, 5, 0.01) > least
+    assert noise_share(64, 50, 0.2) > least
+    assert noise_share(512, 5, 0.2) < least
+
+
+@pytest.mark.parametrize("peaks", ["bins", "local"])
+@pytest.mark.parametrize("false_alarm", [None, 1e-3])
+@pytest.mark.parametrize("value", [0.0, 0.1, -3.7, 1e6])
+def test_a_constant_feature_has_no_period(value: float, false_alarm: float | None, peaks: str) -> None:
+    features = torch.stack([torch.full((512,), value), wave(512, 16).float()], 1)
+    analysis = SpectrogramAnalysis(256, peaks=peaks, false_alarm=false_alarm)
+    assert all(spectrum.power[:, 0].count_nonzero() == 0 for spectrum in analysis(features))
+    plan = analysis.plan(features)
+    assert plan
+    assert periods_of(plan, 0) == []
+    assert analysis.plan(features[:, :1]) == ()
+
+
+def test_a_feature_may_be_constant_in_one_chunk_only() -> None:
+    features = torch.cat([torch.full((128,), 0.1), wave(128, 8).float()])[:, None]
+    plan = SpectrogramAnalysis(128, strongest=1).plan(features)
+    assert [(layer.start, int(layer.period)) for layer in plan] == [(128, 16)]
+
+
+@pytest.mark.parametrize("analysis", [literal(128), SpectrogramAnalysis(128, similar=1.0)])
+def test_offset_and_scale_do_not_matter(analysis: SpectrogramAnalysis) -> None:
+    features = torch.randn(300, 6, dtype=torch.float64) + 3 * wave(300, 16, over=128)[:, None]
+    assert analysis.plan(features)
+    assert analysis.plan(4 * features + 0.5) == analysis.plan(features)
+
+
+@pytest.mark.parametrize(
+    "analysis", [literal(128), SpectrogramAnalysis(128), SpectrogramAnalysis(128, similar=1)]
+)
+def test_permuting_features_permutes_only_their_numbers(analysis: SpectrogramAnalysis) -> None:
+    features = torch.randn(300, 12)
+    for j in range(12):
+        features[:, j] += 2 * wave(300, 6 + j % 5, over=128).float()
+    order = torch.randperm(12)
+    place = order.argsort().tolist()  # feature j of the first is feature place[j] of the second
+
+    def described(plan: Plan, names: list[int]) -> list[tuple]:
+        return [(x.period, x.phases, x.start, x.stop, sorted(names[j] for j in x.features)) for x in plan]
+
+    plan = analysis.plan(features)
+    assert plan
+    assert described(analysis.plan(features[:, order]), list(range(12))) == described(plan, place)
+
+
+def test_features_of_similar_period_share_a_layer() -> None:
+    """Similar: within so many bins of the layer's most common period."""
+    features = torch.stack([wave(256, k) for k in (16, 16, 17, 30)], 1)
+    apart = SpectrogramAnalysis(256, strongest=1).plan(features)
+    assert [(int(layer.period), layer.features) for layer in apart] == [(9, (3,)), (15, (2,)), (16, (0, 1))]
+    together = SpectrogramAnalysis(256, strongest=1, similar=1.1).plan(features)
+    assert [(int(layer.period), layer.features) for layer in together] == [(9, (3,)), (16, (0, 1, 2))]
+
+
+def test_gradients_are_right() -> None:
+    features = torch.randn(28, 2, dtype=torch.float64, requires_grad=True)
+    analysis = SpectrogramAnalysis(12, min_period=2)
+    assert len(analysis(features)) == 3
+    assert torch.autograd.gradcheck(lambda x: tuple(s.power for s in analysis(x)), features)
+
+
+def test_gradients_stop_at_the_plan() -> None:
+    features = wave(128, 8)[:, None].requires_grad_()
+    (layer,) = SpectrogramAnalysis(128, strongest=1).plan(features)
+    assert isinstance(layer.period, Fraction)
+    assert features.grad is None
+
+
+def test_state_dict_round_trip() -> None:
+    analysis = SpectrogramAnalysis(64)
+    SpectrogramAnalysis(64).load_state_dict(analysis.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"window": 15}, r"window=15, min_period=8.*expected .*window >= 2 \* min_period"),
+        ({"min_period": 1}, r"min_period=1.*expected min_period >= 2"),
+        ({"strongest": 0}, r"strongest=0.*expected .*strongest >= 1"),
+        ({"hop": 0}, r"hop=0; expected 1\.\.1024"),
+        ({"hop": 1025}, r"hop=1025; expected 1\.\.1024"),
+        ({"peaks": "all"}, r"peaks='all'.*expected .*'local' or 'bins'"),
+        ({"short": "pad"}, r"short='pad'.*expected .*'shrink' or 'refuse'"),
+        ({"similar": -1.0}, r"similar=-1\.0.*expected .*similar >= 0"),
+        ({"false_alarm": 0.0}, r"false_alarm=0\.0; expected None or a number in \(0, 1\)"),
+        ({"false_alarm": 1.0}, r"false_alarm=1\.0; expected"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        SpectrogramAnalysis(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (torch.randn(100), r"\(100,\) torch\.float32; expected float features \(N,D\)"),
+        (torch.zeros(100, 2).long(), r"torch\.int64; expected float features"),
+        (torch.full((100, 2), torch.nan), r"not finite; expected finite numbers"),
+        (torch.randn(15, 2), r"15 frames; expected at least 16, two periods of 8"),
+        (torch.randn(1, 2), r"1 frame; expected at least 16"),
+    ],
+)
+def test_features_that_do_not_fit_are_refused(features: Tensor, message: str) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        SpectrogramAnalysis().plan(features)
+    assert "\n" not in str(error.value)

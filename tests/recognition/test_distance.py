@@ -1,0 +1,157 @@
+"""Distance of a query to every phase of a layer (eq. 3)."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+import reference
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import FrequencyLayer, InputError, phase_distances
+
+METRICS = ["l1", "l2", "cosine"]
+
+
+def loops(query: Tensor, templates: Tensor, metric: str) -> Tensor:
+    """Each metric from its definition, pair by pair."""
+
+    def one(a: Tensor, b: Tensor) -> Tensor:
+        if metric == "l1":
+            return (a - b).abs().sum()
+        if metric == "l2":
+            return (a - b).square().sum().sqrt()
+        return 1 - (a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()
+
+    return torch.stack([torch.stack([one(a, b) for b in templates]) for a in query])
+
+
+@given(st.integers(1, 5), st.integers(1, 6), st.integers(1, 8), st.integers(0, 2**16))
+def test_eq_3_equals_reference(queries: int, phases: int, features: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    query = torch.randn(queries, features, generator=generator, dtype=torch.float64)
+    mu = torch.randn(phases, features, generator=generator, dtype=torch.float64)
+    layer = FrequencyLayer(Fraction(phases), phases, 0, 1, tuple(range(features)))
+    expected = [
+        [reference.phase_distance(row, mu.tolist(), k, layer) for k in range(phases)]
+        for row in query.tolist()
+    ]
+    torch.testing.assert_close(phase_distances(query, mu).tolist(), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_metrics_are_their_definitions(metric: str) -> None:
+    query, mu = torch.randn(6, 10, dtype=torch.float64), torch.randn(7, 10, dtype=torch.float64)
+    torch.testing.assert_close(
+        phase_distances(query, mu, metric), loops(query, mu, metric), rtol=0, atol=1e-12
+    )
+
+
+def test_l1_is_the_default() -> None:
+    query, mu = torch.randn(3, 4), torch.randn(5, 4)
+    assert torch.equal(phase_distances(query, mu), phase_distances(query, mu, "l1"))
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2"])
+def test_small_distances_between_large_features_are_kept(metric: str) -> None:
+    """|a - b| squared as a*a + b*b - 2ab would lose them in float32."""
+    query = 1000 + torch.rand(40, 64)
+    mu = query + 0.01
+    expected = loops(query.double(), mu.double(), metric)
+    torch.testing.assert_close(phase_distances(query, mu, metric).double(), expected, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2"])
+def test_a_template_has_distance_0_to_itself(metric: str) -> None:
+    mu = torch.rand(40, 64)
+    assert phase_distances(mu, mu, metric).diagonal().tolist() == [0.0] * 40
+
+
+def test_cosine_of_nothing_is_finite() -> None:
+    query = torch.zeros(1, 3, requires_grad=True)
+    distance = phase_distances(query, torch.rand(2, 3), "cosine")
+    assert distance.tolist() == [[1.0, 1.0]]
+    distance.sum().backward()
+    assert query.grad is not None
+    assert query.grad.isfinite().all()
+
+
+def test_a_callable_is_a_metric() -> None:
+    query, mu = torch.randn(3, 4), torch.randn(5, 4)
+    largest = phase_distances(query, mu, lambda a, b: torch.cdist(a, b, p=float("inf")))
+    torch.testing.assert_close(largest, (query[:, None] - mu).abs().amax(2))
+
+
+@pytest.mark.parametrize(
+    "metric", [lambda a, b: torch.cdist(a, b).T, lambda a, b: torch.cdist(a, b).sum(), lambda a, b: a]
+)
+def test_a_callable_that_gives_another_shape_is_refused(metric: object) -> None:
+    with pytest.raises(InputError, match=r"3 queries and 5 phases; expected \(3, 5\)"):
+        phase_distances(torch.rand(3, 4), torch.rand(5, 4), metric)  # type: ignore[arg-type]
+
+
+def test_an_unknown_metric_is_refused() -> None:
+    with pytest.raises(InputError, match=r"'manhattan' is unknown; expected l1, l2, cosine or a callable"):
+        phase_distances(torch.rand(3, 4), torch.rand(5, 4), "manhattan")
+
+
+@pytest.mark.parametrize("metric", [*METRICS, lambda a, b: a @ b.T])
+def test_convention_10_float32_whatever_the_autocast(metric: object) -> None:
+    query, mu = torch.rand(3, 50), torch.rand(5, 50)
+    plain = phase_distances(query, mu, metric)  # type: ignore[arg-type]
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = phase_distances(query, mu, metric)  # type: ignore[arg-type]
+    assert cast.dtype == torch.float32
+    assert torch.equal(cast, plain)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize(
+    ("query", "templates", "result"),
+    [
+        (torch.bfloat16, torch.float32, torch.float32),
+        (torch.bfloat16, torch.bfloat16, torch.float32),
+        (torch.float16, torch.float16, torch.float32),
+        (torch.float64, torch.float32, torch.float64),
+        (torch.float32, torch.float64, torch.float64),
+    ],
+)
+def test_convention_10_float32_at_least(
+    query: torch.dtype, templates: torch.dtype, result: torch.dtype, metric: str
+) -> None:
+    a, b = torch.rand(3, 4).to(query), torch.rand(5, 4).to(templates)
+    distances = phase_distances(a, b, metric)
+    assert distances.dtype == result
+    assert torch.equal(distances, phase_distances(a.to(result), b.to(result), metric))
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_convention_10_nothing_of_queries_times_phases_times_features(
+    metric: str, largest_tensor: type
+) -> None:
+    query = torch.rand(50, 40, requires_grad=True)
+    mu = torch.rand(60, 40, requires_grad=True)
+    with largest_tensor() as seen:
+        phase_distances(query, mu, metric).sum().backward()
+    assert seen.numel <= 60 * 50
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_gradients_are_right(metric: str) -> None:
+    query = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
+    mu = torch.randn(5, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda a, b: phase_distances(a, b, metric), (query, mu))
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_gradients_are_finite_where_query_and_template_are_equal(metric: str) -> None:
+    query = torch.rand(3, 4, requires_grad=True)
+    mu = query.detach().clone().requires_grad_()
+    phase_distances(query, mu, metric).sum().backward()
+    assert query.grad is not None
+    assert mu.grad is not None
+    assert query.grad.isfinite().all()
+    assert mu.grad.isfinite().all()

@@ -1,0 +1,363 @@
+"""Scores of all places (eq. 4): against literal loops, in closed form, and within their memory."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from itertools import pairwise
+
+import pytest
+import reference
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import (
+    CompressedMap,
+    DejaVu,
+    FrequencyLayer,
+    InputError,
+    Matcher,
+    PhaseTemplates,
+    best_match,
+    phase_distances,
+)
+from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.periods.support import common_period
+from dejavu_torch.recognition.scores import combine_layers, segments
+from dejavu_torch.types import Plan
+
+METRICS = ["l1", "l2", "cosine"]
+
+
+def whole(period: int, stop: int, features: tuple[int, ...] = (0,), start: int = 0) -> FrequencyLayer:
+    """The paper's case: as many phases as frames in a period."""
+    return FrequencyLayer(Fraction(period), period, start, stop, features)
+
+
+def make(values: Tensor, plan: Plan) -> CompressedMap:
+    return CompressedMap(plan, PhaseTemplates()(values, plan), *values.shape)
+
+
+MIXED: Plan = (
+    whole(4, 20, (0, 2)),
+    FrequencyLayer(Fraction(5, 2), 3, 5, 25, (0, 1)),
+    whole(7, 50, (1, 2, 3), start=30),
+)
+
+
+# ------------------------------------------------------------------ the letter
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+@given(route=reference.routes(), seed=st.integers(0, 2**16))
+def test_scores_equal_reference(reduction: str, route: reference.Route, seed: int) -> None:
+    values, plan = route
+    generator = torch.Generator().manual_seed(seed)
+    queries = torch.randn(3, values.shape[1], generator=generator, dtype=torch.float64)
+    queries[0] = values[seed % len(values)]
+    mus = [reference.templates(values.tolist(), layer) for layer in plan]
+    expected = [reference.scores(row, len(values), plan, mus, reduction) for row in queries.tolist()]
+    scores = Matcher(reduction=reduction)(queries, make(values, plan))  # type: ignore[arg-type]
+    torch.testing.assert_close(scores, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+@given(route=reference.routes())
+def test_the_place_found_is_the_references(route: reference.Route) -> None:
+    """Whole-number templates, so that ties are ties in both."""
+    values, plan = route
+    mus = [torch.randint(-3, 4, (x.phases, len(x.features))).double() for x in plan]
+    found = CompressedMap(plan, mus, *values.shape)
+    queries = torch.randint(-3, 4, (5, values.shape[1])).double()
+    scores = Matcher(reduction="sum")(queries, found)
+    match = best_match(scores, threshold=4.0)
+    lists = [mu.tolist() for mu in mus]
+    rows = [reference.scores(row, len(values), plan, lists) for row in queries.tolist()]
+    assert scores.tolist() == rows
+    assert match.index.tolist() == [reference.best(row) for row in rows]
+    assert match.accepted.tolist() == [reference.accepted(row, 4.0) for row in rows]
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_a_score_is_the_sum_of_the_distances_of_its_phases(metric: str) -> None:
+    values = torch.randn(50, 4, dtype=torch.float64)
+    route, queries = make(values, MIXED), torch.randn(3, 4, dtype=torch.float64)
+    scores = Matcher(metric, "sum")(queries, route)
+    parts = [
+        phase_distances(queries[:, list(layer.features)], mu, metric)
+        for layer, mu in zip(MIXED, route.blocks(), strict=True)
+    ]
+    torch.testing.assert_close(scores[:, 2], parts[0][:, 2])
+    torch.testing.assert_close(scores[:, 13], parts[0][:, 1] + parts[1][:, reference.phase(13, MIXED[1])])
+    torch.testing.assert_close(scores[:, 40], parts[2][:, 40 % 7])
+
+
+# ----------------------------------------------------------------- closed form
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+@pytest.mark.parametrize("periods", [(4, 6), (3, 5), (5,), (4, 6, 9), (Fraction(7, 2), 6)])
+def test_score_is_0_exactly_at_the_common_period(periods: tuple[Fraction, ...], reduction: str) -> None:
+    """A perfectly periodic traverse of dyadic values: S(i) = 0 exactly at i = q mod lcm."""
+    common = int(common_period(periods))
+    frames = 3 * common
+    plan, columns = [], []
+    for j, period in enumerate(map(Fraction, periods)):
+        phases = int(period * period.denominator)  # a phase holds one frame of each common turn
+        plan.append(FrequencyLayer(period, phases, 0, frames, (2 * j, 2 * j + 1)))
+        cycle = torch.stack([torch.arange(phases) / 8, torch.randperm(phases) / 4], 1).double()
+        columns.append(cycle[plan[-1].place_phases])
+    values = torch.cat(columns, 1)
+    scores = Matcher(reduction=reduction)(values, make(values, tuple(plan)))  # type: ignore[arg-type]
+    i, q = torch.arange(frames), torch.arange(frames)[:, None]
+    assert torch.equal(scores == 0, (i - q) % common == 0)
+    irrational = values * math.pi
+    scores = Matcher(reduction=reduction)(irrational, make(irrational, tuple(plan)))  # type: ignore[arg-type]
+    assert torch.equal(scores <= 1e-12, (i - q) % common == 0)
+
+
+@pytest.mark.parametrize("shift", [1, 5, -13])
+def test_shifting_the_route_shifts_the_scores(shift: int) -> None:
+    values = torch.randint(-16, 17, (48, 3)).double() / 8  # 48: whole turns of both layers
+    plan = (whole(12, 48, (0, 1)), whole(16, 48, (1, 2)))
+    queries = torch.randn(5, 3, dtype=torch.float64)
+    scores, shifted = (Matcher()(queries, make(v, plan)) for v in (values, values.roll(shift, 0)))
+    torch.testing.assert_close(shifted, scores.roll(shift, 1), rtol=0, atol=1e-12)
+
+
+@given(route=reference.routes(), random=st.randoms(use_true_random=False))
+def test_permuting_features_changes_nothing(route: reference.Route, random: object) -> None:
+    values, plan = route
+    order = list(range(values.shape[1]))
+    random.shuffle(order)  # type: ignore[attr-defined]
+    moved = tuple(
+        FrequencyLayer(x.period, x.phases, x.start, x.stop, tuple(sorted(order.index(j) for j in x.features)))
+        for x in plan
+    )
+    before = Matcher()(values, make(values, plan))
+    after = Matcher()(values[:, order], make(values[:, order], moved))
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
+
+
+def test_the_order_of_the_layers_changes_nothing() -> None:
+    values = torch.randn(50, 4, dtype=torch.float64)
+    before, after = (Matcher()(values, make(values, plan)) for plan in (MIXED, MIXED[::-1]))
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
+
+
+# ---------------------------------------------------------- coverage, reduction
+
+
+def test_convention_1_h_is_the_querys_and_l_the_covering_layers() -> None:
+    values = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
+    plan = (whole(1, 2), whole(1, 4, start=1))  # templates 0.5 and 2
+    scores = Matcher(reduction="sum")(torch.tensor([[10.0]]), make(values, plan))
+    assert scores.tolist() == [[9.5, 9.5 + 8, 8, 8]]
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+def test_convention_2_uncovered_places_score_inf(reduction: str, metric: str) -> None:
+    values = torch.rand(60, 4)
+    scores = Matcher(metric, reduction)(values[:5], make(values, MIXED))  # type: ignore[arg-type]
+    uncovered = torch.zeros(60, dtype=torch.bool)
+    uncovered[25:30] = uncovered[50:] = True
+    assert torch.equal(scores.isposinf(), uncovered.expand(5, 60))
+    assert scores[:, ~uncovered].isfinite().all()
+
+
+def test_convention_2_a_plan_without_layers_covers_nothing() -> None:
+    scores = Matcher()(torch.rand(3, 4), CompressedMap((), (), 20, 4))
+    assert scores.shape == (3, 20)
+    assert scores.isposinf().all()
+    assert best_match(scores).index.tolist() == [-1, -1, -1]
+
+
+def test_convention_3_sum_is_the_letter_and_the_default_is_comparable() -> None:
+    """Two chunks with 80 and 8 features: the printed sum sends no query of the first to the first."""
+    values = torch.zeros(40, 88)
+    values[:20, :80] = torch.rand(20, 80).round()
+    values[20:, 80:] = 1 + torch.rand(20, 8).round()
+    plan = (whole(20, 20, tuple(range(80))), whole(20, 40, tuple(range(80, 88)), start=20))
+    route = make(values, plan)
+    queries = values + 0.3 * (torch.rand_like(values).round() - 0.5).sign()
+    own_chunk = torch.arange(40) < 20
+    by_sum = best_match(Matcher(reduction="sum")(queries, route)).index
+    by_mean = best_match(Matcher()(queries, route)).index
+    assert ((by_sum < 20) & own_chunk).sum() == 0
+    assert ((by_mean < 20) == own_chunk).all()
+    assert by_mean[:20].tolist() == list(range(20))
+
+
+def test_convention_3_mean_is_the_sum_over_its_number_of_features() -> None:
+    values = torch.rand(50, 4)
+    route = make(values, MIXED)
+    ratio = Matcher(reduction="sum")(values, route) / Matcher()(values, route)
+    torch.testing.assert_close(ratio[:, :5], torch.full((50, 5), 2.0))
+    torch.testing.assert_close(ratio[:, 5:20], torch.full((50, 15), 4.0))
+    torch.testing.assert_close(ratio[:, 30:], torch.full((50, 20), 3.0))
+
+
+@pytest.mark.parametrize("metric", [*METRICS, lambda a, b: torch.cdist(a, b, p=1.0)])
+def test_mean_does_not_grow_with_the_number_of_features(metric: object) -> None:
+    """A feature written down nine times is still one feature's worth of distance."""
+    values = torch.rand(20, 3)
+    once = make(values, (whole(5, 20, (0, 1, 2)),))
+    often = make(values.repeat(1, 9), (whole(5, 20, tuple(range(27))),))
+    matcher = Matcher(metric)  # type: ignore[arg-type]
+    torch.testing.assert_close(matcher(values.repeat(1, 9), often), matcher(values, once))
+
+
+@given(route=reference.routes())
+def test_segments_cut_the_route_where_coverage_changes(route: reference.Route) -> None:
+    values, plan = route
+    parts = segments(plan, len(values))
+    assert parts[0].start == 0
+    assert parts[-1].stop == len(values)
+    assert all(a.stop == b.start for a, b in pairwise(parts))
+    for start, stop, members in parts:
+        for i in range(start, stop):
+            assert members == tuple(j for j, layer in enumerate(plan) if layer.start <= i < layer.stop)
+
+
+def test_combine_layers_of_a_plan_by_hand() -> None:
+    distances = [torch.tensor([[1.0, 2.0]]), torch.tensor([[10.0, 20.0, 30.0]])]
+    plan = (whole(2, 4), whole(3, 6, (0, 1), start=2))
+    total = combine_layers(distances, plan, 7, reduction="sum")
+    assert total.tolist() == [[1, 2, 31, 12, 20, 30, math.inf]]
+    mean = combine_layers(distances, plan, 7, reduction="mean")
+    torch.testing.assert_close(mean, torch.tensor([[1, 2, 31 / 3, 4, 10, 15, math.inf]]))
+
+
+# ------------------------------------------------- gradients, batches, precision
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+@pytest.mark.parametrize("metric", METRICS)
+def test_gradients_are_right_towards_queries_and_templates(metric: str, reduction: str) -> None:
+    plan = (whole(3, 8, (0, 2)), FrequencyLayer(Fraction(5, 2), 2, 4, 10, (0, 1)))
+    queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    blocks = [torch.randn(x.phases, len(x.features), dtype=torch.float64, requires_grad=True) for x in plan]
+    matcher = Matcher(metric, reduction)  # type: ignore[arg-type]
+
+    def covered(queries: Tensor, *blocks: Tensor) -> Tensor:
+        return matcher(queries, CompressedMap(plan, blocks, 10, 3))
+
+    assert torch.autograd.gradcheck(covered, (queries, *blocks))
+
+
+def test_gradients_reach_the_reference_features() -> None:
+    values = torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
+    queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    plan = (whole(3, 10, (0, 2)), whole(4, 10, (1,)))
+    assert torch.autograd.gradcheck(lambda q, v: Matcher()(q, make(v, plan)), (queries, values))
+
+
+def test_uncovered_places_leave_gradients_finite() -> None:
+    values = torch.rand(60, 4)
+    queries = torch.rand(3, 4, requires_grad=True)
+    scores = Matcher()(queries, make(values, MIXED))
+    torch.logsumexp(-scores, 1).sum().backward()
+    assert queries.grad is not None
+    assert queries.grad.isfinite().all()
+    assert queries.grad.count_nonzero() > 0
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_a_batch_is_its_queries_one_by_one(metric: str) -> None:
+    values = torch.rand(60, 4)
+    route, matcher = make(values, MIXED), Matcher(metric)
+    queries = torch.rand(9, 4)
+    together = matcher(queries, route)
+    assert together.shape == (9, 60)
+    torch.testing.assert_close(torch.cat([matcher(row[None], route) for row in queries]), together)
+    order = torch.randperm(9)
+    torch.testing.assert_close(matcher(queries[order], route), together[order])
+
+
+def test_convention_10_scores_are_float32_whatever_the_autocast() -> None:
+    values = torch.rand(50, 4)
+    route = make(values, MIXED)
+    plain = Matcher()(values, route)
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = Matcher()(values, route)
+        low = Matcher()(values.bfloat16(), route)
+    assert cast.dtype == low.dtype == torch.float32
+    assert torch.equal(cast, plain)
+
+
+def test_convention_10_also_on_a_map_without_layers() -> None:
+    scores = Matcher()(torch.rand(3, 4).bfloat16(), CompressedMap((), (), 20, 4))
+    assert scores.dtype == torch.float32
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_convention_10_nothing_of_queries_times_phases_times_features_is_built(
+    metric: str, largest_tensor: type
+) -> None:
+    queries, phases, features, places = 40, 50, 60, 300
+    route = make(torch.rand(places, features), (whole(phases, places, tuple(range(features))),))
+    with largest_tensor() as seen:
+        Matcher(metric)(torch.rand(queries, features), route)
+    assert seen.numel <= queries * places < queries * phases * features
+
+
+class Given(PeriodFinder):
+    """Finds the plan it is given."""
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__()
+        self.given = plan
+
+    def plan(self, features: Tensor) -> Plan:
+        return self.given
+
+
+def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: type) -> None:
+    values = torch.rand(500, 8)
+    model = DejaVu(periods=Given((whole(50, 500, tuple(range(8))),)), batch_size=16).learn(values)
+
+    def largest(queries: int) -> int:
+        with largest_tensor() as seen:
+            assert model.localize(torch.rand(queries, 8)).index.shape == (queries,)
+        return seen.numel
+
+    # the queries themselves and their matches, Q x 8 and Q, are smaller than one batch of scores
+    assert largest(900) == largest(64) == 16 * 500
+
+
+def test_double_maps_give_double_scores() -> None:
+    values = torch.rand(50, 4)
+    assert Matcher()(values, make(values, MIXED).double()).dtype == torch.float64
+
+
+def test_half_maps_are_matched_in_single_precision() -> None:
+    values = torch.rand(50, 4)
+    route = make(values, MIXED)
+    exact = Matcher()(values, route)
+    half = Matcher()(values, route.half())
+    assert half.dtype == torch.float32
+    torch.testing.assert_close(half, exact, rtol=0, atol=1e-3)
+
+
+def test_state_dict_round_trip() -> None:
+    Matcher().load_state_dict(Matcher().state_dict())
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (3, 3), (4,), (2, 3, 4)])
+def test_queries_of_another_dimension_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match=r"query features are .*; the map expects \(Q, 4\)"):
+        Matcher()(torch.rand(shape), make(torch.rand(50, 4), MIXED))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"metric": "manhattan"}, r"metric 'manhattan' is unknown; expected l1, l2, cosine or a callable"),
+        ({"reduction": "max"}, r"reduction 'max' is unknown; expected 'mean' or 'sum'"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Matcher(**arguments)

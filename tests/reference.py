@@ -1,0 +1,158 @@
+"""The paper's equations as slow literal loops: the oracle the package is held against.
+
+Plain Python numbers throughout. Of the package only the data of `FrequencyLayer` is read, none of
+its methods. Letters: i frame, k phase, j feature, H a query, mu a layer's templates as rows of phases.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch.types import FrequencyLayer, Plan
+
+Row = Sequence[float]
+Table = Sequence[Row]
+
+
+def phase(i: int, layer: FrequencyLayer) -> int:
+    """floor((i mod tau) * P / tau), exact, counted from absolute frame 0."""
+    return math.floor(Fraction(i) % layer.period * layer.phases / layer.period)
+
+
+def mask(i: int, k: int, layer: FrequencyLayer) -> int:
+    """M(i, tau, k), eq. 2: 1 where frame i of the layer's chunk has phase k."""
+    return int(layer.start <= i < layer.stop and phase(i, layer) == k)
+
+
+def template(values: Table, j: int, k: int, layer: FrequencyLayer) -> float:
+    """mu(H, tau, k) of one feature, eq. 1; 0 for a phase that no frame of the chunk has."""
+    total, count = 0.0, 0
+    for i in range(len(values)):
+        total += mask(i, k, layer) * values[i][j]
+        count += mask(i, k, layer)
+    return total / count if count else 0.0
+
+
+def templates(values: Table, layer: FrequencyLayer) -> list[list[float]]:
+    """All templates of a layer, P rows of F numbers."""
+    return [[template(values, j, k, layer) for j in layer.features] for k in range(layer.phases)]
+
+
+def phase_distance(query: Row, mu: Table, k: int, layer: FrequencyLayer) -> float:
+    """s(tau, k), eq. 3: the sum over the layer's features of |H - mu|."""
+    return sum(abs(query[j] - mu[k][column]) for column, j in enumerate(layer.features))
+
+
+def score(query: Row, i: int, plan: Plan, mus: Sequence[Table], reduction: str = "sum") -> float:
+    """S(i), eq. 4: over the layers that cover i; +inf where none does.
+
+    "sum" is the letter, "mean" divides it by the number of features that were summed over.
+    """
+    total, summed = 0.0, 0
+    for layer, mu in zip(plan, mus, strict=True):
+        if layer.start <= i < layer.stop:
+            total += sum(phase_distance(query, mu, k, layer) * mask(i, k, layer) for k in range(layer.phases))
+            summed += len(layer.features)
+    if summed == 0:
+        return math.inf
+    return total / summed if reduction == "mean" else total
+
+
+def scores(query: Row, places: int, plan: Plan, mus: Sequence[Table], reduction: str = "sum") -> list[float]:
+    """S(i) of all places."""
+    return [score(query, i, plan, mus, reduction) for i in range(places)]
+
+
+def best(row: Row) -> int:
+    """b = argmin S(i), eq. 5: of equal scores the lowest place; -1 where all are +inf."""
+    found, least = -1, math.inf
+    for i, value in enumerate(row):
+        if value < least:
+            found, least = i, value
+    return found
+
+
+def accepted(row: Row, threshold: float) -> bool:
+    """Eq. 6 as the text of section III-C has it: accept when the best score is below the threshold."""
+    return best(row) >= 0 and row[best(row)] < threshold
+
+
+class Point(NamedTuple):
+    """Precision and recall when every query with score <= threshold reports its place."""
+
+    threshold: float
+    precision: float
+    recall: float
+
+
+def precision_recall(
+    score: Sequence[float], right: Sequence[bool], answerable: Sequence[bool], recall: str = "all"
+) -> list[Point]:
+    """A point for every distinct finite score, by counting.
+
+    recall: "all" is TP / all queries with a right answer; "reported" is TP / (TP + FN), where only a
+    query that has a right answer and reports nothing is a false negative. 0 where it would be 0 / 0.
+    """
+    points = []
+    for threshold in sorted({value for value in score if value < math.inf}):
+        true_positives = false_positives = silent = 0
+        for value, is_right, has_answer in zip(score, right, answerable, strict=True):
+            if value <= threshold and is_right:
+                true_positives += 1
+            elif value <= threshold:
+                false_positives += 1
+            elif has_answer:
+                silent += 1
+        relevant = sum(answerable) if recall == "all" else true_positives + silent
+        points.append(
+            Point(
+                threshold,
+                true_positives / (true_positives + false_positives),
+                true_positives / relevant if relevant else 0.0,
+            )
+        )
+    return points
+
+
+def trapezoid(points: Sequence[Point]) -> float:
+    """Area under precision over recall between the points themselves."""
+    area = 0.0
+    for a, b in pairwise(points):
+        area += (b.recall - a.recall) * (a.precision + b.precision) / 2
+    return area
+
+
+class Route(NamedTuple):
+    """A traverse of random features and a plan over it."""
+
+    values: Tensor
+    plan: Plan
+
+
+@st.composite
+def routes(draw: Callable, most_layers: int = 4) -> Route:
+    """Small routes whose layers overlap, leave gaps, and have whole and rational periods.
+
+    Feature values are multiples of 1/8: sums of them are exact.
+    """
+    frames = draw(st.integers(4, 24))
+    dimension = draw(st.integers(1, 5))
+    plan = []
+    for _ in range(draw(st.integers(1, most_layers))):
+        start = draw(st.integers(0, frames - 1))
+        stop = draw(st.integers(start + 1, frames))
+        period = Fraction(draw(st.integers(2, 20)), draw(st.integers(1, 3)))
+        phases = draw(st.integers(1, 9)) if period.denominator > 1 or draw(st.booleans()) else int(period)
+        features = draw(st.sets(st.integers(0, dimension - 1), min_size=1))
+        plan.append(FrequencyLayer(period, phases, start, stop, tuple(sorted(features))))
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**16)))
+    values = torch.randint(-16, 17, (frames, dimension), generator=generator).double() / 8
+    return Route(values, tuple(plan))

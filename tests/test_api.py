@@ -1,0 +1,80 @@
+"""The front door: few names, all documented, and cheap to import."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dejavu_torch
+
+PACKAGE = Path(dejavu_torch.__file__).parent
+FILES = sorted(PACKAGE.rglob("*.py"))
+HEAVY = ["pytorch_lightning", "lightning", "torchmetrics", "matplotlib", "av"]
+
+
+def test_the_front_door_names_what_it_offers() -> None:
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    written = [node for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "__all__"]
+    assert len(written) == 1
+    assert ast.literal_eval(written[0].value) == dejavu_torch.__all__
+    assert 1 <= len(dejavu_torch.__all__) <= 25
+    assert len(set(dejavu_torch.__all__)) == len(dejavu_torch.__all__)
+
+
+@pytest.mark.parametrize("name", dejavu_torch.__all__)
+def test_every_name_is_there_and_documented(name: str) -> None:
+    value = getattr(dejavu_torch, name)
+    assert inspect.isclass(value) or inspect.isfunction(value)
+    assert value.__module__.startswith("dejavu_torch.")
+    # a NamedTuple without a docstring gets "Name(field, ...)"
+    assert inspect.getdoc(value)
+    assert not inspect.getdoc(value).startswith(f"{name}(")
+
+
+@pytest.mark.parametrize("name", dejavu_torch.__all__)
+def test_the_whole_paper_is_mapped_in_the_docstring(name: str) -> None:
+    not_of_the_paper = {"AerialRoad", "ArrayTraverse", "Certificate", "ImageFolder", "InputError", "Match"}
+    not_of_the_paper |= {"PRCurve", "Traverse", "open_source"}
+    assert name in not_of_the_paper or name in (dejavu_torch.__doc__ or "")
+
+
+def test_what_the_docstring_names_is_there() -> None:
+    """The last column of the map names modules of the package."""
+    lines = [line for line in (dejavu_torch.__doc__ or "").splitlines() if line.startswith("    ")]
+    assert len(lines) > 8
+    for line in lines:
+        for module in re.findall(r"\b[a-z]+\.[a-z.]*[a-z]\b", line):
+            assert (PACKAGE / module.replace(".", "/")).with_suffix(".py").exists(), module
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = f"import sys, dejavu_torch; print([name for name in {HEAVY} if name in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (ran.stdout.strip(), ran.stderr) == ("[]", "")
+
+
+def test_importing_changes_no_global_setting() -> None:
+    code = (
+        "import torch, random; before = (torch.get_num_threads(), torch.get_default_dtype(), "
+        "torch.is_grad_enabled(), torch.initial_seed(), random.getstate()); import dejavu_torch; "
+        "assert before == (torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled(), "
+        "torch.initial_seed(), random.getstate())"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("file", FILES, ids=[str(file.relative_to(PACKAGE)) for file in FILES])
+def test_every_public_function_and_class_has_a_docstring(file: Path) -> None:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+    bare = [
+        n.name for n in tree.body if isinstance(n, kinds) and n.name[0] != "_" and not ast.get_docstring(n)
+    ]
+    assert ast.get_docstring(tree)
+    assert bare == []

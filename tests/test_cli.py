@@ -1,0 +1,418 @@
+"""The commands as a user meets them: their output, their files, and one line for every mistake."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dejavu_torch import DejaVu
+from dejavu_torch.cli import main
+
+SMALL = "sim:aerial?frames=256"
+QUERY = "sim:aerial?frames=256&traverse=1"
+
+
+def run(*arguments: str | Path) -> None:
+    main([str(argument) for argument in arguments])
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Run a command that must fail; its one line on stderr."""
+    with pytest.raises(SystemExit) as stop:
+        run(*arguments)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("dejavu: ")
+    assert error.count("\n") == 1
+    assert error.endswith("\n")
+    assert "Traceback" not in error
+    return error
+
+
+def frames(count: int, seed: int = 0, size: int = 32) -> np.ndarray:
+    """Frames of a texture that slides past with period 16, with noise."""
+    noise = np.random.default_rng(seed)
+    texture = np.random.default_rng(99).integers(40, 215, (size, size))
+    rolled = [np.roll(texture, 2 * i, axis=1) for i in range(count)]
+    return np.clip(np.stack(rolled) + noise.normal(0, 8, (count, size, size)), 0, 255).astype(np.uint8)
+
+
+def write_images(folder: Path, images: np.ndarray) -> Path:
+    folder.mkdir()
+    for i, image in enumerate(images):
+        Image.fromarray(image).save(folder / f"{i}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def small_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("map") / "small.safetensors"
+    run("learn", SMALL, "--map", path)
+    return path
+
+
+# what works
+
+
+def test_learn_prints_plan_certificate_and_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run("learn", SMALL, "--map", tmp_path / "a.safetensors")
+    out = capsys.readouterr().out
+    assert "periods" in out
+    assert "places covered" in out
+    assert f"{(tmp_path / 'a.safetensors').stat().st_size} bytes" in out
+    assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, tmp_path: Path) -> None:
+    run("localize", small_map, QUERY, "--out", tmp_path / "m.csv")
+    rows = list(csv.DictReader((tmp_path / "m.csv").open()))
+    model = DejaVu.load(small_map)
+    from dejavu_torch import open_source
+
+    match = model.localize(open_source(QUERY))
+    assert list(rows[0]) == ["query", "place", "score", "accepted"]
+    assert [int(row["query"]) for row in rows] == list(range(256))
+    assert [int(row["place"]) for row in rows] == match.index.tolist()
+    assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-5)
+
+
+def test_convention_4_threshold_option_then_map_then_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    route, out = tmp_path / "a.safetensors", tmp_path / "m.csv"
+
+    def accepted() -> int:
+        return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
+
+    run("learn", SMALL, "--map", route)
+    capsys.readouterr()
+    run("localize", route, QUERY, "--out", out)
+    assert "no threshold" in capsys.readouterr().out
+    assert accepted() == 256
+    score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[100]
+    run("learn", SMALL, "--map", route, "--threshold", str(score))
+    capsys.readouterr()
+    run("localize", route, QUERY, "--out", out)
+    assert "no threshold" not in capsys.readouterr().out
+    assert 90 <= accepted() <= 101
+    run("localize", route, QUERY, "--out", out, "--threshold", "0")
+    assert accepted() == 0
+
+
+def test_info_tells_what_learn_told(small_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run("info", small_map)
+    out = capsys.readouterr().out
+    assert "places covered" in out
+    assert "HOG" in out
+
+
+def test_folder_of_images_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = write_images(tmp_path / "first", frames(128, seed=1))
+    second = write_images(tmp_path / "second", frames(128, seed=2))
+    run("compare", first, second, "--out", tmp_path / "report")
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["frames"] == report["queries"] == 128
+    assert 16 in report["periods"]
+    assert {file.name for file in (tmp_path / "report").iterdir()} >= {
+        "report.json",
+        "index.html",
+        "matches.csv",
+        "pr.png",
+        "coverage.png",
+        "chunks.png",
+    }
+
+
+def test_config_and_options(tmp_path: Path) -> None:
+    config = tmp_path / "mine.yaml"
+    config.write_text(
+        "periods: {class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: 128}}\nreduction: sum\n"
+    )
+    route = tmp_path / "a.safetensors"
+    run("learn", SMALL, "--map", route, "--config", config, "--batch_size", "16")
+    model = DejaVu.load(route)
+    assert model.periods.window == 128
+    assert model.matcher.reduction == "sum"
+    assert model.batch_size == 16
+    assert {(layer.start, layer.stop) for layer in model.map.plan} == {(0, 128), (128, 256)}
+
+
+def test_features_by_class_path(tmp_path: Path) -> None:
+    route = tmp_path / "a.safetensors"
+    run("learn", SMALL, "--map", route, "--features", "dejavu_torch.HOG", "--features.cell", "16")
+    assert DejaVu.load(route).features.cell == 16
+
+
+def test_features_of_another_package_are_named_again_to_localize(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "frames.npy", frames(64))
+    route = tmp_path / "a.safetensors"
+    run("learn", tmp_path / "frames.npy", "--map", route, "--features", "torch.nn.Flatten")
+    assert "torch.nn" in fails(capsys, "info", route)
+    run(
+        "localize",
+        route,
+        tmp_path / "frames.npy",
+        "--features",
+        "torch.nn.Flatten",
+        "--out",
+        tmp_path / "m.csv",
+    )
+    assert len((tmp_path / "m.csv").read_text().splitlines()) == 65
+
+
+def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    noise = np.random.default_rng(0)
+    for name in ("a", "b"):
+        np.save(tmp_path / f"{name}.npy", noise.normal(size=(200, 40)).astype(np.float32))
+    run("learn", tmp_path / "a.npy", "--map", tmp_path / "a.safetensors")
+    assert "this route does not repeat" in capsys.readouterr().out.splitlines()
+    assert DejaVu.load(tmp_path / "a.safetensors").map.plan == ()
+    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--out", tmp_path / "report")
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["recall_at_1"] == report["auc"] == 0
+    assert report["accepted"] == 0
+    assert report["periods"] == report["chunks"] == []
+
+
+def test_compare_without_truth_gives_matches_and_no_scores(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "a.npy", frames(96))
+    np.save(tmp_path / "b.npy", frames(64, seed=5))
+    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--out", tmp_path / "report")
+    assert "no scores" in capsys.readouterr().out
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["auc"] is None
+    assert len((tmp_path / "report" / "matches.csv").read_text().splitlines()) == 65
+    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--truth", "16", "--out", tmp_path / "report")
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["auc"] is not None
+
+
+def test_negative_offset_is_a_truth(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", frames(64))
+    run(
+        "compare",
+        tmp_path / "a.npy",
+        tmp_path / "a.npy",
+        "--truth=-3",
+        "--tolerance",
+        "0",
+        "--out",
+        tmp_path / "r",
+    )
+    assert json.loads((tmp_path / "r" / "report.json").read_text())["tolerance"] == 0
+
+
+@pytest.mark.parametrize("command", ["demo", "learn", "localize", "compare", "info"])
+def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(command, "--help")
+    out = capsys.readouterr().out
+    assert stop.value.code == 0
+    assert "known subclasses" not in out
+    assert len(out.splitlines()) < 70
+
+
+def test_quiet_where_not_a_terminal(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "dejavu_torch.cli",
+        "learn",
+        SMALL,
+        "--map",
+        str(tmp_path / "a.safetensors"),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert [line for line in done.stderr.splitlines() if "window shrunk" not in line] == []
+
+
+# what is refused
+
+
+def test_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = fails(capsys, "learn", tmp_path / "nowhere", "--map", tmp_path / "a.safetensors")
+    assert "nowhere" in error
+    assert "expected" in error
+
+
+def test_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    assert "no images" in fails(capsys, "learn", tmp_path / "empty", "--map", tmp_path / "a.safetensors")
+    assert not (tmp_path / "a.safetensors").exists()
+
+
+@pytest.mark.parametrize("count", [1, 15])
+def test_too_few_frames(count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_images(tmp_path / "short", frames(count))
+    error = fails(capsys, "learn", folder, "--map", tmp_path / "a.safetensors")
+    assert f"{count} frame" in error
+    assert "at least 16" in error
+
+
+def test_paper_preset_refuses_less_than_its_window(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = Path(__file__).parents[1] / "configs" / "paper.yaml"
+    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", config)
+    assert "256" in error
+    assert "1024" in error
+
+
+def test_mixed_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_images(tmp_path / "mixed", frames(40))
+    Image.fromarray(frames(1, size=24)[0]).save(folder / "20.png")
+    error = fails(capsys, "learn", folder, "--map", tmp_path / "a.safetensors")
+    assert "20.png" in error
+    assert "24 x 24" in error
+    assert "32 x 32" in error
+
+
+def test_unreadable_image_in_the_middle(
+    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_images(tmp_path / "broken", frames(100, size=64))
+    (folder / "77.png").write_bytes(b"no image")
+    assert "77.png" in fails(capsys, "localize", small_map, folder, "--out", tmp_path / "m.csv")
+    # the first batch was matched by then: nothing of it may stay
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["broken"]
+
+
+def test_nan_features(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = np.random.default_rng(0).normal(size=(100, 8))
+    values[70, 3] = np.nan
+    np.save(tmp_path / "nan.npy", values)
+    assert "frame 70" in fails(capsys, "learn", tmp_path / "nan.npy", "--map", tmp_path / "a.safetensors")
+
+
+def test_constant_features_do_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "flat.npy", np.full((100, 8), 0.3, dtype=np.float32))
+    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "a.safetensors")
+    assert "this route does not repeat" in capsys.readouterr().out
+
+
+def test_a_file_that_is_no_array(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "text.npy").write_text("hello")
+    assert "text.npy" in fails(capsys, "learn", tmp_path / "text.npy", "--map", tmp_path / "a.safetensors")
+
+
+def test_features_of_another_dimension(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wave = np.sin(np.arange(100)[:, None] * np.array([0.4, 0.5, 0.6]))
+    np.save(tmp_path / "three.npy", wave)
+    np.save(tmp_path / "two.npy", wave[:, :2])
+    run("learn", tmp_path / "three.npy", "--map", tmp_path / "a.safetensors")
+    capsys.readouterr()
+    error = fails(
+        capsys, "localize", tmp_path / "a.safetensors", tmp_path / "two.npy", "--out", tmp_path / "m.csv"
+    )
+    assert "2" in error
+    assert "(Q, 3)" in error
+    assert not (tmp_path / "m.csv").exists()
+
+
+def test_truncated_and_foreign_maps(
+    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cut.safetensors").write_bytes(small_map.read_bytes()[:-100])
+    (tmp_path / "text.safetensors").write_text("not a map at all")
+    for name in ("cut", "text", "missing"):
+        path = tmp_path / f"{name}.safetensors"
+        assert name in fails(capsys, "localize", path, QUERY, "--out", tmp_path / "m.csv")
+
+
+def test_missing_config(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", "nowhere.yaml")
+    assert "nowhere.yaml" in error
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("colour: red\n", "'colour'"),
+        ("periods: {class_path: nowhere.Finder}\n", "'nowhere'"),
+        ("periods: {class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: 3}}\n", "window=3"),
+        ("reduction: [\n", "bad.yaml"),
+        ("batch_size: many\n", "many"),
+        ("batch_size: 0\n", "batch_size is 0"),
+        ("metric: manhattan\n", "'manhattan'"),
+    ],
+)
+def test_bad_config(text: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bad.yaml").write_text(text)
+    error = fails(
+        capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", tmp_path / "bad.yaml"
+    )
+    assert named in error
+
+
+def test_unknown_option_and_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--colour" in fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--colour", "red")
+    assert "dance" in fails(capsys, "dance")
+    assert "map" in fails(capsys, "learn", SMALL)
+
+
+@pytest.mark.parametrize(
+    "bad", ["sim:moon", "sim:aerial?colour=red", "sim:aerial?frames=many", "strip:a.png"]
+)
+def test_bad_source(bad: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "expected" in fails(capsys, "learn", bad, "--map", tmp_path / "a.safetensors")
+
+
+def test_bad_truth_and_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "a.npy", frames(64))
+    pair = (tmp_path / "a.npy", tmp_path / "a.npy", "--out", tmp_path / "r")
+    assert "'maybe'" in fails(capsys, "compare", *pair, "--truth", "maybe")
+    assert "-1" in fails(capsys, "compare", *pair, "--tolerance", "-1")
+
+
+def test_output_that_cannot_be_written(
+    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "does not exist" in fails(capsys, "learn", SMALL, "--map", tmp_path / "no" / "a.safetensors")
+    assert "is a folder" in fails(capsys, "localize", small_map, QUERY, "--out", tmp_path)
+    (tmp_path / "file").write_text("in the way")
+    assert "file" in fails(capsys, "compare", SMALL, QUERY, "--out", tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_full_disk(
+    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "m.csv"
+    out.write_text("old")
+
+    def full(self: Path, *arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    assert "No space left" in fails(capsys, "localize", small_map, QUERY, "--out", out)
+    assert [file.name for file in tmp_path.iterdir()] == ["m.csv"]
+    assert out.read_text() == "old"
+
+
+def test_localize_memory_does_not_grow_with_the_queries(small_map: Path, tmp_path: Path) -> None:
+    code = (
+        "import resource, sys; from dejavu_torch.cli import main; main(sys.argv[1:]);"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+
+    def peak(count: int) -> int:
+        arguments = ["localize", small_map, f"sim:aerial?frames={count}", "--out", tmp_path / "m.csv"]
+        command = [sys.executable, "-c", code, *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return int(done.stdout.splitlines()[-1])
+
+    few, many = peak(128), peak(1280)
+    # features of the further frames would take 8 MB, their frames 57 MB, the painted route takes 2 MB
+    assert many - few < 8_000

@@ -1,0 +1,133 @@
+"""Imports point one way (design.md, section 1), and files stay short."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dejavu_torch
+
+PACKAGE = Path(dejavu_torch.__file__).parent
+FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
+NAMES = [str(file) for file in FILES]
+ORDER = [
+    {"types"},
+    {"features", "periods", "data"},
+    {"database"},
+    {"recognition"},
+    {"model"},
+    {"evaluation"},
+    {"training"},
+    {"experiments"},
+    {"cli"},
+]
+RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
+LONGEST = 300
+
+
+def room_of(file: Path) -> str:
+    return file.parts[0].removesuffix(".py")
+
+
+def rooms_imported(source: str, file: Path) -> Iterator[tuple[int, str]]:
+    """Every import of the package in a file, wherever it stands: (line, room).
+
+    A name of the front door itself, such as `__version__`, counts as the room "".
+    """
+    package = ["dejavu_torch", *file.parent.parts]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            targets = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (base, node.module) if part)
+            targets = [f"{module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for target in targets:
+            name, *rest = target.split(".")
+            if name == "dejavu_torch":
+                yield node.lineno, rest[0] if rest and rest[0] in RANK else ""
+
+
+def front_door_rank() -> int:
+    """Whoever imports the front door imports all the rooms that it opens."""
+    source = (PACKAGE / "__init__.py").read_text(encoding="utf-8")
+    return max(RANK[room] for _, room in rooms_imported(source, Path("__init__.py")))
+
+
+def wrong_arrows(source: str, file: Path) -> list[str]:
+    """Imports of a file that go against the order of the rooms."""
+    here = room_of(file)
+    if here == "__init__":
+        return []
+    ranks = {**RANK, "": front_door_rank()}
+    return [
+        f"{file}:{line}: {here} imports {room or 'the front door'}"
+        for line, room in rooms_imported(source, file)
+        if room != here and ranks[room] >= RANK[here]
+    ]
+
+
+def test_every_file_stands_in_a_room() -> None:
+    assert [file for file in FILES if room_of(file) not in RANK.keys() | {"__init__", "__main__"}] == []
+
+
+@pytest.mark.parametrize("file", FILES, ids=NAMES)
+def test_imports_point_one_way(file: Path) -> None:
+    assert wrong_arrows((PACKAGE / file).read_text(encoding="utf-8"), file) == []
+
+
+@pytest.mark.parametrize("file", FILES, ids=NAMES)
+def test_files_stay_short(file: Path) -> None:
+    assert len((PACKAGE / file).read_text(encoding="utf-8").splitlines()) <= LONGEST
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("types.py", "import dejavu_torch.data.files"),
+        ("features/hog.py", "from dejavu_torch.periods.layers import cluster_layers"),
+        ("features/hog.py", "from dejavu_torch import periods"),
+        ("features/hog.py", "from dejavu_torch import HOG"),
+        ("features/hog.py", "import dejavu_torch"),
+        ("features/hog.py", "from ..data.strip import SlidingWindow"),
+        ("features/hog.py", "from .. import model"),
+        ("features/deep/net.py", "from ...database import phase"),
+        ("data/files.py", "def f():\n    from dejavu_torch.model import DejaVu"),
+        ("data/simulate/aerial.py", "if True:\n    import dejavu_torch.evaluation as e"),
+        ("database/phase.py", "import torch, dejavu_torch.recognition.scores"),
+        ("recognition/scores.py", "from ..model import DejaVu"),
+        ("model.py", "from .evaluation import curves"),
+        ("model.py", "from . import evaluation"),
+        (
+            "evaluation/curves.py",
+            "try:\n    from dejavu_torch.training import metrics\nexcept ImportError: pass",
+        ),
+        ("experiments/compare.py", "from dejavu_torch.cli import main"),
+    ],
+)
+def test_a_wrong_arrow_is_caught(file: str, source: str) -> None:
+    assert len(wrong_arrows(source, Path(file))) == 1
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("__init__.py", "from dejavu_torch.cli import main"),
+        ("features/hog.py", "import torch\nfrom dejavu_torch.types import InputError"),
+        (
+            "features/hog.py",
+            "from ..types import InputError\nfrom .extract import feature_batches\nfrom . import hog",
+        ),
+        ("data/simulate/aerial.py", "from .paint import Canvas\nfrom ..strip import read_strip"),
+        ("model.py", "from .data import arrays\nfrom . import types"),
+        ("cli.py", "from dejavu_torch import __version__\nfrom dejavu_torch.experiments import compare"),
+        ("types.py", "import dejavu_torch_other\nfrom torch import cli"),
+    ],
+)
+def test_right_arrows_pass(file: str, source: str) -> None:
+    assert wrong_arrows(source, Path(file)) == []

@@ -1,0 +1,462 @@
+"""The whole method as one module: learn, localize, forward."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.model import DejaVu
+from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.select import best_match
+from dejavu_torch.types import FrequencyLayer, InputError, Match, Plan, Traverse
+
+SIZE = 16
+
+
+class Fixed(PeriodFinder):
+    """Layers that are known beforehand."""
+
+    def __init__(self, *layers: FrequencyLayer) -> None:
+        super().__init__()
+        self.layers = layers
+
+    def plan(self, features: Tensor) -> Plan:
+        return self.layers
+
+
+class Tiny(nn.Module):
+    """A smooth backbone with 4 features."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(1, 4, 3)
+        self.norm = nn.BatchNorm2d(4)
+        self.drop = nn.Dropout(0.5)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return self.drop(torch.tanh(self.norm(self.conv(frames)))).mean((2, 3))
+
+
+class Stream(Traverse):
+    """Features or frames made as they are asked for; counts its batches."""
+
+    def __init__(self, make: Any, length: int) -> None:
+        self.make, self.length, self.given = make, length, 0
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        for start in range(0, self.length, size):
+            self.given += 1
+            yield self.make(torch.arange(start, min(start + size, self.length)))
+
+
+class Largest(TorchDispatchMode):
+    """Remembers the size of the largest tensor of numbers that any operation makes."""
+
+    numbers = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        for value in result if isinstance(result, tuple | list) else [result]:
+            if isinstance(value, Tensor):
+                self.numbers = max(self.numbers, value.numel())
+        return result
+
+
+@contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """The block is refused in one line that holds these words."""
+    with pytest.raises(InputError) as caught:
+        yield
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+def layers(*periods: int, stop: int = 72, features: int = 4) -> Fixed:
+    chosen = tuple(range(features))
+    return Fixed(*(FrequencyLayer(Fraction(tau), tau, 0, stop, chosen) for tau in periods))
+
+
+def waves(frames: int = 72, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Two features that repeat, after 8 and after 9 frames."""
+    return torch.arange(frames)[:, None] % torch.tensor([8, 9], dtype=dtype)
+
+
+def pictures(frames: int = 72, dtype: torch.dtype = torch.float32) -> Tensor:
+    """The left half of the frame repeats after 8 frames, the right half after 9."""
+    random = torch.Generator().manual_seed(0)
+    left, right = (torch.rand(p, 1, SIZE, SIZE, generator=random, dtype=dtype) for p in (8, 9))
+    left[..., -1] = right[..., 0] = 0.5  # so that no gradient sees both
+    at = torch.arange(frames)
+    return torch.cat([left[at % 8], right[at % 9]], 3)
+
+
+def wave_model(**arguments: Any) -> DejaVu:
+    return DejaVu(periods=SpectrogramAnalysis(window=72, strongest=1), **arguments)
+
+
+# what goes in and what comes out
+
+
+def test_features_that_repeat_are_found_exactly() -> None:
+    model = wave_model().learn(waves())
+    assert [layer.period for layer in model.map.plan] == [8, 9]
+    match = model.localize(waves())
+    assert isinstance(match, Match)
+    assert match.index.tolist() == list(range(72))
+    assert match.score.tolist() == [0.0] * 72
+    assert match.accepted.all()
+
+
+def test_frames_that_repeat_are_found() -> None:
+    model = wave_model(features=HOG(block=1)).learn(pictures())
+    assert model.localize(pictures()).index.tolist() == list(range(72))
+    assert model(pictures(5)).shape == (5, 72)
+
+
+@pytest.mark.parametrize("make", [waves, pictures])
+@pytest.mark.parametrize("batch_size", [1, 7, 64, 1000])
+def test_tensors_traverses_and_batch_sizes_agree(make: Any, batch_size: int) -> None:
+    values = make()
+    whole = wave_model(batch_size=1000).learn(values)
+    other = wave_model(batch_size=batch_size).learn(ArrayTraverse(values))
+    assert other.map.plan == whole.map.plan
+    torch.testing.assert_close(other.map.templates, whole.map.templates)
+    query = values[::5] + 0.01
+    expected = whole.localize(query)
+    for source in (query, ArrayTraverse(query), Stream(lambda at: query[at], len(query))):
+        found = other.localize(source)
+        assert torch.equal(found.index, expected.index)
+        torch.testing.assert_close(found.score, expected.score)
+
+
+def test_byte_frames_are_frames() -> None:
+    pixels = (pictures()[:, 0] * 255).byte()
+    model = wave_model(features=HOG(block=1)).learn(pixels)
+    assert not model.ready_features
+    assert model.localize(pixels).index.tolist() == list(range(72))
+
+
+def test_learn_returns_the_model_and_relearning_replaces_the_map() -> None:
+    model = wave_model()
+    assert model.learn(waves()) is model
+    assert model.learn(pictures(90)) is model
+    assert (model.map.places, model.map.dimension, model.ready_features) == (90, 3 * 36, False)
+    fresh = wave_model().learn(pictures(90))
+    assert model.map.plan == fresh.map.plan
+    assert torch.equal(model(pictures(3)), fresh(pictures(3)))
+
+
+def test_a_failed_relearning_keeps_the_map() -> None:
+    model = wave_model().learn(waves())
+    with refused("NaN"):
+        model.learn(torch.full((72, 2), torch.nan))
+    assert model.localize(waves()).index.tolist() == list(range(72))
+
+
+def test_features_are_accepted_where_the_map_was_learnt_from_frames() -> None:
+    model = wave_model().learn(pictures())
+    with torch.no_grad():
+        features = model.features(pictures(9))
+    assert torch.equal(model(features), model(pictures(9)))
+    assert torch.equal(model.localize(features).index, model.localize(pictures(9)).index)
+
+
+@pytest.mark.parametrize(
+    ("threshold", "accepted"), [(None, [True, True]), (0.5, [True, False]), (0.0, [False, False])]
+)
+def test_the_threshold_accepts_below(threshold: float | None, accepted: list[bool]) -> None:
+    model = wave_model(threshold=threshold).learn(waves())
+    query = torch.stack([waves()[10], waves()[10] + torch.tensor([0.0, 30.0])])
+    match = model.localize(query)
+    assert match.accepted.tolist() == accepted
+    assert (match.index >= 0).all()
+
+
+# training and deployment give equal scores
+
+
+@pytest.mark.parametrize("make", [waves, pictures])
+@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_forward_and_localize_agree(make: Any, metric: str, reduction: Any) -> None:
+    model = wave_model(metric=metric, reduction=reduction).learn(make())
+    query = make() + 0.2 * torch.rand_like(make())
+    scores, match = model(query), model.localize(query)
+    expected = best_match(scores)
+    assert torch.equal(match.index, expected.index)
+    torch.testing.assert_close(match.score, expected.score, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_training_and_deployed_path_give_equal_scores(training: bool) -> None:
+    torch.manual_seed(0)
+    model = DejaVu(Tiny(), layers(8, 9)).learn(pictures())
+    model.train(training)
+    query = pictures(6)
+    match = model.localize(query)
+    model.eval()
+    expected = best_match(model(query.requires_grad_()))
+    assert torch.equal(match.index, expected.index)
+    assert torch.equal(match.score, expected.score)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_mode_of_the_features_is_restored(training: bool) -> None:
+    model = DejaVu(Tiny(), layers(8)).train(training)
+    before = {name: value.clone() for name, value in model.features.state_dict().items()}
+    model.learn(pictures())
+    model.localize(pictures(5))
+    with refused("NaN"):
+        model.localize(torch.full((2, 1, SIZE, SIZE), torch.nan))
+    assert [module.training for module in model.features.modules()] == [training] * 4
+    assert all(torch.equal(before[name], value) for name, value in model.features.state_dict().items())
+
+
+def test_the_mode_of_each_part_of_the_features_is_restored() -> None:
+    model = DejaVu(Tiny(), layers(8)).train()
+    model.features.norm.eval()
+    model.learn(pictures())
+    assert not model.features.norm.training
+
+
+# gradients
+
+
+def test_gradcheck_from_frames_to_scores() -> None:
+    torch.manual_seed(0)
+    model = DejaVu(Tiny(), layers(8, 9)).double().eval()
+    model.learn(pictures(dtype=torch.float64))
+    frames = torch.rand(2, 1, 6, 6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(model, frames)
+
+
+def test_gradcheck_from_features_to_scores() -> None:
+    model = DejaVu(periods=layers(8, 9)).learn(torch.rand(72, 4, dtype=torch.float64))
+    query = torch.rand(3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(model, query)
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+def test_gradients_reach_the_weights_of_the_backbone(metric: str) -> None:
+    torch.manual_seed(0)
+    model = DejaVu(Tiny(), layers(8, 9), metric=metric).learn(pictures()).eval()
+    model(pictures(4) + 0.1).logsumexp(1).sum().backward()
+    for name in ("weight", "bias"):
+        gradient = getattr(model.features.conv, name).grad
+        assert gradient.isfinite().all()
+        assert gradient.abs().max() > 0
+
+
+def test_a_flat_image_has_finite_gradients() -> None:
+    model = wave_model().learn(pictures())
+    frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
+    model(frames).sum().backward()
+    assert frames.grad is not None
+    assert frames.grad.isfinite().all()
+
+
+def test_localize_and_learn_leave_no_graph() -> None:
+    model = DejaVu(Tiny(), layers(8)).learn(pictures().requires_grad_())
+    assert not model.map.templates.requires_grad
+    assert not model.localize(pictures(3).requires_grad_()).score.requires_grad
+
+
+# a module like any other
+
+
+def test_state_dict_goes_into_a_fresh_model() -> None:
+    torch.manual_seed(0)
+    model = DejaVu(Tiny(), layers(8, 9)).learn(pictures()).eval()
+    fresh = DejaVu(Tiny()).eval()
+    fresh.load_state_dict(model.state_dict())
+    assert fresh.map.plan == model.map.plan
+    assert torch.equal(fresh(pictures(5)), model(pictures(5)))
+    smaller = DejaVu(Tiny(), layers(5, features=2)).learn(pictures(80))
+    smaller.load_state_dict(model.state_dict())
+    assert smaller.map.plan == model.map.plan
+
+
+def test_to_float64() -> None:
+    model = DejaVu(Tiny(), layers(8, 9)).learn(pictures()).eval()
+    single = model(pictures(5))
+    double = model.to(torch.float64)(pictures(5).double())
+    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+    torch.testing.assert_close(double.float(), single, atol=1e-5, rtol=1e-5)
+    assert model.map.layers.dtype == torch.int64
+
+
+def test_float64_features_stay_float64() -> None:
+    model = wave_model().learn(waves(dtype=torch.float64) / 3)
+    assert model.map.templates.dtype == torch.float64
+    assert model.localize(waves(dtype=torch.float64) / 3).score.abs().max() <= 1e-12
+
+
+def test_scores_ignore_autocast() -> None:
+    model = wave_model().learn(waves() / 3)
+    with torch.autocast("cpu", torch.bfloat16):
+        scores = model(waves() / 3)
+    assert torch.equal(scores, model(waves() / 3))
+
+
+# memory
+
+
+@pytest.mark.parametrize("at_once", [1, 200, 10**6])
+def test_few_scores_are_held_at_once(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
+    model = wave_model().learn(waves())
+    query = waves()[::2] + torch.rand(36, 2)
+    expected = model.localize(query)
+    monkeypatch.setattr("dejavu_torch.model.SCORES_AT_ONCE", at_once)
+    with Largest() as largest:
+        found = model.localize(query)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    # never less than one query at a time, and the batch of features itself
+    assert largest.numbers <= max(at_once, 72, query.numel())
+
+
+def test_memory_does_not_grow_with_the_number_of_queries() -> None:
+    model = wave_model(batch_size=16).learn(waves())
+    largest = []
+    for queries in (100, 1000):
+        with Largest() as seen:
+            assert sum(
+                len(match.index) for match in model.matches(Stream(lambda at: waves()[at % 72], queries))
+            )
+        largest.append(seen.numbers)
+    assert largest[0] == largest[1] <= 16 * 72
+
+
+def test_nothing_of_queries_times_phases_times_features_is_built() -> None:
+    features, phases, queries = 50, 8 + 9, 40
+    model = DejaVu(periods=layers(8, 9, features=features)).learn(torch.rand(72, features))
+    with Largest() as seen:
+        model.localize(torch.rand(queries, features))
+    assert seen.numbers < queries * phases * features / 4
+
+
+def test_queries_are_read_as_they_are_matched() -> None:
+    model = wave_model(batch_size=4).learn(waves())
+    stream = Stream(lambda at: waves()[at % 72], 400)
+    matches = model.matches(stream)
+    assert next(matches).index.tolist() == [0, 1, 2, 3]
+    before = stream.given
+    assert before <= 3
+    assert next(matches).index.tolist() == [4, 5, 6, 7]
+    assert stream.given == before + 1
+
+
+# a route in which nothing repeats, and bad input
+
+
+@pytest.mark.parametrize("values", [torch.full((72, 3), 0.3), torch.full((72, 1, SIZE, SIZE), 0.3)])
+def test_a_constant_route_gives_a_map_without_layers(values: Tensor) -> None:
+    model = wave_model().learn(values)
+    assert model.map.plan == ()
+    assert (model.map.places, model.certificate.covered) == (72, 0)
+    match = model.localize(values[:5])
+    assert match.index.tolist() == [-1] * 5
+    assert match.score.tolist() == [float("inf")] * 5
+    assert not match.accepted.any()
+    assert model(values[:5]).isposinf().all()
+
+
+@pytest.mark.parametrize("use", [DejaVu.localize, DejaVu.forward])
+def test_without_a_map(use: Any) -> None:
+    with refused("no map yet", "learn"):
+        use(DejaVu(), waves())
+
+
+@pytest.mark.parametrize("frames", [1, 2, 15])
+@pytest.mark.parametrize("make", [waves, pictures])
+def test_a_traverse_of_few_frames_is_refused(make: Any, frames: int) -> None:
+    with refused(f"{frames} frame", "expected at least 16"):
+        wave_model().learn(make(frames))
+
+
+def test_the_paper_refuses_a_traverse_shorter_than_its_window() -> None:
+    with refused("72 frames", "1024"):
+        DejaVu(periods=SpectrogramAnalysis(short="refuse")).learn(waves())
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+@pytest.mark.parametrize("make", [waves, pictures])
+def test_a_frame_that_is_not_finite_is_named(make: Any, bad: float) -> None:
+    values = make()
+    values[41].view(-1)[3 if make is pictures else 1] = bad
+    for batch_size in (8, 64):
+        with refused("frame 41", "NaN", "expected finite"):
+            wave_model(batch_size=batch_size).learn(values)
+        model = wave_model(batch_size=batch_size).learn(make())
+        with refused("frame 41", "NaN"):
+            model.localize(values)
+
+
+@pytest.mark.parametrize("query", [torch.rand(3, 5), torch.rand(3, 1)])
+def test_features_of_another_dimension_are_refused(query: Tensor) -> None:
+    model = wave_model().learn(waves())
+    for use in (model, model.localize):
+        with refused(str(tuple(query.shape)), "(Q, 2)"):
+            use(query)
+
+
+def test_frames_of_another_size_are_refused() -> None:
+    model = wave_model().learn(pictures())
+    with refused("(Q, 108)"):
+        model.localize(torch.rand(3, 1, 32, 32))
+    with refused("8 x 8", "16 x 16"):
+        model.localize(torch.rand(3, 1, 8, 8))
+
+
+def test_frames_on_a_map_of_ready_features_are_refused() -> None:
+    model = wave_model().learn(waves())
+    with refused("frames", "ready features", "expected features (Q, 2)"):
+        model.localize(pictures(3))
+
+
+def test_forward_refuses_frames_on_a_map_of_ready_features() -> None:
+    model = DejaVu(HOG(), layers(8, features=108)).learn(torch.rand(72, 108))
+    with refused("ready features"):
+        model(pictures(3))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [torch.zeros(72), torch.zeros(72, 2, dtype=torch.int64), torch.zeros(72, 3, 4), torch.zeros(0, 2)],
+)
+def test_a_tensor_that_holds_no_traverse_is_refused(values: Tensor) -> None:
+    with refused(str(tuple(values.shape)), "expected frames"):
+        wave_model().learn(values)
+
+
+def test_a_traverse_without_frames_is_refused() -> None:
+    with refused("no frames"):
+        wave_model().learn(Stream(waves, 0))
+
+
+@pytest.mark.parametrize("make", [lambda x: x, lambda x: x.sum(), lambda x: x.flatten(1)[:1]])
+def test_a_backbone_that_makes_no_features_is_refused(make: Any) -> None:
+    class Wrong(nn.Module):
+        def forward(self, frames: Tensor) -> Tensor:
+            return make(frames)
+
+    with refused("Wrong", "expected features (64, D)"):
+        DejaVu(Wrong(), layers(8)).learn(pictures())
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"batch_size": 0}, {"threshold": torch.nan}, {"metric": "l7"}, {"reduction": "median"}]
+)
+def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
+    with refused("expected"):
+        DejaVu(**arguments)

@@ -1,0 +1,50 @@
+"""What the README shows works as it stands there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def test_python_runs_and_its_shapes_are_true(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, object] = {}
+    for block in BLOCKS:
+        exec(block, space)
+    assert tuple(space["frames"].shape) == (4, 3, 64, 64)
+    assert tuple(space["scores"].shape) == (4, 1024)
+    assert space["frames"].grad.abs().sum() > 0
+    assert (tmp_path / "road.safetensors").is_file()
+
+
+def test_python_is_twelve_lines_at_most() -> None:
+    assert len(BLOCKS) == 1
+    assert len([line for line in BLOCKS[0].splitlines() if line.strip()]) <= 12
+
+
+def test_every_linked_file_is_there() -> None:
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_every_command_shown_is_understood() -> None:
+    from dejavu_torch.cli import build_parser
+
+    shown = re.findall(r"^(dejavu .*?)(?:\s+#.*)?$", README, re.MULTILINE)
+    assert len(shown) >= 4
+    for line in shown:
+        build_parser().parse_args(line.split()[1:])
+
+
+def test_ci_calls_the_readmes_test_command() -> None:
+    commands = [line for line in README.splitlines() if line.endswith("python -m pytest")]
+    assert len(commands) == 1
+    assert "python -m pytest$" in (ROOT / ".ci" / "run").read_text()
+    assert commands[0] in (ROOT / "CONTRIBUTING.md").read_text()
