@@ -3,35 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from fractions import Fraction
 from typing import Any
 
 import pytest
 import torch
+from helpers import Fixed, refused
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
-from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import FrequencyLayer, InputError, Match, Plan, Traverse
+from dejavu_torch.types import FrequencyLayer, Match, Traverse
 
 SIZE = 16
-
-
-class Fixed(PeriodFinder):
-    """Layers that are known beforehand."""
-
-    def __init__(self, *layers: FrequencyLayer) -> None:
-        super().__init__()
-        self.layers = layers
-
-    def plan(self, features: Tensor) -> Plan:
-        return self.layers
 
 
 class Tiny(nn.Module):
@@ -70,16 +58,6 @@ class Largest(TorchDispatchMode):
             if isinstance(value, Tensor):
                 self.numbers = max(self.numbers, value.numel())
         return result
-
-
-@contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """The block is refused in one line that holds these words."""
-    with pytest.raises(InputError) as caught:
-        yield
-    message = str(caught.value)
-    assert "\n" not in message
-    assert [word for word in words if word not in message] == [], message
 
 
 def layers(*periods: int, stop: int = 72, features: int = 4) -> Fixed:

@@ -2,37 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers import all_of, refused
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse, read_array
-from dejavu_torch.types import InputError, Traverse
 
 RANDOM = np.random.default_rng(0)
 GREY = RANDOM.integers(0, 256, (7, 4, 5), np.uint8)
 COLOUR = RANDOM.integers(0, 256, (7, 4, 5, 3), np.uint8)
 FRAMES = RANDOM.random((7, 1, 4, 5), np.float32)
 FEATURES = RANDOM.random((7, 6))
-
-
-@contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """The block is refused in one line that holds these words."""
-    with pytest.raises(InputError) as caught:
-        yield
-    message = str(caught.value)
-    assert "\n" not in message
-    assert [word for word in words if word not in message] == [], message
-
-
-def all_of(traverse: Traverse, batch: int = 64) -> Tensor:
-    return torch.cat(list(traverse.batches(batch)))
 
 
 @pytest.mark.parametrize("kind", ["array", "tensor", "file"])

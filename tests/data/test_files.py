@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from helpers import refused
 
 from dejavu_torch.data.files import check_output_file, make_output_folder, whole_file
 from dejavu_torch.types import InputError
-
-
-@contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """The block is refused in one line that holds these words."""
-    with pytest.raises(InputError) as caught:
-        yield
-    message = str(caught.value)
-    assert "\n" not in message
-    assert [word for word in words if word not in message] == [], message
 
 
 def full_disk(*_: object, **__: object) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from PIL import Image
 from torch import Tensor
 
@@ -17,16 +16,6 @@ from dejavu_torch.types import InputError
 
 GREY = np.arange(20, dtype=np.uint8).reshape(4, 5) * 10
 COLOUR = np.stack([GREY, 255 - GREY, GREY // 2], 2)
-
-
-@contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """The block is refused in one line that holds these words."""
-    with pytest.raises(InputError) as caught:
-        yield
-    message = str(caught.value)
-    assert "\n" not in message
-    assert [word for word in words if word not in message] == [], message
 
 
 def write(path: Path, *names: str) -> None:

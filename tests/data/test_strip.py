@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers import all_of, refused
 from PIL import Image
 from torch import Tensor
 
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.strip import SlidingWindow, read_strip
-from dejavu_torch.types import InputError, Traverse
-
-
-@contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """The block is refused in one line that holds these words."""
-    with pytest.raises(InputError) as caught:
-        yield
-    message = str(caught.value)
-    assert "\n" not in message
-    assert [word for word in words if word not in message] == [], message
-
-
-def all_of(traverse: Traverse, batch: int = 64) -> Tensor:
-    return torch.cat(list(traverse.batches(batch)))
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import json
 import pickle
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,14 @@ from typing import Any
 import pytest
 import safetensors.torch
 import torch
+from helpers import Fixed, refused
 from safetensors import safe_open
 from torch import Tensor, nn
 
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
-from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer
 
 WINDOW = SpectrogramAnalysis(window=64, strongest=1)
 
@@ -57,33 +56,12 @@ class Tied(nn.Module):
         return self.again(self.encode(frames.mean((1, 2))))
 
 
-class Fixed(PeriodFinder):
-    """Layers that are known beforehand."""
-
-    def __init__(self, *layers: FrequencyLayer) -> None:
-        super().__init__()
-        self.layers = layers
-
-    def plan(self, features: Tensor) -> Plan:
-        return self.layers
-
-
 class Stateful(Fixed):
     """A period finder with a buffer of its own."""
 
     def __init__(self, *layers: FrequencyLayer) -> None:
         super().__init__(*layers)
         self.register_buffer("prior", torch.ones(3))
-
-
-@contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """The block is refused in one line that holds these words."""
-    with pytest.raises(InputError) as caught:
-        yield
-    message = str(caught.value)
-    assert "\n" not in message
-    assert [word for word in words if word not in message] == [], message
 
 
 def waves(frames: int = 64) -> Tensor:

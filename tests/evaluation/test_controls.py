@@ -8,25 +8,14 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import Fixed
 from torch import Tensor
 
 from dejavu_torch.evaluation.controls import leave_out_match, null_control, relearn
 from dejavu_torch.evaluation.curves import judge
 from dejavu_torch.model import DejaVu
-from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, InputError, Match, Plan
-
-
-class Fixed(PeriodFinder):
-    """Layers that are known beforehand."""
-
-    def __init__(self, *layers: FrequencyLayer) -> None:
-        super().__init__()
-        self.layers = layers
-
-    def plan(self, features: Tensor) -> Plan:
-        return self.layers
 
 
 def layer(
