@@ -58,13 +58,14 @@ def fail(message: str) -> NoReturn:
     raise SystemExit(2)
 
 
-def run_demo(out: Path, seed: int) -> None:
+def run_demo(out: Path, seed: int, command: str) -> None:
     """The main job on the built-in route."""
     make_output_folder(out)
     reference = open_source(f"sim:aerial?seed={seed}")
     query = open_source(f"sim:aerial?seed={seed}&traverse=1")
     print(f"learning {reference.name}, then finding {query.name} on it")
-    _publish(compare(reference, query, progress=True), out, "dejavu demo: the built-in route", save_map=True)
+    result = compare(reference, query, progress=True)
+    _publish(result, out, "dejavu demo: the built-in route", command, save_map=True)
 
 
 def run_learn(source: str, map: Path, model: DejaVu) -> None:
@@ -94,12 +95,13 @@ def run_compare(
     leave_out: int | None,
     out: Path,
     model: DejaVu,
+    command: str,
 ) -> None:
     """Learn, localize and judge; report beside baselines and null control."""
-    make_output_folder(out)
     pair = open_source(reference), open_source(query)
+    make_output_folder(out)
     result = compare(*pair, truth, model, tolerance, leave_out, progress=True)
-    _publish(result, out, f"{query} found on {reference}")
+    _publish(result, out, f"{query} found on {reference}", command)
 
 
 def run_info(map: Path, features: Any) -> None:
@@ -116,7 +118,7 @@ def _print_plan(model: DejaVu) -> None:
     print(describe(model.certificate))
 
 
-def _publish(result: Comparison, out: Path, title: str, save_map: bool = False) -> None:
+def _publish(result: Comparison, out: Path, title: str, command: str, save_map: bool = False) -> None:
     _print_plan(result.model)
     if result.report.ours.scores is None:
         print("the traverses differ in length and no --truth was given: matches and pictures, no scores")
@@ -124,7 +126,6 @@ def _publish(result: Comparison, out: Path, title: str, save_map: bool = False) 
     write_matches(out / "matches.csv", [result.match])
     if save_map:
         result.model.save(out / "map.safetensors")
-    command = shlex.join(["dejavu", *sys.argv[1:]])
     write_report(out, result.report, result.pictures, title, command, describe(result.model.certificate))
     print(f"right within {result.report.facts['tolerance']} frames; report: {out / 'index.html'}")
 
@@ -140,6 +141,8 @@ def build_parser() -> Parser:
         if model:
             sub.add_argument("--config", action="config", help="YAML file; its keys are the options below")
             sub.add_class_arguments(DejaVu, None, as_group=True)
+            defaults = {"features": "dejavu_torch.HOG", "periods": "dejavu_torch.SpectrogramAnalysis"}
+            sub.set_defaults({name: {"class_path": path} for name, path in defaults.items()})
         commands.add_subcommand(name, sub, help=text)
         return sub
 
@@ -201,6 +204,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         chosen.pop("config", None)
         if parsed.command in ("learn", "compare"):
             chosen["model"] = DejaVu(**{name: chosen.pop(name) for name in MODEL})
+        if parsed.command in ("demo", "compare"):
+            chosen["command"] = shlex.join(["dejavu", *given])
         COMMANDS[parsed.command](**chosen)
     except UsageError as error:
         config = [value for name, value in pairwise(given) if name == "--config"]
@@ -213,7 +218,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         fail(str(cause))
     except KeyboardInterrupt:
-        fail("interrupted; nothing half-written was left")
+        print("dejavu: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 if __name__ == "__main__":

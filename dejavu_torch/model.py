@@ -16,7 +16,7 @@ from dejavu_torch.database.certificate import Certificate, certify
 from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import Recipe, build, map_size, read_map, recipe_of, write_map
 from dejavu_torch.database.phase import PhaseTemplates
-from dejavu_torch.features.extract import feature_batches, features_of, holds_features
+from dejavu_torch.features.extract import feature_batches, features_of, frame_shape
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -71,7 +71,7 @@ class DejaVu(nn.Module):
         self.threshold = threshold
         self.batch_size = batch_size
         self.map = CompressedMap()
-        self.ready_features = False  # the map was learnt from features made elsewhere
+        self.learnt_from: tuple[int, ...] | None = None  # a frame's (C,H,W), or (D,) of ready features
 
     def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
         """Section III-A: features, their periods, layers, and the templates of eq. 1.
@@ -89,27 +89,30 @@ class DejaVu(nn.Module):
         """
         traverse = as_traverse(traverse)
         features = self.extract_all(traverse, "learning" if progress else None)
-        return self.learn_features(features, ready=holds_features(traverse))
+        return self.learn_features(features, frame_shape(traverse))
 
-    def learn_features(self, features: Tensor, ready: bool = False) -> DejaVu:
+    def learn_features(self, features: Tensor, learnt_from: tuple[int, ...] | None = None) -> DejaVu:
         """As `learn`, from features that are there already.
 
         Args:
             features: (N,D) float.
-            ready: they were made elsewhere, not by `self.features`; the map then refuses frames.
+            learnt_from: shape of the frames that `self.features` made them from, (C,H,W); (D,) where
+                they were made elsewhere, so that the map refuses frames; None where unknown.
         """
         plan = self.periods.plan(features)
         with torch.no_grad():
             templates = self.templates(features, plan)
         self.map = CompressedMap(plan, templates, *features.shape).to(features.device)
-        self.ready_features = ready
+        self.learnt_from = learnt_from
         return self
 
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
-        self._require_features(queries.ndim == 2, "the query")
-        scores: Tensor = self.matcher(features_of(queries, self.features, "the query"), self.map)
+        self.check_queries(tuple(queries.shape[1:]), "the query")
+        features = features_of(queries, self.features, "the query")
+        self._check_dimension(features, tuple(queries.shape[1:]), "the query")
+        scores: Tensor = self.matcher(features, self.map)
         return scores
 
     def localize(self, queries: Traverse | Tensor, progress: bool = False) -> Match:
@@ -131,8 +134,10 @@ class DejaVu(nn.Module):
         self._require_map()
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         queries = as_traverse(queries)
-        self._require_features(holds_features(queries), queries.name)
+        shape = frame_shape(queries)
+        self.check_queries(shape, queries.name)
         for features in self.extract(queries, "localizing" if progress else None):
+            self._check_dimension(features, shape, queries.name)
             for part in features.split(at_once):
                 with torch.no_grad():
                     match = best_match(self.matcher(part, self.map), self.threshold)
@@ -153,6 +158,8 @@ class DejaVu(nn.Module):
             InputError: nothing learnt yet, or the file cannot be written.
         """
         self._require_map()
+        if callable(self.matcher.metric):
+            raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
         write_map(Path(path), *self._file())
 
     @classmethod
@@ -171,10 +178,8 @@ class DejaVu(nn.Module):
             made_by, found_by = Recipe(**header["features"]), Recipe(**header["periods"])
             if features is None:
                 features = build(made_by)
-            elif recipe_of(features).class_path != made_by.class_path:
-                raise InputError(
-                    f"{path} was learnt with {made_by.class_path}; got {recipe_of(features).class_path}"
-                )
+            elif recipe_of(features) != made_by:
+                raise InputError(f"it was learnt with {made_by}; got {recipe_of(features)}")
             # only learning needs what found the periods: one from elsewhere need not be built
             ours = found_by.class_path.startswith("dejavu_torch.")
             periods = build(found_by) if ours else None
@@ -182,9 +187,10 @@ class DejaVu(nn.Module):
                 raise InputError(f"it names {found_by.class_path} as what finds periods, which it does not")
             settings = {name: header[name] for name in ("metric", "reduction", "threshold", "batch_size")}
             model = cls(features, periods, **settings)
-            model.ready_features = bool(header["ready_features"])
+            model.learnt_from = header["learnt_from"] and tuple(header["learnt_from"])
             loaded = model.load_state_dict(tensors, strict=False)
-            missing = [name for name in loaded.missing_keys if not name.startswith("periods.")]
+            not_kept = ("periods.", "_extra_state")
+            missing = [name for name in loaded.missing_keys if not name.startswith(not_kept)]
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
         except InputError as error:
@@ -205,7 +211,8 @@ class DejaVu(nn.Module):
     @property
     def backbone_bytes(self) -> int:
         """The part of `map_bytes` that is weights of the feature module."""
-        return sum(t.numel() * t.element_size() for t in self.features.state_dict().values())
+        weights = [t for t in self.features.state_dict().values() if isinstance(t, Tensor)]
+        return sum(t.numel() * t.element_size() for t in weights)
 
     @property
     def certificate(self) -> Certificate:
@@ -213,27 +220,54 @@ class DejaVu(nn.Module):
         return certify(self.map.plan, self.map.places, self.map_bytes)
 
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        if callable(self.matcher.metric):
-            raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
+        metric = self.matcher.metric
         header = {
             "features": recipe_of(self.features)._asdict(),
             "periods": recipe_of(self.periods)._asdict(),
-            "metric": self.matcher.metric,
+            "metric": metric if isinstance(metric, str) else getattr(metric, "__name__", "callable"),
             "reduction": self.matcher.reduction,
             "threshold": self.threshold,
             "batch_size": self.batch_size,
-            "ready_features": self.ready_features,
+            "learnt_from": self.learnt_from,
         }
         # what found the periods is not needed any more
         tensors = {f"map.{name}": t for name, t in self.map.state_dict().items()}
-        return tensors | {f"features.{name}": t for name, t in self.features.state_dict().items()}, header
+        weights = {f"features.{n}": t for n, t in self.features.state_dict().items() if isinstance(t, Tensor)}
+        return tensors | weights, header
 
-    def _require_features(self, given: bool, name: str) -> None:
-        if self.ready_features and not given:
+    def check_queries(self, shape: tuple[int, ...], name: str) -> None:
+        """Refuse frames where the map was learnt from ready features, and tell of frames of another size.
+
+        Args:
+            shape: of one query, (C,H,W) or (D,).
+            name: of the queries, for the message.
+        """
+        if self.learnt_from is None or len(shape) != 3:
+            return
+        if len(self.learnt_from) == 1:
             raise InputError(
                 f"{name} holds frames, but the map was learnt from ready features; "
                 f"expected features (Q, {self.map.dimension})"
             )
+        if shape[1:] != self.learnt_from[1:] and getattr(self.features, "resize", None) is None:
+            log.warning(
+                "%s has frames of %s, the map was learnt from %s", name, _by(shape), _by(self.learnt_from)
+            )
+
+    def _check_dimension(self, features: Tensor, shape: tuple[int, ...], name: str) -> None:
+        if features.shape[1] != self.map.dimension and len(shape) == 3 and self.learnt_from:
+            raise InputError(
+                f"{name}: frames of {_by(shape)} give {features.shape[1]} features; the map expects "
+                f"{self.map.dimension}, as frames of {_by(self.learnt_from)} give"
+            )
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What the state_dict holds beside the tensors."""
+        return {"learnt_from": self.learnt_from}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take over what `get_extra_state` gave."""
+        self.learnt_from = state["learnt_from"]
 
     def _require_map(self) -> None:
         if not self.map.places:
@@ -243,3 +277,7 @@ class DejaVu(nn.Module):
 def as_traverse(source: Traverse | Tensor) -> Traverse:
     """A tensor of frames or features as a traverse; a traverse as it is."""
     return source if isinstance(source, Traverse) else ArrayTraverse(source)
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape))

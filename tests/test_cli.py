@@ -145,6 +145,14 @@ def test_config_and_options(tmp_path: Path) -> None:
     assert {(layer.start, layer.stop) for layer in model.map.plan} == {(0, 128), (128, 256)}
 
 
+def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
+    route = tmp_path / "a.safetensors"
+    run("learn", SMALL, "--map", route, "--periods.window", "128", "--features.cell", "16")
+    model = DejaVu.load(route)
+    assert (model.periods.window, model.features.cell) == (128, 16)
+    assert model.periods.peaks == "local"
+
+
 def test_features_by_class_path(tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
     run("learn", SMALL, "--map", route, "--features", "dejavu_torch.HOG", "--features.cell", "16")
@@ -357,6 +365,8 @@ def test_bad_config(text: str, named: str, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_unknown_option_and_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert fails(capsys, "compare", "nowhere", QUERY, "--out", tmp_path / "report")
+    assert not (tmp_path / "report").exists()
     assert "--colour" in fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--colour", "red")
     assert "dance" in fails(capsys, "dance")
     assert "map" in fails(capsys, "learn", SMALL)

@@ -1,4 +1,4 @@
-"""Imports point one way (design.md, section 1), and files stay short."""
+"""Imports point one way (CONTRIBUTING.md, the house), and files stay short."""
 
 from __future__ import annotations
 

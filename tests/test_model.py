@@ -121,7 +121,7 @@ def test_tensors_traverses_and_batch_sizes_agree(make: Any, batch_size: int) -> 
 def test_byte_frames_are_frames() -> None:
     pixels = (pictures()[:, 0] * 255).byte()
     model = wave_model(features=HOG(block=1)).learn(pixels)
-    assert not model.ready_features
+    assert model.learnt_from == (1, *pixels.shape[1:])
     assert model.localize(pixels).index.tolist() == list(range(72))
 
 
@@ -129,7 +129,11 @@ def test_learn_returns_the_model_and_relearning_replaces_the_map() -> None:
     model = wave_model()
     assert model.learn(waves()) is model
     assert model.learn(pictures(90)) is model
-    assert (model.map.places, model.map.dimension, model.ready_features) == (90, 3 * 36, False)
+    assert (model.map.places, model.map.dimension, model.learnt_from) == (
+        90,
+        3 * 36,
+        tuple(pictures().shape[1:]),
+    )
     fresh = wave_model().learn(pictures(90))
     assert model.map.plan == fresh.map.plan
     assert torch.equal(model(pictures(3)), fresh(pictures(3)))
@@ -390,7 +394,7 @@ def test_features_of_another_dimension_are_refused(query: Tensor) -> None:
 
 def test_frames_of_another_size_are_refused() -> None:
     model = wave_model().learn(pictures())
-    with refused("(Q, 108)"):
+    with refused("32 x 32", "324 features", "expects 108"):
         model.localize(torch.rand(3, 1, 32, 32))
     with refused("8 x 8", "16 x 16"):
         model.localize(torch.rand(3, 1, 8, 8))
@@ -438,3 +442,21 @@ def test_a_backbone_that_makes_no_features_is_refused(make: Any) -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
     with refused("expected"):
         DejaVu(**arguments)
+
+
+def test_frames_of_another_size_are_told_apart(caplog: pytest.LogCaptureFixture) -> None:
+    model = wave_model(features=HOG(cell=8)).learn(torch.rand(72, 1, 32, 16))
+    with refused("1 x 32 x 32", "1 x 32 x 16"):
+        model.localize(torch.rand(3, 1, 32, 32))
+    with refused("1 x 32 x 32", "1 x 32 x 16"):
+        model(torch.rand(3, 1, 32, 32))
+    caplog.clear()
+    model.localize(torch.rand(3, 1, 16, 32))  # as many features, and yet not the same
+    assert "1 x 16 x 32" in caplog.text
+
+
+def test_what_a_map_was_learnt_from_is_part_of_its_state() -> None:
+    model = wave_model().learn(waves())
+    again = wave_model()
+    again.load_state_dict(model.state_dict())
+    assert again.learnt_from == model.learnt_from == (waves().shape[1],)

@@ -63,9 +63,5 @@ def read_array(path: Path) -> ArrayTraverse:
         if not isinstance(values, np.ndarray):
             raise ValueError("several arrays in one file")
     except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path} is no whole .npy array ({_line(error)}); expected {EXPECTED}") from error
+        raise InputError(f"{path} is no whole .npy array; expected {EXPECTED}") from error
     return ArrayTraverse(values, str(path))
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]

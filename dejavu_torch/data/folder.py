@@ -30,7 +30,11 @@ class ImageFolder(Traverse):
         folder = Path(path)
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
-        files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
+        files = [
+            file
+            for file in folder.iterdir()
+            if file.suffix.lower() in SUFFIXES and file.is_file() and file.name[0] != "."
+        ]
         if not files:
             raise InputError(f"{folder} holds no images; expected files such as .png or .jpg")
         self.files = sorted(files, key=lambda file: _natural(file.name))

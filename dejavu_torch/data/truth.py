@@ -41,6 +41,18 @@ def position_truth(reference: Tensor, query: Tensor) -> Tensor:
     return place.T
 
 
+def read_offset(truth: str) -> int:
+    """The offset that a text means.
+
+    Raises:
+        InputError: no integer.
+    """
+    try:
+        return int(truth)
+    except ValueError as error:
+        raise InputError(f"truth {truth!r} is not known; expected an integer offset such as 0") from error
+
+
 def find_truth(
     truth: str | None, reference: Traverse, query: Traverse, places: int, queries: int
 ) -> Tensor | None:
@@ -53,13 +65,17 @@ def find_truth(
     Shape: -> (Q,R) int64, every right place of each query, -1 as padding; or None.
 
     Raises:
-        InputError: text that is no truth.
+        InputError: text that is no truth, or a truth in which no query has a right answer.
     """
     if truth is not None:
-        try:
-            return offset_truth(queries, places, int(truth))
-        except ValueError as error:
-            raise InputError(f"truth {truth!r} is not known; expected an integer offset such as 0") from error
+        offset = read_offset(truth)
+        right = offset_truth(queries, places, offset)
+        if not (right >= 0).any():
+            raise InputError(
+                f"with truth {offset} no query has a right answer: {queries} queries, {places} places; "
+                f"expected an offset from {1 - queries} to {places - 1}"
+            )
+        return right
     if reference.place is not None and query.place is not None:
         return position_truth(reference.place, query.place)
     return offset_truth(queries, places) if queries == places else None

@@ -80,7 +80,7 @@ def describe(certificate: Certificate) -> str:
         >>> from dejavu_torch.types import FrequencyLayer
         >>> layers = [FrequencyLayer(Fraction(p), p, 0, 1024, (0, 1)) for p in (93, 171)]
         >>> print(describe(certify(tuple(layers), places=1024, map_bytes=4096)))
-        frames 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); tells 5301 places apart; gcd 3
+        frames 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); lcm 5301 frames, gcd 3
         1024 of 1024 places covered; 264 templates, 528 numbers; 4096 bytes, 4.0 per place
     """
     lines = []
@@ -90,15 +90,15 @@ def describe(certificate: Certificate) -> str:
             f"{_number(chunk.periods[j])} ({chunk.features[j]} features)" for j in sorted(largest)
         )
         more = len(chunk.periods) - len(largest)
-        capacity = _number(chunk.common_period) if chunk.common_period < 10**9 else "over 1000000000"
+        lcm = _number(chunk.common_period) if chunk.common_period < 10**9 else "over 1e9"
         layers = f"{len(chunk.periods)} layer{'s' * (len(chunk.periods) > 1)}"
         line = f"frames {chunk.start}-{chunk.stop - 1}: {layers}, periods {shown}" + (
             f" and {more} smaller layers" if more else ""
         )
-        line += f"; tells {capacity} places apart"
+        line += f"; lcm {lcm} frames"
         if chunk.shared_factors:
             low, high = min(chunk.shared_factors), max(chunk.shared_factors)
-            line += f"; gcd {_number(low)}" + ("" if low == high else f" to {_number(high)}")
+            line += f", gcd {_number(low)}" + ("" if low == high else f" to {_number(high)}")
         lines.append(line)
     lines.append(
         f"{certificate.covered} of {certificate.places} places covered; {certificate.templates} templates, "

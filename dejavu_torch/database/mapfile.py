@@ -33,7 +33,9 @@ def recipe_of(module: nn.Module) -> Recipe:
     cls = type(module)
     path = f"{cls.__module__}.{cls.__qualname__}"
     names = inspect.signature(cls).parameters if path.startswith(PACKAGE + ".") else ()
-    return Recipe(path, {name: getattr(module, name) for name in names})
+    arguments = {name: getattr(module, name) for name in names}
+    # as JSON gives it back, so that a recipe read from a file equals the module's own
+    return Recipe(path, json.loads(json.dumps(arguments)))
 
 
 def build(recipe: Recipe) -> nn.Module:

@@ -33,7 +33,8 @@ def nearest_frames(
             distances = phase_distances(batch, reference, metric)
             for found, k in zip(parts, strides, strict=True):
                 match = best_match(distances[:, ::k])
-                found.append(match._replace(index=match.index * k))
+                match = match._replace(index=torch.where(match.index >= 0, match.index * k, -1))
+                found.append(Match(*(column.cpu() for column in match)))
     return [Match(*(torch.cat(column) for column in zip(*found, strict=True))) for found in parts]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.distance import Metric, phase_distances
 from dejavu_torch.recognition.scores import combine_layers
@@ -12,29 +13,38 @@ from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 
-def relearn(model: DejaVu, features: Tensor) -> DejaVu:
-    """A model with the same settings, learnt anew from features (N,D)."""
-    matcher = model.matcher
-    other = DejaVu(
-        model.features, model.periods, matcher.metric, matcher.reduction, model.threshold, model.batch_size
-    )
-    return other.learn_features(features, model.ready_features)
+def same_settings(model: DejaVu) -> DejaVu:
+    """A model with the settings of another and no map."""
+    metric, reduction = model.matcher.metric, model.matcher.reduction
+    return DejaVu(model.features, model.periods, metric, reduction, model.threshold, model.batch_size)
 
 
-def null_control(model: DejaVu, reference: Tensor, query: Tensor, seed: int = 0) -> Match:
-    """Matches of a map whose periods and templates were learnt from the reference in shuffled order.
+def null_control(
+    model: DejaVu, reference: Tensor, query: Tensor, seed: int = 0, same_plan: bool = False
+) -> Match:
+    """Matches of a map learnt from the reference in shuffled order.
 
-    Nothing repeats in time any more, so what such a map still recognises does not come from periods.
+    Nothing repeats in time any more, so what such a map still recognises does not come from periods
+    but from templates that hold few frames each, as any store of frames does.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
+        same_plan: keep the layers of the model and learn only the templates anew. Otherwise the periods
+            are sought anew too; the default preset then finds none, since shuffled frames are noise
+            in time, and reports nothing.
 
     Returns:
-        Match of (Q,) whose index is the reference frame *stored* at the reported place; -1
-        everywhere where the shuffled route gave no layers.
+        Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
+        the map reports nothing.
     """
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
-    match = relearn(model, reference[order]).localize(query)
+    shuffled, null = reference[order.to(reference.device)], same_settings(model)
+    if same_plan:
+        templates = null.templates(shuffled, model.map.plan)
+        null.map = CompressedMap(model.map.plan, templates, *shuffled.shape).to(shuffled.device)
+    else:
+        null.learn_features(shuffled)
+    match = null.localize(query)
     return match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
 
 
@@ -61,13 +71,14 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
         return model.localize(reference)
     matches = []
     with torch.no_grad():
-        for frames in torch.arange(len(reference)).split(256):
+        for frames in torch.arange(len(reference), device=reference.device).split(256):
             distances = [
                 _distances_without(reference[:, index], layer, block, frames, width, matcher.metric)
                 for layer, block, index in zip(plan, blocks, model.map.layer_features(), strict=True)
             ]
             scores = combine_layers(distances, plan, len(reference), matcher.metric, matcher.reduction)
-            matches.append(best_match(scores, model.threshold))
+            match = best_match(scores, model.threshold)
+            matches.append(Match(*(column.cpu() for column in match)))
     return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
 
 
@@ -75,20 +86,20 @@ def _distances_without(
     values: Tensor, layer: FrequencyLayer, block: Tensor, frames: Tensor, width: int, metric: Metric
 ) -> Tensor:
     """Phase distances of the queries `frames`, each without the frames within `width` of it: (B,P)."""
-    near = frames[:, None] + torch.arange(-width, width + 1)  # (B,K)
+    near = frames[:, None] + torch.arange(-width, width + 1, device=frames.device)  # (B,K)
     inside = (near >= layer.start) & (near < layer.stop)
     near = near.clamp(0, len(values) - 1)
     phase = layer.phase(near)
     # frames of the window that share a phase leave its mean together
     together = (phase[:, :, None] == phase[:, None, :]) & inside[:, None, :]
     taken = together.to(values.dtype) @ values[near]  # (B,K,F)
-    count = torch.bincount(layer.place_phases, minlength=layer.phases)[phase]
+    count = torch.bincount(layer.place_phases, minlength=layer.phases).to(frames.device)[phase]
     left = count - together.sum(2)
     mean = (block[phase] * count[..., None] - taken) / left.clamp(min=1)[..., None]
     rows = zip(values[frames].split(1), mean, strict=True)
     distance = torch.cat([phase_distances(query, means, metric) for query, means in rows])
     distance = torch.where(left > 0, distance, torch.inf)
     table = phase_distances(values[frames], block, metric)
-    row = torch.arange(len(frames))[:, None].expand_as(phase)
+    row = torch.arange(len(frames), device=frames.device)[:, None].expand_as(phase)
     table[row[inside], phase[inside]] = distance[inside]
     return table

@@ -15,7 +15,7 @@ from dejavu_torch.types import FrequencyLayer, Match, Plan, PRCurve
 Plot = tuple[Figure, Any]
 
 BLUE, ORANGE, GREEN, RED, DARK, GREY = "#2166ac", "#d9822b", "#1b8a4b", "#c0392b", "#333333", "#999999"
-_CURVES = (BLUE, DARK, ORANGE, "#8e6bb0", GREY)
+_CURVES = (BLUE, DARK, ORANGE, "#8e6bb0", GREY, RED)
 
 
 def _figure(width: float, height: float, rows: int = 1) -> Plot:
@@ -28,7 +28,7 @@ def _figure(width: float, height: float, rows: int = 1) -> Plot:
 
 def plot_curves(curves: Mapping[str, PRCurve], title: str = "") -> Plot:
     """Precision against recall, one line for each name (figures 8 to 10 of the paper)."""
-    figure, axis = _figure(6, 4.2)
+    figure, axis = _figure(6, 4.9)
     for (name, curve), colour in zip(curves.items(), _CURVES * 2, strict=False):
         if len(curve.recall) == 0:
             axis.plot([], [], color=colour, label=f"{name} (reports nothing)")
@@ -39,7 +39,7 @@ def plot_curves(curves: Mapping[str, PRCurve], title: str = "") -> Plot:
         xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision", title=title
     )
     axis.grid(alpha=0.25)
-    axis.legend(loc="lower left", frameon=False, fontsize=9)
+    axis.legend(loc="upper left", bbox_to_anchor=(0, -0.13), ncols=2, frameon=False, fontsize=8)
     return figure, axis
 
 

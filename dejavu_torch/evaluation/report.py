@@ -135,11 +135,19 @@ _HEADINGS = {
     "activations": "two layers and their fusion",
 }
 
+_NOTE = """
+R@100P: recall at 100 % precision; P@100R: precision when every query reports; rep.: the second definition of
+recall. A curve starts at its first threshold: matches that all have one score enclose no area. Null controls
+learn from the reference in shuffled order, where nothing repeats. The first seeks the periods anew, and
+reports nothing where no frequency passes the test for noise. The second keeps this map's layers: what it
+recognises comes from how much the map stores, not from periods.
+"""
+
 _STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
+body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
 div.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
-td,th{padding:.3rem .7rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
+td,th{padding:.25rem .5rem;font-size:.9rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
 td:first-child,th:first-child{text-align:left}tr.ours{background:#eaf2fb;font-weight:600}
 img{max-width:100%;height:auto}pre{background:#f6f6f6;padding:.7rem;white-space:pre-wrap;font-size:.85rem}
 p.note{color:#555;font-size:.9rem}
@@ -165,9 +173,7 @@ def _page(report: Report, images: Mapping[str, bytes], title: str, command: str,
 <p>{facts["queries"]} queries on {facts["frames"]} places; {scored}
 Learning took {facts["seconds_learn"]:.1f} s, localizing {facts["seconds_localize"]:.1f} s.</p>
 <div class="wide"><table>{table}</table></div>
-<p class="note">recall = {html.escape(facts["recall_definition"])}. R@100P: recall at 100 % precision; P@100R:
-precision when every query reports; rep.: the second definition of recall. null: periods and templates learnt
-from the reference in shuffled order, a control that should find little.</p>
+<p class="note">recall = {html.escape(facts["recall_definition"])}. {_NOTE}</p>
 <h2>the map</h2><pre>{html.escape(plan)}</pre>
 {pictures}
 <h2>made by</h2><pre>{html.escape(command)}

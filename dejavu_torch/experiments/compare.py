@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.truth import find_truth
+from dejavu_torch.data.truth import find_truth, read_offset
 from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, curve_of, judge
 from dejavu_torch.evaluation.plots import Plot, plot_activations, plot_chunks, plot_coverage, plot_curves
 from dejavu_torch.evaluation.report import Contender, Report
-from dejavu_torch.features.extract import holds_features
+from dejavu_torch.features.extract import frame_shape
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.distance import phase_distances
 from dejavu_torch.types import InputError, Match, Traverse
@@ -58,11 +58,14 @@ def compare(
     """
     if tolerance < 0 or (leave_out is not None and leave_out < 0):
         raise InputError(f"tolerance is {tolerance}, leave_out {leave_out}; expected at least 0")
+    if truth is not None:
+        read_offset(truth)  # before the long work
     model = DejaVu() if model is None else model
     began = time.perf_counter()
     stored = model.extract_all(reference, "learning" if progress else None)
-    model.learn_features(stored, ready=holds_features(reference))
+    model.learn_features(stored, frame_shape(reference))
     learnt = time.perf_counter()
+    model.check_queries(frame_shape(query), query.name)
     seen = model.extract_all(query, "localizing" if progress else None)
     match = model.localize(seen)
     localized = time.perf_counter()
@@ -76,9 +79,14 @@ def compare(
     everything, strided, sparse = nearest_frames(stored, seen, (1, k, coarsest), model.matcher.metric)
     found = {
         "uncompressed": (f"all {len(stored)} frames", everything, 1),
-        "stride": (f"every {_ordinal(k)} frame", strided, k),
-        "stride_coarsest": (f"every {_ordinal(coarsest)} frame", sparse, coarsest),
-        "null": ("null control", null_control(model, stored, seen, seed), None),
+        "stride": (f"every {_ordinal(k)} frame (the map's bytes)", strided, k),
+        "stride_coarsest": (f"every {_ordinal(coarsest)} frame (2 x tolerance)", sparse, coarsest),
+        "null": ("null: all learnt shuffled", null_control(model, stored, seen, seed), None),
+        "null_same_plan": (
+            "null: this map's layers, shuffled",
+            null_control(model, stored, seen, seed, same_plan=True),
+            None,
+        ),
     }
     if leave_out is not None:
         itself = leave_out_match(model, stored, leave_out)
@@ -141,7 +149,7 @@ def _pictures(
         curves = {"this map": curve_of(match, truth, tolerance)}
         for key, (name, other, _) in found.items():
             if key != "leave_out":  # it has other queries
-                curves.setdefault(name, curve_of(other, truth, tolerance))
+                curves[name] = curve_of(other, truth, tolerance)
         pictures["pr"] = plot_curves(curves, f"right within {tolerance} frames")
     pictures["coverage"] = plot_coverage(match, truth, tolerance, model.map.places)
     pictures["chunks"] = plot_chunks(model.map.plan, model.map.places)
@@ -188,11 +196,14 @@ def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:
     None where the traverse holds features.
     """
     columns: list[Tensor] = []
+    seen = 0
     for batch in traverse.batches(64):
-        if batch.ndim == 2 or len(columns) >= stop:
+        if batch.ndim == 2 or seen >= stop:
             break
-        columns += batch[..., batch.shape[-1] // 2].float().unbind()
-    return torch.stack(columns[start:stop], -1) if columns else None
+        middle = batch[max(0, start - seen) : stop - seen, ..., batch.shape[-1] // 2]
+        columns.append(middle.clone())  # a view would keep the whole frames
+        seen += len(batch)
+    return torch.cat(columns).permute(1, 2, 0).float() if columns else None
 
 
 def _plain(period: object) -> int | float:
@@ -201,4 +212,4 @@ def _plain(period: object) -> int | float:
 
 
 def _ordinal(k: int) -> str:
-    return {1: "single", 2: "2nd", 3: "3rd"}.get(k, f"{k}th")
+    return {1: "1st", 2: "2nd", 3: "3rd"}.get(k, f"{k}th")

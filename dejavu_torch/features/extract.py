@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 
 import torch
 from torch import Tensor, nn
@@ -41,6 +40,8 @@ def feature_batches(
         for batch in traverse.batches(batch_size):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
+            if features.dtype in (torch.float16, torch.bfloat16):  # too coarse to add up and to transform
+                features = features.float()
             bad = ~features.isfinite().all(1)
             if bad.any():
                 first = done + int(bad.nonzero()[0])
@@ -76,6 +77,8 @@ def features_of(batch: Tensor, module: nn.Module, name: str = "the input") -> Te
     return features
 
 
-def holds_features(traverse: Traverse) -> bool:
-    """Whether a traverse gives ready features (B,D) and not frames."""
-    return any(batch.ndim == 2 for batch in islice(traverse.batches(1), 1))
+def frame_shape(traverse: Traverse) -> tuple[int, ...]:
+    """Shape of one frame of a traverse: (C,H,W), or (D,) where it gives ready features."""
+    for batch in traverse.batches(1):
+        return tuple(batch.shape[1:])
+    raise InputError(f"{traverse.name} holds no frames; expected at least one")

@@ -16,6 +16,8 @@ from dejavu_torch.types import InputError, Plan
 
 log = logging.getLogger("dejavu_torch")
 
+HANN_PEAK = 2 / 3  # share of its power that a pure wave holds in its own bin under a Hann window
+
 
 class Spectrum(NamedTuple):
     """Power of every feature at every frequency of one chunk [start, stop), n = stop - start frames.
@@ -91,13 +93,14 @@ class SpectrogramAnalysis(PeriodFinder):
         window: frames per spectrum, which is also the length of a chunk.
         hop: frames from one chunk to the next; None is `window`, chunks side by side.
         min_period: shortest period considered, frames. The longest is half the window (bin 2):
-            bins 0 and 1 hold the mean and its leakage through the Hann window.
+            bins 0 and 1 hold the mean, slow drift, and their leakage through the Hann window.
         strongest: how many of its strongest frequencies a feature keeps.
         peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
         false_alarm: a frequency is kept only where its share of the feature's power is more than
-            white noise would show anywhere in the chunk with at most this probability (`noise_share`), so
-            that a route in which nothing repeats gets no layers. None keeps every frequency (the
-            paper).
+            white noise would show anywhere in the chunk with at most this probability
+            (`noise_share`). It rejects noise that is new in every frame, so that frames without any
+            order get no layers; smooth footage passes, whether it repeats or not. None keeps every
+            frequency (the paper).
         similar: features share a layer when their frequencies lie within this many bins of the
             layer's most common period; 0 means the same rounded period (the paper).
         short: what to do with a traverse shorter than the window: "shrink" the window to the
@@ -107,7 +110,8 @@ class SpectrogramAnalysis(PeriodFinder):
 
     Convention: Hann window, not centred. What remains after the last whole window is a shorter
         window of its own; a remainder under two of the shortest periods can show none and is left
-        out. A feature that does not vary inside a chunk has no power there.
+        out. A feature that does not vary inside a chunk has no power there. Where a chunk is too
+        short for any wave to pass `false_alarm`, one logged line says so.
 
     Raises:
         InputError: not (N,D), not finite, fewer than two of the shortest periods, or a traverse
@@ -155,6 +159,7 @@ class SpectrogramAnalysis(PeriodFinder):
         self.false_alarm = false_alarm
         self.similar = similar
         self.short = short
+        self._told: set[str] = set()
 
     def chunks(self, frames: int) -> list[tuple[int, int]]:
         """The chunks [start, stop) that a traverse of `frames` frames is cut into."""
@@ -168,7 +173,7 @@ class SpectrogramAnalysis(PeriodFinder):
         if frames < window:
             if self.short == "refuse":
                 raise InputError(f"the traverse has {frames} frames; expected at least {window}, the window")
-            log.warning("window shrunk from %d to %d frames, the whole traverse", window, frames)
+            self._tell(f"window shrunk from {window} to {frames} frames, the whole traverse")
             window = frames
         hop = min(self.hop or window, window)
         starts = range(0, frames - window + 1, hop)
@@ -202,9 +207,20 @@ class SpectrogramAnalysis(PeriodFinder):
                 if self.false_alarm is not None:
                     share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
                     least = noise_share(len(power) - 1, power.shape[1], self.false_alarm)
+                    if least > HANN_PEAK:
+                        self._tell(
+                            f"frames {start}-{stop - 1}: too few to tell a period from noise in "
+                            f"{power.shape[1]} features, so none is kept"
+                        )
                     bins = bins.masked_fill(~(share > least), -1)
                 layers += cluster_layers(bins, start, stop, self.similar)
             return tuple(layers)
+
+    def _tell(self, message: str) -> None:
+        """Log a warning, once."""
+        if message not in self._told:
+            log.warning(message)
+            self._told.add(message)
 
     def extra_repr(self) -> str:
         names = ("window", "hop", "min_period", "strongest", "peaks", "false_alarm", "similar", "short")

@@ -36,7 +36,9 @@ def check_metric(metric: Metric) -> None:
         InputError: naming what is known.
     """
     if not callable(metric) and metric not in METRICS:
-        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(METRICS)} or a callable")
+        raise InputError(
+            f"metric {metric!r} is unknown; expected {', '.join(METRICS)}, or in Python a callable"
+        )
 
 
 def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> Tensor:

@@ -164,10 +164,22 @@ def test_the_threshold_is_stored(path: Path, threshold: float | None) -> None:
     assert torch.equal(again.localize(query).accepted, model.localize(query).accepted)
 
 
-@pytest.mark.parametrize("ready", [True, False])
-def test_a_map_of_ready_features_stays_one(path: Path, ready: bool) -> None:
-    DejaVu(periods=WINDOW).learn_features(waves(), ready=ready).save(path)
-    assert DejaVu.load(path).ready_features is ready
+@pytest.mark.parametrize("shape", [(2,), (3, 64, 48), None])
+def test_a_map_knows_what_it_was_learnt_from(path: Path, shape: tuple[int, ...] | None) -> None:
+    DejaVu(periods=WINDOW).learn_features(waves(), shape).save(path)
+    assert DejaVu.load(path).learnt_from == shape
+
+
+def test_features_of_other_settings_are_refused(path: Path) -> None:
+    DejaVu(HOG(cell=4), periods=WINDOW).learn(torch.rand(64, 1, 16, 16)).save(path)
+    assert DejaVu.load(path, HOG(cell=4)).map.places == 64
+    with refused("cell", "learnt with"):
+        DejaVu.load(path, HOG(cell=8))
+
+
+def test_a_callable_metric_counts_its_bytes(path: Path) -> None:
+    model = DejaVu(periods=WINDOW, metric=torch.cdist).learn(waves())
+    assert model.certificate.map_bytes == model.map_bytes > 0
 
 
 def test_float64_templates_stay_float64(path: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 from helpers import Fixed
 from torch import Tensor
 
-from dejavu_torch.evaluation.controls import leave_out_match, null_control, relearn
+from dejavu_torch.evaluation.controls import leave_out_match, null_control, same_settings
 from dejavu_torch.evaluation.curves import judge
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -83,16 +83,35 @@ def test_the_null_shuffles_by_its_seed_and_leaves_the_model_alone() -> None:
 
 
 @pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
-def test_relearning_keeps_the_settings(metric: str) -> None:
+def test_same_settings_and_no_map(metric: str) -> None:
     model = DejaVu(
         periods=Fixed(layer(8, 0, 64, 0, 1)), metric=metric, reduction="sum", threshold=0.1, batch_size=5
     )
     model.learn(torch.rand(64, 2))
-    other = relearn(model, torch.rand(64, 2))
+    other = same_settings(model)
     assert (other.matcher.metric, other.matcher.reduction) == (metric, "sum")
-    assert (other.threshold, other.batch_size, other.ready_features) == (0.1, 5, True)
-    assert other.map.plan == model.map.plan
-    assert not torch.equal(other.map.templates, model.map.templates)
+    assert (other.threshold, other.batch_size, other.map.places) == (0.1, 5, 0)
+    assert (other.features, other.periods) == (model.features, model.periods)
+
+
+def test_the_null_of_the_same_plan_fails_where_the_score_comes_from_periods() -> None:
+    reference, query = route(432, seed=1), route(432, seed=2)
+    model = DejaVu(periods=Fixed(layer(16, 0, 432, *range(40)), layer(27, 0, 432, *range(40, 80))))
+    model.learn_features(reference)
+    truth = torch.arange(432)[:, None]
+    ours = judge(model.localize(query), truth, 2).recall_at_1
+    null = judge(null_control(model, reference, query, same_plan=True), truth, 2).recall_at_1
+    assert ours > 0.5
+    assert null <= 0.3 * ours
+
+
+def test_the_null_of_the_same_plan_tells_a_store_of_frames_from_periods() -> None:
+    """Nothing repeats, and a template a frame: the map is a store, as good in any order."""
+    reference = torch.rand(100, 30)
+    model = DejaVu(periods=Fixed(layer(100, 0, 100, *range(30)))).learn_features(reference)
+    query = reference + 0.01 * torch.rand(100, 30)
+    match = null_control(model, reference, query, same_plan=True)
+    assert match.index.tolist() == list(range(100))
 
 
 # leave out

@@ -53,6 +53,23 @@ def test_refuses_a_negative_tolerance(model: DejaVu) -> None:
         compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model, tolerance=-1)
 
 
+def test_slit_scan_holds_no_more_than_it_shows() -> None:
+    frames = torch.rand(300, 1, 16, 16)
+    scan = slit_scan(ArrayTraverse(frames), 10, 290)
+    assert scan.untyped_storage().nbytes() <= 2 * 280 * 16 * 4
+
+
+def test_a_callable_metric() -> None:
+    model = DejaVu(periods=SpectrogramAnalysis(window=240), metric=torch.cdist)
+    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model)
+    assert result.report.as_json()["recall_at_1"] > 0
+
+
+def test_a_truth_without_any_right_answer_is_refused(model: DejaVu) -> None:
+    with pytest.raises(InputError, match="no query has a right answer"):
+        compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "1000", model)
+
+
 def test_slit_scan_of_a_sliding_window_is_the_strip() -> None:
     strip = torch.rand(3, 8, 200)
     scan = slit_scan(SlidingWindow(strip, width=10), 20, 120)

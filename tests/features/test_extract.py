@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, InputError, Traverse
-from dejavu_torch.features.extract import feature_batches, features_of, holds_features
+from dejavu_torch.features.extract import feature_batches, features_of, frame_shape
 
 
 class Pooled(nn.Module):
@@ -139,7 +139,13 @@ def test_features_of_keeps_gradients() -> None:
     assert frames.grad is not None
 
 
-def test_holds_features() -> None:
-    assert holds_features(ArrayTraverse(torch.rand(3, 2)))
-    assert not holds_features(ArrayTraverse(torch.rand(3, 1, 4, 4)))
-    assert not holds_features(Listed())
+def test_frame_shape() -> None:
+    assert frame_shape(ArrayTraverse(torch.rand(3, 2))) == (2,)
+    assert frame_shape(ArrayTraverse(torch.rand(3, 1, 4, 5))) == (1, 4, 5)
+    with pytest.raises(InputError, match="no frames"):
+        frame_shape(Listed())
+
+
+def test_coarse_floats_become_float32() -> None:
+    features = torch.rand(4, 3).bfloat16()
+    assert next(feature_batches(Listed(features), HOG())).dtype == torch.float32
