@@ -141,7 +141,15 @@ def plot_activations(
     ):
         axis.plot(where, values, color=colour, linewidth=1.1)
         best = int(values.argmin())
-        axis.plot(where[best], values[best], "v", color=RED, markersize=7, label="best (first of equals)")
+        axis.plot(
+            where[best],
+            values[best],
+            "v",
+            color=RED,
+            markersize=7,
+            clip_on=False,
+            label="best (first of equals)",
+        )
         axis.set_ylabel(name, fontsize=9)
         axis.set_yticks([])
     for axis in rows:

@@ -96,11 +96,10 @@ class SpectrogramAnalysis(PeriodFinder):
             bins 0 and 1 hold the mean, slow drift, and their leakage through the Hann window.
         strongest: how many of its strongest frequencies a feature keeps.
         peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
-        false_alarm: a frequency is kept only where its share of the feature's power is more than
-            white noise would show anywhere in the chunk with at most this probability
-            (`noise_share`). It rejects noise that is new in every frame, so that frames without any
-            order get no layers; smooth footage passes, whether it repeats or not. None keeps every
-            frequency (the paper).
+        false_alarm: a chunk gets layers only where some frequency holds a larger share of its feature's
+            power than white noise would show anywhere in the chunk with at most this probability
+            (`noise_share`), so that frames without any order get none. Smooth footage passes, whether
+            it repeats or not. None asks nothing (the paper).
         similar: features share a layer when their frequencies lie within this many bins of the
             layer's most common period; 0 means the same rounded period (the paper).
         short: what to do with a traverse shorter than the window: "shrink" the window to the
@@ -204,17 +203,19 @@ class SpectrogramAnalysis(PeriodFinder):
             for start, stop, power in self(features.detach()):
                 length = stop - start
                 bins = strongest_bins(power, self.strongest, length // self.min_period, self.peaks)
-                if self.false_alarm is not None:
-                    share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
-                    least = noise_share(len(power) - 1, power.shape[1], self.false_alarm)
-                    if least > HANN_PEAK:
-                        self._tell(
-                            f"frames {start}-{stop - 1}: too few to tell a period from noise in "
-                            f"{power.shape[1]} features, so none is kept"
-                        )
-                    bins = bins.masked_fill(~(share > least), -1)
-                layers += cluster_layers(bins, start, stop, self.similar)
+                if self._stands_out(power, bins, start, stop):
+                    layers += cluster_layers(bins, start, stop, self.similar)
             return tuple(layers)
+
+    def _stands_out(self, power: Tensor, bins: Tensor, start: int, stop: int) -> bool:
+        """Whether any frequency of a chunk is stronger than noise that is new in every frame."""
+        if self.false_alarm is None:
+            return True
+        least = noise_share(len(power) - 1, power.shape[1], self.false_alarm)
+        if least > HANN_PEAK:
+            self._tell(f"frames {start}-{stop - 1}: too few to tell a period from noise, so none is kept")
+        share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
+        return bool(((share > least) & (bins > 0)).any())
 
     def _tell(self, message: str) -> None:
         """Log a warning, once."""

@@ -42,7 +42,7 @@ def recall(match: Match, tolerance: int = 0) -> float:
 def test_convention_8_the_null_of_a_repeating_route_finds_no_layers() -> None:
     """White noise plus a strong periodic part: in shuffled order it is white noise."""
     reference, query = route(432), route(432, seed=1)
-    model = DejaVu(periods=SpectrogramAnalysis(window=432, false_alarm=1e-6)).learn(reference)
+    model = DejaVu(periods=SpectrogramAnalysis(window=432, strongest=1, false_alarm=1e-6)).learn(reference)
     ours, null = model.localize(query), null_control(model, reference, query)
     assert recall(ours) > 0.9
     assert null.index.tolist() == [-1] * 432
@@ -217,7 +217,7 @@ def test_convention_8_on_sliding_footage_the_neighbours_carry_the_answer() -> No
 
 def test_what_repeats_survives_leaving_out() -> None:
     reference = route(432, noise=0.1)
-    model = DejaVu(periods=SpectrogramAnalysis(window=432)).learn(reference)
+    model = DejaVu(periods=SpectrogramAnalysis(window=432, strongest=1)).learn(reference)
     assert recall(leave_out_match(model, reference, 5)) > 0.9
 
 
