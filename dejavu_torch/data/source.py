@@ -12,12 +12,14 @@ from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.folder import SUFFIXES, ImageFolder
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.strip import read_strip
+from dejavu_torch.data.video import SUFFIXES as VIDEO_SUFFIXES
+from dejavu_torch.data.video import Video
 from dejavu_torch.types import InputError, Traverse
 
 SIMULATORS: dict[str, Callable[..., Traverse]] = {"aerial": AerialRoad}
 EXPECTED = (
-    "a folder of images, an .npy file of frames or features, sim:aerial?seed=0&traverse=0&frames=3072, "
-    "or strip:IMAGE?width=96"
+    "a folder of images, an .npy file of frames or features, a video such as clip.mp4?width=160, "
+    "sim:aerial?seed=0&traverse=0&frames=3072, or strip:IMAGE?width=96"
 )
 
 
@@ -26,7 +28,8 @@ def open_source(source: str | Path) -> Traverse:
 
     Args:
         source: a folder of images (sorted by name); an `.npy` file of frames (N,H,W) or (N,H,W,3)
-            uint8, or of features (N,D) float; `sim:NAME?seed=0&traverse=0&frames=3072`; or
+            uint8, or of features (N,D) float; a video file, `clip.mp4` or
+            `clip.mp4?width=160&height=90&step=2`; `sim:NAME?seed=0&traverse=0&frames=3072`; or
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window slid along one long image.
 
     Raises:
@@ -49,10 +52,15 @@ def open_source(source: str | Path) -> Traverse:
     path = Path(text)
     if path.is_dir():
         return ImageFolder(path)
+    name, _, query = text.rpartition("?")
+    if not path.exists() and Path(name).suffix.lower() in VIDEO_SUFFIXES:
+        return Video(Path(name), **_arguments(text, query, Video))
     if not path.exists():
         raise InputError(f"{path} is not there; expected {EXPECTED}")
     if path.suffix.lower() == ".npy":
         return read_array(path)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return Video(path)
     if path.suffix.lower() in SUFFIXES:
         raise InputError(f"{path} is a single image; expected {EXPECTED}")
     raise InputError(f"{path} is none of the kinds that can be read; expected {EXPECTED}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.video import Video
 
 
 @pytest.mark.parametrize("kind", [str, Path])
@@ -31,6 +33,52 @@ def test_an_array(tmp_path: Path, name: str) -> None:
     source = open_source(tmp_path / name)
     assert isinstance(source, ArrayTraverse)
     assert (source.length, source.name) == (3, str(tmp_path / name))
+
+
+def write_clip(path: Path) -> Path:
+    """Five grey frames of 32 x 48 pixels."""
+    with av.open(str(path), "w", format="matroska") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, "bgr0"
+        for _ in range(5):
+            container.mux(stream.encode(av.VideoFrame(48, 32, "bgr0")))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.mkv", "A.MP4", "what?.mkv", "clip.mp4?width=16.mkv"])
+@pytest.mark.parametrize(
+    ("options", "shape"),
+    [
+        ("", (5, 3, 32, 48)),
+        ("?width=16&height=8&step=2", (3, 3, 8, 16)),
+        ("?width=24", (5, 3, 16, 24)),
+        ("?step=5", (1, 3, 32, 48)),
+    ],
+)
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_video(tmp_path: Path, name: str, options: str, shape: tuple[int, ...], kind: type) -> None:
+    path = write_clip(tmp_path / name)
+    source = open_source(kind(f"{path}{options}"))
+    assert isinstance(source, Video)
+    assert source.name == str(path)
+    assert next(source.batches(8)).shape == shape
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("?width=wide", ["width is 'wide'", "expected int"]),
+        ("?width=", ["width is ''", "expected int"]),
+        ("?path=3", ["unknown 'path'", "expected width, height, step"]),
+        ("?rows=3", ["unknown 'rows'", "expected width, height, step"]),
+        ("?step=0", ["a.mkv", "step=0", "step of at least 1"]),
+    ],
+)
+def test_options_that_no_video_has_are_refused(tmp_path: Path, options: str, words: list[str]) -> None:
+    write_clip(tmp_path / "a.mkv")
+    with refused(*words):
+        open_source(f"{tmp_path / 'a.mkv'}{options}")
 
 
 def test_a_simulator() -> None:
@@ -54,6 +102,9 @@ def test_a_source_gives_the_same_frames_whatever_the_batch() -> None:
 @pytest.mark.parametrize(
     ("source", "words"),
     [
+        ("nowhere.mp4", ["nowhere.mp4 is not there", "expected a folder", "clip.mp4?width=160"]),
+        ("nowhere.mp4?width=3", ["nowhere.mp4 is not there", "expected a video file"]),
+        ("nowhere.png?width=3", ["nowhere.png?width=3 is not there", "expected a folder"]),
         ("nowhere", ["nowhere", "not there", "folder of images", ".npy", "sim:aerial"]),
         ("sim:moon?seed=1", ["'moon'", "expected aerial"]),
         ("sim:", ["simulator ''", "expected aerial"]),

@@ -1,0 +1,240 @@
+"""A video file as a traverse."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dejavu_torch.types import InputError, Traverse
+
+if TYPE_CHECKING:
+    from av import VideoFrame
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
+
+SUFFIXES = {
+    *(".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts"),
+    *(".wmv", ".flv", ".ogv", ".mjpeg"),
+}
+EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"
+BOXES = {b"ftyp", b"free", b"skip", b"wide", b"moov", b"moof", b"mdat", b"mfra", b"sidx", b"styp", b"uuid"}
+
+
+class Video(Traverse):
+    """The frames of a video file, decoded and resized as they are read.
+
+    Args:
+        path: a video file of any container and codec that FFmpeg reads.
+        width, height: pixels of the frames, averaged over areas; 0 keeps the video's own, or its
+            aspect ratio where only the other is given.
+        step: every step-th frame, from frame 0.
+
+    Shape: frames (B,3,H,W), RGB also where the video is grey, upright where the file says how the
+        camera was turned.
+
+    Raises:
+        InputError: width, height or step out of range; no video, or one that is cut off; while
+            reading, a damaged frame, frames that are missing, or frames of different size. Only
+            files that say how long they are (not .ts, .mpg, .flv, .mjpeg) can be found cut off
+            between two frames.
+    """
+
+    def __init__(self, path: str | Path, width: int = 0, height: int = 0, step: int = 1) -> None:
+        if width < 0 or height < 0 or step < 1:
+            raise InputError(
+                f"{path}: width={width}, height={height}, step={step}; "
+                "expected width and height of at least 0, and step of at least 1"
+            )
+        self.path, self.name = Path(path), str(path)
+        self.width, self.height, self.step = width, height, step
+        if not self.path.is_file():
+            raise InputError(f"{path} is not there; expected a video file")
+        self._times: Tensor | None = None
+        self._listed: int | None = None  # frames before the step, where the file tells
+        if not _is_whole(self.path):
+            raise InputError(f"{path} is cut off or damaged; expected a whole video file")
+        with self._open() as (container, stream):
+            # only this family lists every frame, and which of them an edit list hides
+            if container.format.name.startswith("mov") and stream.frames:
+                self._listed = sum(not entry.is_discard for entry in stream.index_entries)
+                self.length = len(range(0, self._listed, step))
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        first: tuple[int, int] | None = None
+        batch: list[np.ndarray] = []
+        with closing(self._frames()) as frames:
+            for i, frame in enumerate(frames):
+                shape = (frame.height, frame.width)
+                first = first or shape
+                if shape != first:
+                    raise InputError(
+                        f"frame {i} of {self.name} is {shape[0]} x {shape[1]} pixels; "
+                        f"expected {first[0]} x {first[1]} as frame 0"
+                    )
+                if i % self.step == 0:
+                    batch.append(self._pixels(frame))
+                if len(batch) == size:
+                    yield _as_tensor(batch)
+                    batch = []
+        if batch:
+            yield _as_tensor(batch)
+
+    @property
+    def times(self) -> Tensor:
+        """(N,) float64, seconds of each frame from its timestamp in the file, increasing.
+
+        Known once the video was read to the end; before, it is read through for them.
+
+        Raises:
+            InputError: the file has no timestamps, or they run backwards.
+        """
+        if self._times is None:
+            for _ in self._frames(decode=self._listed is None):
+                pass
+        times = self._times
+        if times is None or times.isnan().any() or (times.diff() < 0).any():
+            raise InputError(f"{self.name} has no increasing timestamps; expected one for each frame")
+        return times
+
+    def _frames(self, decode: bool = True) -> Generator[VideoFrame, None, None]:
+        """Every frame; at the end its time is known, and that none is missing.
+
+        Args:
+            decode: False yields nothing: only the timestamps are read.
+        """
+        import av
+
+        stamps: list[int | None] = []
+        packets = 0
+        try:
+            with self._open() as (container, stream):
+                for packet in container.demux(stream):
+                    packets += packet.size > 0
+                    if packet.is_corrupt:
+                        raise self._broken(len(stamps), "the data are incomplete")
+                    if not decode:
+                        stamps += [packet.pts] if packet.size and not packet.is_discard else []
+                        continue
+                    for frame in packet.decode():
+                        if frame.is_corrupt:
+                            raise self._broken(len(stamps), "the picture is damaged")
+                        stamps.append(frame.pts)
+                        yield frame
+                avi = container.format.name == "avi"
+                if (avi and packets < len(stream.index_entries)) or len(stamps) < (self._listed or 0):
+                    raise self._broken(len(stamps), "frames are missing")
+                if not stamps:
+                    raise InputError(f"{self.name} holds no frames; expected a video")
+                base = float("nan") if stream.time_base is None else stream.time_base
+        except av.FFmpegError as error:
+            raise self._broken(len(stamps), str(error.strerror)) from error
+        seconds = [float("nan" if stamp is None else stamp * base) for stamp in stamps]
+        times = torch.tensor(seconds, dtype=torch.float64)
+        # packets come in decoding order; .avi stores no other, so its decoded frames carry a wrong one
+        self._times = (times.sort().values if avi or not decode else times)[:: self.step]
+
+    def _pixels(self, frame: VideoFrame) -> np.ndarray:
+        """One frame, upright and resized, (H,W,3) uint8."""
+        import av
+        from av.video.reformatter import Interpolation as How
+
+        # full chroma, or colours are averaged over pairs of columns of the result as well
+        how = int(How.AREA | How.FULL_CHR_H_INT | How.FULL_CHR_H_INP)
+        turns = round(frame.rotation / 90) % 4  # quarters, counterclockwise
+        w, h = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
+        width = self.width or (max(1, round(w * self.height / h)) if self.height else w)
+        height = self.height or (max(1, round(h * self.width / w)) if self.width else h)
+        if turns % 2:
+            width, height = height, width
+        try:
+            pixels = frame.reformat(width, height, "rgb24", interpolation=how).to_ndarray()
+        except (av.FFmpegError, ValueError, MemoryError) as error:
+            raise InputError(
+                f"{self.name} cannot be resized to {height} x {width} pixels; expected less"
+            ) from error
+        return np.rot90(pixels, turns)
+
+    @contextmanager
+    def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
+        import av
+        from av.stream import Disposition
+
+        options: dict[str, Any] = {"metadata_errors": "replace"}
+        if self.path.suffix.lower() == ".mjpeg":
+            options["format"] = "mjpeg"  # bare pictures in a row, often mistaken for something else
+        try:
+            # "file:" so that a colon in the name is not taken for a protocol
+            container = av.open(f"file:{self.path}", "r", **options)
+        except av.FFmpegError as error:
+            raise InputError(f"{self.name} cannot be read as a video: {error.strerror}") from error
+        with container:
+            stream: Any = container.streams.best("video")
+            if stream is None or stream.disposition & Disposition.attached_pic:  # the cover of a song
+                raise InputError(f"{self.name} has no video stream; expected a video")
+            if stream.codec_context is None:
+                raise InputError(f"{self.name} has a codec that cannot be decoded; expected such as H.264")
+            stream.thread_type = "AUTO"
+            yield container, stream
+
+    def _broken(self, frame: int, why: str) -> InputError:
+        return InputError(f"{self.name} is broken near frame {frame}: {why}; expected a whole video file")
+
+
+def _as_tensor(frames: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2).float().div_(255)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the outermost parts of an MP4, AVI or Matroska file end inside the file.
+
+    FFmpeg reads what is left of a truncated file without a word.
+    """
+    with path.open("rb") as file:
+        stop, start = file.seek(0, 2), 0
+        while start < stop:
+            file.seek(start)
+            head = file.read(16)
+            if head[:4] == EBML:
+                return _elements_fit(file, start, stop)
+            if head[:4] == b"RIFF":
+                length = int.from_bytes(head[4:8], "little")
+                start += 8 + length + length % 2
+            elif head[4:8] in BOXES:
+                length = int.from_bytes(head[:4])
+                if length == 0:  # up to the end
+                    return True
+                start += max(8, int.from_bytes(head[8:]) if length == 1 else length)
+            else:
+                return True
+        return start - 1 <= stop  # the last byte may be padding that was left out
+
+
+def _elements_fit(file: BinaryIO, start: int, stop: int) -> bool:
+    """Whether the Matroska elements from `start` on, one after another, end exactly at `stop`."""
+    while start < stop:
+        file.seek(start)
+        head = file.read(12)
+        # an identifier and a length; the zero bits they start with tell how long they are
+        i = 9 - head[0].bit_length()
+        j = i + 9 - head[i].bit_length() if i <= 4 and i < len(head) else 13
+        if j > len(head):
+            return False
+        unknown = (1 << 7 * (j - i)) - 1
+        length = int.from_bytes(head[i:j]) & unknown
+        if length == unknown:  # recorded live: nothing to check against
+            return head[:i] in (SEGMENT, CLUSTER)
+        end = start + j + length
+        if end > stop:
+            return False
+        if head[:i] in (SEGMENT, CLUSTER) and not _elements_fit(file, start + j, end):
+            return False
+        if head[:i] == SEGMENT:
+            return True  # what follows is not ours
+        start = end
+    return True
