@@ -7,13 +7,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from dejavu_torch.recognition.l1 import compiled_l1
 from dejavu_torch.types import InputError
 
 Metric = str | Callable[[Tensor, Tensor], Tensor]
 
 
 def _l1(query: Tensor, templates: Tensor) -> Tensor:
-    return torch.cdist(query, templates, p=1.0)
+    distances = compiled_l1(query, templates)
+    return torch.cdist(query, templates, p=1.0) if distances is None else distances
 
 
 def _l2(query: Tensor, templates: Tensor) -> Tensor:
@@ -53,7 +55,8 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
     Shape: (Q,F), (P,F) -> (Q,P).
 
     Convention: computed in float32 whatever the autocast (float64 stays float64). Nothing of
-        Q x P x F is built.
+        Q x P x F is built. "l1" without gradients on the CPU runs in a compiled loop where numba is
+        installed (`l1_backend` tells).
 
     Example:
         >>> phase_distances(torch.tensor([[1.0, 2.0]]), torch.tensor([[1.0, 2.0], [0.0, 4.0]]))

@@ -50,6 +50,13 @@ def test_metrics_are_their_definitions(metric: str) -> None:
     )
 
 
+@pytest.mark.parametrize("gradients", [False, True])
+def test_l1_is_its_definition_whatever_computes_it(gradients: bool) -> None:
+    query, mu = torch.randn(6, 700, requires_grad=gradients), torch.randn(41, 700)
+    expected = loops(query.detach().double(), mu.double(), "l1")
+    torch.testing.assert_close(phase_distances(query, mu).detach().double(), expected, rtol=1e-5, atol=0)
+
+
 def test_l1_is_the_default() -> None:
     query, mu = torch.randn(3, 4), torch.randn(5, 4)
     assert torch.equal(phase_distances(query, mu), phase_distances(query, mu, "l1"))

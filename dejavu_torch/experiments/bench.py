@@ -1,0 +1,224 @@
+"""HOG and L1 distances, timed beside other programs that compute the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import dejavu_torch
+from dejavu_torch.data.files import make_output_folder, whole_file
+from dejavu_torch.evaluation.bench_plot import plot_ratios
+from dejavu_torch.experiments.race import Row, Run, Runner, race
+from dejavu_torch.features.hog import hog
+from dejavu_torch.recognition.distance import phase_distances
+from dejavu_torch.recognition.l1 import l1_backend
+from dejavu_torch.types import InputError
+
+BATCH = 64
+PATIENCE = 60  # seconds for one contender, all its runs together
+COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu")
+
+Sizes = Sequence[tuple[int, int]]
+
+
+def bench_matcher(
+    frames: int = 2000,
+    repeats: int = 3,
+    images: Sizes = ((64, 64), (256, 192)),
+    distances: Sequence[tuple[int, int, int]] = ((512, 2640, 1000),),
+    torch_compile: bool = True,
+    seed: int = 0,
+) -> list[Row]:
+    """Time HOG beside scikit-image, and L1 distances beside torch, scipy and faiss.
+
+    Args:
+        frames: grey frames to describe, of each size in `images` (height, width in pixels).
+        repeats: timed runs of each contender, in turn; the best counts.
+        distances: queries, features and templates of each case of L1.
+        torch_compile: also a sum that `torch.compile` makes a loop of; compiling takes its time.
+        seed: of the random frames and features.
+
+    Convention: one process, float32, and the same number of threads, torch.get_num_threads(), for all
+        that can use several.
+
+    Raises:
+        InputError: a number below 1.
+    """
+    if min(frames, repeats, *(n for size in (*images, *distances) for n in size)) < 1:
+        raise InputError(
+            f"the bench got frames={frames}, repeats={repeats}, images {images} and distances {distances}; "
+            "expected at least 1 of each"
+        )
+    generator = torch.Generator().manual_seed(seed)
+    rows = []
+    with torch.no_grad():
+        for height, width in images:
+            some = torch.rand(min(frames, BATCH), 1, height, width, generator=generator)
+            rows += _hog_case(f"hog {height} x {width}", some, frames, repeats)
+        for q, f, p in distances:
+            query, templates = (torch.rand(n, f, generator=generator) for n in (q, p))
+            rows += _l1_case(f"l1 {q} x {f} x {p}", query, templates, repeats, torch_compile)
+    return rows
+
+
+def _hog_case(case: str, some: Tensor, frames: int, repeats: int) -> list[Row]:
+    """All `frames`, of which `some` differ."""
+    dimension = hog(some[:1]).shape[1]
+
+    def ours() -> Tensor:
+        out = torch.empty(frames, dimension)
+        for start in range(0, frames, BATCH):
+            out[start : start + BATCH] = hog(some[: frames - start])
+        return out
+
+    def skimage() -> Run:
+        from skimage.feature import hog as theirs
+
+        one = partial(theirs, orientations=9, pixels_per_cell=(8, 8), cells_per_block=(2, 2))
+        pictures = some[:, 0].numpy()
+        one(pictures[0])
+        began = time.perf_counter()
+        one(pictures[0])
+        possible = PATIENCE / (repeats + 2) / (time.perf_counter() - began)
+        part = min(frames, 1 + int(possible))
+
+        def run() -> Tensor:
+            out = torch.empty(part, dimension)
+            for i in range(part):
+                out[i] = torch.from_numpy(one(pictures[i % len(pictures)]))
+            return out
+
+        return run
+
+    threads = torch.get_num_threads()
+    return race(case, Runner("dejavu", threads, lambda: ours), [Runner("scikit-image", 1, skimage)], repeats)
+
+
+def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_compile: bool) -> list[Row]:
+    threads = torch.get_num_threads()
+
+    def eager() -> Run:
+        wanted = query.clone().requires_grad_()
+
+        def run() -> Tensor:
+            with torch.enable_grad():  # gradients are torch's
+                return phase_distances(wanted, templates).detach()
+
+        return run
+
+    def compiled() -> Run:
+        if not torch_compile:
+            raise RuntimeError("not asked for")
+        if shutil.which("c++") is None and shutil.which("g++") is None:
+            raise RuntimeError("no C++ compiler")
+        loop = torch.compile(lambda a, b: (a[:, None] - b).abs().sum(2))
+        return lambda: loop(query, templates)
+
+    def scipy() -> Run:
+        from scipy.spatial.distance import cdist
+
+        return lambda: torch.from_numpy(cdist(query.numpy(), templates.numpy(), "cityblock"))
+
+    def faiss() -> Run:
+        import faiss
+
+        faiss.omp_set_num_threads(threads)
+        pairwise = partial(faiss.pairwise_distances, metric=faiss.METRIC_L1)
+        return lambda: torch.from_numpy(pairwise(query.numpy(), templates.numpy()))
+
+    return race(
+        case,
+        Runner("dejavu", threads, lambda: partial(phase_distances, query, templates)),
+        [
+            Runner("dejavu (eager torch)", threads, eager),
+            Runner("torch.cdist", threads, lambda: partial(torch.cdist, query, templates, p=1.0)),
+            Runner("torch.compile", threads, compiled),
+            Runner("scipy cdist", 1, scipy),
+            Runner("faiss", threads, faiss),
+        ],
+        repeats,
+    )
+
+
+BENCHES = {"matcher": bench_matcher}
+
+
+def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> list[Row]:
+    """Run a bench with its default sizes, and write bench.json and bench.png into the folder `out`.
+
+    Raises:
+        InputError: an unknown bench, or a folder that cannot be made or written in.
+    """
+    if what not in BENCHES:
+        raise InputError(f"bench {what!r} is unknown; expected {', '.join(BENCHES)}")
+    make_output_folder(out)  # before the long work
+    rows = BENCHES[what](frames, repeats)
+    write_bench(out, rows)
+    return rows
+
+
+def write_bench(folder: Path, rows: Sequence[Row]) -> None:
+    """Write bench.json and bench.png into a folder that exists.
+
+    Raises:
+        InputError: the folder cannot be written in.
+    """
+    facts = {
+        "rows": [row._asdict() for row in rows],
+        "threads": torch.get_num_threads(),
+        "l1_backend": l1_backend(),
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "versions": {"dejavu_torch": dejavu_torch.__version__} | {name: _version(name) for name in COMPARED},
+    }
+    cases: dict[str, dict[str, float]] = {}
+    for row in rows:
+        if row.ratio_to_ours is not None:
+            cases.setdefault(row.case, {})[row.contender] = row.ratio_to_ours
+    figure, _ = plot_ratios(cases)
+    with whole_file(folder / "bench.png") as temporary:
+        figure.savefig(temporary)
+    with whole_file(folder / "bench.json") as temporary:
+        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def bench_table(rows: Sequence[Row]) -> list[list[str]]:
+    """The figures as rows of text, the header first.
+
+    Example:
+        >>> bench_table([Row("l1", "dejavu", 0.5, ratio_to_ours=1.0)])[1][:3]
+        ['l1: dejavu', '0.500', '1.0']
+    """
+    head = ["", "seconds", "x ours", "first run", "threads", "peak MB", "result MB", "difference", ""]
+    return [head, *([f"{row.case}: {row.contender}", *_figures(row)] for row in rows)]
+
+
+def _figures(row: Row) -> list[str]:
+    def text(value: float | None, form: str, unit: float = 1) -> str:
+        return "" if value is None else format(value / unit, form)
+
+    note = f"skipped: {row.skipped}" if row.skipped else ""
+    return [
+        text(row.seconds, ".3f"),
+        text(row.ratio_to_ours, ".1f"),
+        text(row.seconds_first, ".2f"),
+        text(row.threads, ".0f"),
+        text(row.peak_bytes, ".1f", 1e6),
+        text(row.bytes, ".1f", 1e6),
+        text(row.difference, ".1e"),
+        f"{row.measured_rows} measured" if row.measured_rows else note,
+    ]

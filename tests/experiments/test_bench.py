@@ -1,0 +1,201 @@
+"""`dejavu bench`: who takes part, what is compared, and what is written."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import refused
+from matplotlib.figure import Figure
+
+from dejavu_torch.evaluation.report import text_table
+from dejavu_torch.experiments import bench
+from dejavu_torch.experiments.bench import bench_matcher, bench_table, run_bench, write_bench
+from dejavu_torch.experiments.race import Row, Run, Runner, peak_memory, race
+
+
+def small(**options: object) -> list[Row]:
+    sizes = {"frames": 70, "repeats": 1, "images": [(24, 16)], "distances": [(9, 40, 410)]}
+    return bench_matcher(**{"torch_compile": False, **sizes, **options})  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[tuple[str, str], Row]:
+    return {(row.case, row.contender): row for row in small()}
+
+
+L1 = "l1 9 x 40 x 410"
+HOG = "hog 24 x 16"
+
+
+def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
+    assert list(rows) == [
+        (HOG, "dejavu"),
+        (HOG, "scikit-image"),
+        (L1, "dejavu"),
+        (L1, "dejavu (eager torch)"),
+        (L1, "torch.cdist"),
+        (L1, "torch.compile"),
+        (L1, "scipy cdist"),
+        (L1, "faiss"),
+    ]
+
+
+def test_contenders_give_what_we_give(rows: dict[tuple[str, str], Row]) -> None:
+    ran = {key: row for key, row in rows.items() if row.skipped is None}
+    assert {(HOG, "scikit-image"), (L1, "scipy cdist"), (L1, "torch.cdist")} <= ran.keys()  # the test extra
+    for (case, _), row in ran.items():
+        assert row.difference is not None
+        assert row.difference < (1e-6 if case == HOG else 1e-4)
+
+
+def test_a_size_is_that_of_the_result(rows: dict[tuple[str, str], Row]) -> None:
+    assert rows[HOG, "dejavu"].bytes == rows[HOG, "scikit-image"].bytes == 70 * (2 * 1 * 4 * 9) * 4
+    assert rows[L1, "dejavu"].bytes == 9 * 410 * 4
+    assert rows[L1, "scipy cdist"].bytes == 9 * 410 * 8
+
+
+def test_threads_are_told(rows: dict[tuple[str, str], Row]) -> None:
+    assert rows[L1, "dejavu"].threads == torch.get_num_threads()
+    assert rows[L1, "scipy cdist"].threads == rows[HOG, "scikit-image"].threads == 1
+
+
+def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
+    for case in (HOG, L1):
+        mine = [row for row in rows.values() if row.case == case and row.seconds]
+        ours = min(row.seconds for row in mine if row.contender.startswith("dejavu") and row.seconds)
+        assert [row.ratio_to_ours for row in mine] == [row.seconds and row.seconds / ours for row in mine]
+
+
+def test_who_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    found = {row.contender: row for row in small(images=[])}
+    assert found["faiss"].skipped is not None
+    assert "faiss" in found["faiss"].skipped
+    assert found["faiss"]._replace(skipped=None) == Row(L1, "faiss")
+    assert found["torch.compile"].skipped == "RuntimeError: not asked for"
+    assert found["torch.cdist"].skipped is None
+
+
+def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "PATIENCE", 0)
+    ours, theirs = small(distances=[])
+    assert (ours.measured_rows, theirs.measured_rows) == (None, 1)
+    assert theirs.bytes == ours.bytes
+    assert theirs.difference is not None
+    assert theirs.difference < 1e-6
+    assert theirs.seconds is not None
+    assert theirs.seconds_first is not None
+
+
+class Counted:
+    """Gives `value`, and remembers who ran in which order."""
+
+    def __init__(self, name: str, value: torch.Tensor, log: list[str], pause: float = 0.0) -> None:
+        self.name, self.value, self.log, self.pause = name, value, log, pause
+
+    def ready(self) -> Run:
+        self.log.append(f"{self.name} ready")
+        time.sleep(self.pause)
+        return self.run
+
+    def run(self) -> torch.Tensor:
+        self.log.append(self.name)
+        return self.value
+
+
+def test_a_race_goes_round_by_round_after_the_warm_up() -> None:
+    log: list[str] = []
+    a = Counted("a", torch.zeros(4), log, pause=0.2)
+    b = Counted("b", torch.tensor([0.0, 0.5]), log)
+    first, second = race("case", Runner("dejavu", 1, a.ready), [Runner("other", 2, b.ready)], 3)
+    watched = 0 if first.peak_bytes is None else 1
+    assert log == ["a ready", *["a"] * (1 + watched), "b ready", *["b"] * (1 + watched), *["a", "b"] * 3]
+    assert first.seconds is not None
+    assert first.seconds_first is not None
+    assert first.seconds < 0.2 <= first.seconds_first  # getting ready counts in the first run only
+    assert (first.difference, second.difference) == (0.0, 0.5)
+    assert (second.measured_rows, second.bytes, second.threads) == (2, 16, 2)
+
+
+def test_an_error_of_ours_is_raised_and_one_of_theirs_told() -> None:
+    def broken() -> Run:
+        raise ZeroDivisionError("of\nno use")
+
+    fine = Counted("a", torch.zeros(2), [])
+    rows = race("case", Runner("dejavu", 1, fine.ready), [Runner("other", 1, broken)], 1)
+    assert rows[1] == Row("case", "other", skipped="ZeroDivisionError: of no use")
+    with pytest.raises(ZeroDivisionError):
+        race("case", Runner("dejavu", 1, broken), [Runner("other", 1, fine.ready)], 1)
+
+
+def test_peak_memory_sees_what_is_freed_again() -> None:
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("nobody tells")
+
+    def run() -> torch.Tensor:
+        large = torch.ones(16, 2**20)  # 64 MiB
+        time.sleep(0.1)
+        return large[0].clone()
+
+    peak = peak_memory(run)
+    assert peak is not None
+    assert 60 * 2**20 < peak < 200 * 2**20
+
+
+def test_what_is_written(tmp_path: Path, rows: dict[tuple[str, str], Row]) -> None:
+    write_bench(tmp_path, list(rows.values()))
+    written = json.loads((tmp_path / "bench.json").read_text())
+    assert [Row(**row) for row in written["rows"]] == list(rows.values())
+    assert written["threads"] == torch.get_num_threads()
+    assert written["l1_backend"] in ("numba", "torch")
+    assert written["versions"]["torch"].startswith(torch.__version__.split("+")[0])
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.json", "bench.png"]
+
+
+def test_a_bar_for_each_who_ran() -> None:
+    figure, axes = bench.plot_ratios({"one": {"dejavu": 1.0, "other": 2.5}, "two": {"dejavu": 1.0}})
+    assert isinstance(figure, Figure)
+    assert [axis.get_title("left") for axis in axes] == ["one", "two"]
+    assert [[bar.get_width() for bar in axis.patches] for axis in axes] == [[1.0, 2.5], [1.0]]
+    assert [text.get_text() for text in axes[0].get_yticklabels()] == ["dejavu", "other"]
+
+
+def test_the_table() -> None:
+    rows = [
+        Row("l1", "dejavu", 0.5, 1.25, 1.0, 2_000_000, 1_000_000, 2, 0.0),
+        Row("l1", "slow", 5.0, 6.0, 10.0, None, 1_000_000, 1, 1e-5, measured_rows=7),
+        Row("l1", "absent", skipped="ImportError: no module"),
+    ]
+    head, *body = bench_table(rows)
+    assert body == [
+        ["l1: dejavu", "0.500", "1.0", "1.25", "2", "2.0", "1.0", "0.0e+00", ""],
+        ["l1: slow", "5.000", "10.0", "6.00", "1", "", "1.0", "1.0e-05", "7 measured"],
+        ["l1: absent", "", "", "", "", "", "", "", "skipped: ImportError: no module"],
+    ]
+    assert len(text_table([head, *body]).splitlines()) == 4
+
+
+def test_run_bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [Row("l1", "dejavu", 1.0, ratio_to_ours=1.0)]
+    monkeypatch.setitem(bench.BENCHES, "matcher", lambda frames, repeats: rows if frames == 8 else [])
+    assert run_bench("matcher", tmp_path / "new", frames=8) == rows
+    assert (tmp_path / "new" / "bench.json").exists()
+    with refused("'brew' is unknown; expected matcher"):
+        run_bench("brew", tmp_path / "other")
+    (tmp_path / "file").touch()
+    with refused("file"):
+        run_bench("matcher", tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"frames": 0}, {"repeats": 0}, {"images": [(24, 0)]}, {"distances": [(1, 0, 1)]}]
+)
+def test_nothing_to_measure_is_refused(wrong: dict[str, object]) -> None:
+    with refused("the bench got", "expected at least 1"):
+        small(**wrong)

@@ -1,0 +1,286 @@
+"""The compiled loop for L1: when it is used, and that its numbers do not depend on where they stand."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from dejavu_torch import phase_distances
+from dejavu_torch.recognition import l1
+
+ENOUGH = (64, l1.WORTH_COMPILING // 64)  # the smallest templates that are left to the compiled loop
+
+
+@pytest.fixture
+def forget() -> Iterator[Callable[[], None]]:
+    """What was found out about numba is found out anew, in the test and after it."""
+    l1._compiled.cache_clear()
+    yield l1._compiled.cache_clear
+    l1._compiled.cache_clear()
+
+
+@pytest.fixture(params=[1, 3], ids=["one thread", "three threads"])
+def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Everything that can be is computed by the compiled loop, and cut into tasks, however small."""
+    pytest.importorskip("numba")
+    monkeypatch.setattr(l1, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(l1, "TASK", 1)
+    monkeypatch.setattr(l1, "QUERIES_AT_ONCE", 3)
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield
+    torch.set_num_threads(before)
+
+
+def distances(query: Tensor, templates: Tensor) -> Tensor:
+    """What the compiled loop gives, never torch."""
+    result = l1.compiled_l1(query, templates)
+    assert result is not None
+    assert result.shape == (len(query), len(templates))
+    assert result.dtype == torch.float32
+    return result
+
+
+SIZES = given(st.integers(1, 9), st.integers(1, 14), st.integers(1, 300), st.integers(0, 2**16))
+
+
+@pytest.mark.usefixtures("compiled")
+class TestTheCompiledLoop:
+    @SIZES
+    def test_equals_float64(self, queries: int, phases: int, features: int, seed: int) -> None:
+        torch.manual_seed(seed)
+        query, mu = torch.randn(queries, features), torch.randn(phases, features)
+        expected = (query.double()[:, None] - mu.double()).abs().sum(2)
+        torch.testing.assert_close(distances(query, mu).double(), expected, rtol=1e-5, atol=0)
+
+    def test_equals_float64_over_many_features(self) -> None:
+        query, mu = torch.rand(2, 100_003), torch.rand(5, 100_003)
+        expected = (query.double()[:, None] - mu.double()).abs().sum(2)
+        torch.testing.assert_close(distances(query, mu).double(), expected, rtol=1e-5, atol=0)
+
+    @SIZES
+    def test_equal_templates_have_equal_distances(
+        self, queries: int, phases: int, features: int, seed: int
+    ) -> None:
+        torch.manual_seed(seed)
+        found = distances(torch.randn(queries, features), torch.randn(1, features).repeat(phases, 1))
+        assert torch.equal(found, found[:, :1].expand(-1, phases))
+
+    @SIZES
+    def test_a_pair_alone_has_the_distance_it_has_among_others(
+        self, queries: int, phases: int, features: int, seed: int
+    ) -> None:
+        torch.manual_seed(seed)
+        query, mu = torch.randn(queries, features), torch.randn(phases, features)
+        alone = [[distances(a[None], b[None]).item() for b in mu] for a in query]
+        assert distances(query, mu).tolist() == alone
+
+    @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+    @pytest.mark.parametrize("feature", [0, 40, 99])
+    def test_nan_and_infinity_arrive(self, value: float, feature: int) -> None:
+        query, mu = torch.rand(4, 100), torch.rand(6, 100)
+        query[1, feature] = value
+        mu[5, feature] = value
+        expected = torch.cdist(query, mu, p=1.0)
+        assert expected.isfinite().sum() == 3 * 5
+        torch.testing.assert_close(distances(query, mu), expected, equal_nan=True)
+
+    def test_infinity_minus_infinity_is_nan(self) -> None:
+        rows = torch.tensor([[0.0, torch.inf], [0.0, -torch.inf]])
+        assert str(distances(rows, rows).tolist()) == "[[nan, inf], [inf, nan]]"
+
+    def test_rows_need_not_lie_side_by_side(self) -> None:
+        query, mu = torch.rand(80, 7).T, torch.rand(20, 161)[::2, 1::2]
+        assert torch.equal(distances(query, mu), distances(query.clone(), mu.clone()))
+        assert torch.equal(distances(mu[3:4].expand(5, -1), mu)[4], distances(mu, mu)[3])
+
+    def test_no_queries(self) -> None:
+        assert distances(torch.rand(0, 5), torch.rand(3, 5)).shape == (0, 3)
+
+    def test_inputs_stay_as_they_were(self) -> None:
+        query, mu = torch.rand(4, 9), torch.rand(5, 9)
+        kept = query.clone(), mu.clone()
+        distances(query, mu).fill_(7)
+        assert torch.equal(query, kept[0])
+        assert torch.equal(mu, kept[1])
+
+    def test_several_threads_at_once(self, forget: Callable[[], None]) -> None:
+        query, mu = torch.rand(20, 33), torch.rand(21, 33)
+        expected = distances(query, mu)
+        forget()  # each of them may have to compile
+        with ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(lambda _: distances(query, mu), range(64)))
+        assert all(torch.equal(one, expected) for one in found)
+
+    @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+    @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+    def test_after_fork(self) -> None:
+        query, mu = torch.rand(20, 33), torch.rand(21, 33)
+        expected = distances(query, mu)
+
+        def child() -> None:
+            sys.exit(0 if torch.equal(distances(query, mu), expected) else 3)
+
+        process = multiprocessing.get_context("fork").Process(target=child)
+        process.start()
+        process.join(60)
+        assert process.exitcode == 0
+
+
+def test_a_query_alone_gets_the_bits_it_gets_in_a_batch() -> None:
+    for templates in (torch.rand(ENOUGH), torch.rand(ENOUGH)[1:]):
+        query = torch.rand(5, templates.shape[1])
+        alone = torch.cat([phase_distances(row[None], templates) for row in query])
+        assert torch.equal(alone, phase_distances(query, templates))
+
+
+def traced(function: Callable[[Tensor, Tensor], Tensor], a: Tensor, b: Tensor) -> list[Tensor]:
+    """The function as each tracer records it, on other numbers than it was recorded with."""
+    others = torch.rand_like(a), torch.rand_like(b)
+
+    class Module(torch.nn.Module):
+        def forward(self, a: Tensor, b: Tensor) -> Tensor:
+            return function(a, b)
+
+    with torch.no_grad():
+        tracers = [
+            torch.jit.trace(Module(), others),  # type: ignore[no-untyped-call]
+            make_fx(Module())(*others),
+            make_fx(Module(), tracing_mode="fake")(*others),
+            torch.export.export(Module(), others).module(),
+            torch.compile(Module(), backend="eager", fullgraph=True),
+        ]
+        return [tracer(a, b) for tracer in tracers]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
+def test_what_traces_finds_operations_of_torch() -> None:
+    query, mu = torch.rand(3, ENOUGH[1]), torch.rand(ENOUGH)
+    for found in traced(phase_distances, query, mu):
+        assert torch.equal(found, torch.cdist(query, mu, p=1.0))
+
+
+def test_vmap_is_left_to_torch() -> None:
+    query, mu = torch.rand(2, 3, ENOUGH[1]), torch.rand(ENOUGH)
+    expected = torch.stack([torch.cdist(one, mu, p=1.0) for one in query])
+    torch.testing.assert_close(torch.vmap(lambda one: phase_distances(one, mu))(query), expected)
+
+
+def test_gradients_are_left_to_torch() -> None:
+    """Sum of |a - b|: the gradient of each number is how many of the others it exceeds, less the rest."""
+    mu = torch.rand(ENOUGH)
+    for query in (torch.full((1, ENOUGH[1]), 2.0), torch.full((1, ENOUGH[1]), -2.0)):
+        query.requires_grad_()
+        phase_distances(query, mu).sum().backward()
+        assert query.grad is not None
+        assert torch.equal(query.grad, query.detach().sign() * ENOUGH[0])
+    slope = torch.func.grad(lambda a: phase_distances(a, mu).sum())(torch.full((1, ENOUGH[1]), 2.0))
+    assert torch.equal(slope, torch.full((1, ENOUGH[1]), float(ENOUGH[0])))
+    with forward_ad.dual_level():  # torch has no rule for this: it says so, and nothing is dropped silently
+        dual = forward_ad.make_dual(torch.rand(1, ENOUGH[1]), torch.rand(1, ENOUGH[1]))
+        assert l1.compiled_l1(dual, mu) is None
+
+
+@pytest.mark.parametrize(
+    ("query", "templates"),
+    [
+        (torch.rand(2, ENOUGH[1]), torch.rand(ENOUGH[0] - 1, ENOUGH[1])),
+        (torch.rand(2, ENOUGH[1]).double(), torch.rand(ENOUGH).double()),
+        (torch.rand(2, ENOUGH[1]), torch.rand(ENOUGH).double()),
+        (torch.rand(2, ENOUGH[1]).half(), torch.rand(ENOUGH).half()),
+        (torch.rand(2, ENOUGH[1], requires_grad=True), torch.rand(ENOUGH)),
+        (torch.rand(2, ENOUGH[1]), torch.rand(*ENOUGH, requires_grad=True)),
+        (torch.rand(2, ENOUGH[1], device="meta"), torch.rand(ENOUGH, device="meta")),
+        (torch.rand(2, ENOUGH[1]), torch.rand(ENOUGH).to_sparse()),
+        (torch.rand(2, ENOUGH[1] - 1), torch.rand(ENOUGH)),
+        (torch.rand(ENOUGH[1]), torch.rand(ENOUGH)),
+        (torch.rand(1, 2, ENOUGH[1]), torch.rand(1, *ENOUGH)),
+    ],
+    ids=[
+        "few",
+        "f64",
+        "mixed",
+        "f16",
+        "grad",
+        "grad of templates",
+        "meta",
+        "sparse",
+        "other F",
+        "1-D",
+        "3-D",
+    ],
+)
+def test_what_is_left_to_torch(query: Tensor, templates: Tensor) -> None:
+    assert l1.compiled_l1(query, templates) is None
+
+
+def test_what_is_not_left_to_torch() -> None:
+    pytest.importorskip("numba")
+    query, mu = torch.rand(2, ENOUGH[1], requires_grad=True), torch.nn.Parameter(torch.rand(ENOUGH))
+    assert l1.compiled_l1(query.detach(), mu.detach()) is not None
+    with torch.no_grad():
+        assert l1.compiled_l1(query, mu) is not None
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
+        assert l1.compiled_l1(torch.rand(2, ENOUGH[1]), mu) is not None
+
+
+@pytest.mark.usefixtures("forget")
+class TestWithoutNumba:
+    def told(self, caplog: pytest.LogCaptureFixture) -> str:
+        """The one line that is logged, once, while torch does the work."""
+        query, mu = torch.rand(3, ENOUGH[1]), torch.rand(ENOUGH)
+        with caplog.at_level(logging.INFO, "dejavu_torch"):
+            for _ in range(2):
+                assert l1.l1_backend() == "torch"
+                assert torch.equal(phase_distances(query, mu), torch.cdist(query, mu, p=1.0))
+        (record,) = caplog.records
+        assert record.levelno == logging.INFO
+        assert "\n" not in record.getMessage()
+        return record.getMessage()
+
+    def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+        monkeypatch.setitem(sys.modules, "numba", None)
+        assert "by torch, not by numba" in self.told(caplog)
+
+    def test_broken(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+        def njit(*args: object, **options: object) -> None:
+            raise OSError("libllvm\nis of another time")
+
+        monkeypatch.setattr(pytest.importorskip("numba"), "njit", njit)
+        assert self.told(caplog).endswith("libllvm is of another time")
+
+    def test_switched_off(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+        monkeypatch.setattr(pytest.importorskip("numba").config, "DISABLE_JIT", 1)
+        assert "NUMBA_DISABLE_JIT" in self.told(caplog)
+
+    def test_nowhere_to_keep_what_is_compiled(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        numba = pytest.importorskip("numba")
+        njit = numba.njit
+
+        def nowhere(*args: object, cache: bool, **options: object) -> object:
+            if cache:
+                raise RuntimeError("cannot cache function: no locator available")
+            return njit(*args, cache=cache, **options)
+
+        monkeypatch.setattr(numba, "njit", nowhere)
+        assert l1.l1_backend() == "numba"
+
+
+def test_numba_waits_until_it_is_needed() -> None:
+    code = (
+        "import sys, torch, dejavu_torch as d; d.phase_distances(torch.rand(99, 9), torch.rand(99, 9));"
+        "sys.exit('numba' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
