@@ -17,7 +17,9 @@ from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import Recipe, build, map_size, read_map, recipe_of, write_map
 from dejavu_torch.database.phase import PhaseTemplates
 from dejavu_torch.features.extract import feature_batches, features_of, frame_shape
+from dejavu_torch.features.gather import gather
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.distance import Metric
@@ -28,6 +30,7 @@ from dejavu_torch.types import InputError, Match, Traverse
 log = logging.getLogger("dejavu_torch")
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
+MANY_FEATURES = 50_000  # per frame: worth a word
 
 
 class DejaVu(nn.Module):
@@ -40,6 +43,7 @@ class DejaVu(nn.Module):
         reduction: how layers combine in eq. 4, see `combine_layers`.
         threshold: accept a match when its score is below; None accepts every finite score.
         batch_size: frames in memory at a time.
+        preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
@@ -58,12 +62,14 @@ class DejaVu(nn.Module):
         reduction: Reduction = "mean",
         threshold: float | None = None,
         batch_size: int = 64,
+        preprocess: Preprocess | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; expected at least 1")
         if threshold is not None and math.isnan(threshold):
             raise InputError("the threshold is NaN; expected a number")
+        self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
         self.periods = SpectrogramAnalysis() if periods is None else periods
         self.templates = PhaseTemplates()
@@ -82,7 +88,8 @@ class DejaVu(nn.Module):
 
         Returns:
             self, with the map in `self.map`. A route in which nothing repeats gives a map without
-            layers, on which every place scores +inf.
+            layers, on which every place scores +inf. Memory does not grow with the frames: features
+            beyond `gather`'s share of it spill to a temporary file.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes.
@@ -99,6 +106,12 @@ class DejaVu(nn.Module):
             learnt_from: shape of the frames that `self.features` made them from, (C,H,W); (D,) where
                 they were made elsewhere, so that the map refuses frames; None where unknown.
         """
+        if len(learnt_from or ()) == 3 and features.shape[1] > MANY_FEATURES:
+            log.warning(
+                "each frame gives %d features; smaller frames make a smaller and faster map, as "
+                "--features.resize [90,160] or, of a video, ?width=160 does",
+                features.shape[1],
+            )
         plan = self.periods.plan(features)
         with torch.no_grad():
             templates = self.templates(features, plan)
@@ -110,7 +123,7 @@ class DejaVu(nn.Module):
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
         self.check_queries(tuple(queries.shape[1:]), "the query")
-        features = features_of(queries, self.features, "the query")
+        features = features_of(queries, self.pipeline, "the query")
         self._check_dimension(features, tuple(queries.shape[1:]), "the query")
         scores: Tensor = self.matcher(features, self.map)
         return scores
@@ -145,11 +158,16 @@ class DejaVu(nn.Module):
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Features of a traverse in batches (B,D), without gradients."""
-        return feature_batches(traverse, self.features, self.batch_size, self.map.size.device, progress)
+        return feature_batches(traverse, self.pipeline, self.batch_size, self.map.size.device, progress)
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
-        """Features of a whole traverse, (N,D)."""
-        return torch.cat(list(self.extract(traverse, progress)))
+        """Features of a whole traverse, (N,D); many of them lie in a temporary file, see `gather`."""
+        return gather(self.extract(traverse, progress))
+
+    @property
+    def pipeline(self) -> nn.Sequential:
+        """What makes features of frames: preprocess, then features."""
+        return nn.Sequential(self.preprocess, self.features)
 
     def save(self, path: str | Path) -> None:
         """Write the map, with the feature module's weights, as one safetensors file.
@@ -177,16 +195,15 @@ class DejaVu(nn.Module):
         try:
             made_by, found_by = Recipe(**header["features"]), Recipe(**header["periods"])
             if features is None:
-                features = build(made_by)
+                features = build(made_by, nn.Module)
             elif recipe_of(features) != made_by:
                 raise InputError(f"it was learnt with {made_by}; got {recipe_of(features)}")
             # only learning needs what found the periods: one from elsewhere need not be built
             ours = found_by.class_path.startswith("dejavu_torch.")
-            periods = build(found_by) if ours else None
-            if not isinstance(periods, PeriodFinder | None):
-                raise InputError(f"it names {found_by.class_path} as what finds periods, which it does not")
+            periods = build(found_by, PeriodFinder) if ours else None  # type: ignore[type-abstract]
+            preprocess = build(Recipe(**header["preprocess"]), Preprocess)
             settings = {name: header[name] for name in ("metric", "reduction", "threshold", "batch_size")}
-            model = cls(features, periods, **settings)
+            model = cls(features, periods, **settings, preprocess=preprocess)
             model.learnt_from = header["learnt_from"] and tuple(header["learnt_from"])
             loaded = model.load_state_dict(tensors, strict=False)
             not_kept = ("periods.", "_extra_state")
@@ -195,12 +212,9 @@ class DejaVu(nn.Module):
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-        except RuntimeError as error:
-            raise InputError(f"{path} does not fit its modules: {' '.join(str(error).split())}") from error
-        except (AttributeError, KeyError, TypeError) as error:
-            raise InputError(
-                f"{path} does not hold what a map holds: {' '.join(str(error).split())}"
-            ) from error
+        except (AttributeError, KeyError, RuntimeError, TypeError) as error:
+            what = "fit its modules" if isinstance(error, RuntimeError) else "hold what a map holds"
+            raise InputError(f"{path} does not {what}: {' '.join(str(error).split())}") from error
         return model
 
     @property
@@ -222,6 +236,7 @@ class DejaVu(nn.Module):
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         metric = self.matcher.metric
         header = {
+            "preprocess": recipe_of(self.preprocess)._asdict(),
             "features": recipe_of(self.features)._asdict(),
             "periods": recipe_of(self.periods)._asdict(),
             "metric": metric if isinstance(metric, str) else getattr(metric, "__name__", "callable"),

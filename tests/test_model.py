@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from fractions import Fraction
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,8 +14,11 @@ from helpers import Fixed, refused
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.features.gather import gather
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match
@@ -137,6 +142,59 @@ def test_learn_returns_the_model_and_relearning_replaces_the_map() -> None:
     fresh = wave_model().learn(pictures(90))
     assert model.map.plan == fresh.map.plan
     assert torch.equal(model(pictures(3)), fresh(pictures(3)))
+
+
+@pytest.mark.parametrize("spilled", [0, 1000, 2**29])
+def test_features_that_spill_to_a_file_give_the_same_map(
+    spilled: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = DejaVu(batch_size=5).learn(pictures())
+    monkeypatch.setattr(model_module, "gather", partial(gather, in_memory=spilled))
+    other = DejaVu(batch_size=5).learn(pictures())
+    assert other.map.plan == plain.map.plan
+    assert torch.equal(other.map.templates, plain.map.templates)
+    assert other.map.templates.untyped_storage().nbytes() == plain.map.templates.untyped_storage().nbytes()
+
+
+def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path: Path) -> None:
+    frames = torch.rand(40, 3, SIZE, SIZE)
+    by_hand = Preprocess("R-B", "patch", patch=5)(frames)
+    model = DejaVu(preprocess=Preprocess("R-B", "patch", patch=5), periods=layers(8, stop=40))
+    plain = DejaVu(periods=layers(8, stop=40)).learn(by_hand)
+    model.learn(frames)
+    assert torch.equal(model.map.templates, plain.map.templates)
+    assert torch.equal(model(frames[:3]), plain(by_hand[:3]))
+    assert torch.equal(model.localize(frames).score, plain.localize(by_hand).score)
+    model.save(tmp_path / "map.safetensors")
+    loaded = DejaVu.load(tmp_path / "map.safetensors")
+    assert torch.equal(loaded(frames[:3]), model(frames[:3]))
+
+
+def test_ready_features_are_not_preprocessed() -> None:
+    model = DejaVu(preprocess=Preprocess("R-B")).learn(waves())
+    assert torch.equal(model.map.templates, DejaVu().learn(waves()).map.templates)
+
+
+def test_gradients_pass_through_the_preprocessing() -> None:
+    model = DejaVu(preprocess=Preprocess(contrast="patch", patch=5)).learn(pictures())
+    query = pictures()[:2].requires_grad_()
+    model(query).sum().backward()
+    assert query.grad is not None
+    assert query.grad.isfinite().all()
+    assert query.grad.abs().sum() > 0
+
+
+def test_so_many_features_are_told_of(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    DejaVu().learn(pictures())
+    DejaVu().learn(torch.rand(40, 200))
+    assert caplog.text == "" or "smaller frames" not in caplog.text
+    monkeypatch.setattr(model_module, "MANY_FEATURES", 50)
+    DejaVu().learn(torch.rand(40, 200))  # ready features: nothing to be done about them
+    assert "smaller frames" not in caplog.text
+    DejaVu().learn(pictures())
+    assert "each frame gives 108 features; smaller frames" in caplog.text
 
 
 def test_a_failed_relearning_keeps_the_map() -> None:
@@ -359,10 +417,10 @@ def test_without_a_map(use: Any) -> None:
         use(DejaVu(), waves())
 
 
-@pytest.mark.parametrize("frames", [1, 2, 15])
+@pytest.mark.parametrize("frames", [1, 2, 7])
 @pytest.mark.parametrize("make", [waves, pictures])
 def test_a_traverse_of_few_frames_is_refused(make: Any, frames: int) -> None:
-    with refused(f"{frames} frame", "expected at least 16"):
+    with refused(f"{frames} frame", "expected at least 8"):
         wave_model().learn(make(frames))
 
 

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import safetensors.torch
 from safetensors import SafetensorError, safe_open
@@ -18,6 +18,9 @@ from dejavu_torch.types import InputError
 FORMAT = 1
 PACKAGE = "dejavu_torch"
 LAYER_COLUMNS = ["period_numerator", "period_denominator", "phases", "start", "stop"]
+
+
+M = TypeVar("M", bound=nn.Module)
 
 
 class Recipe(NamedTuple):
@@ -38,11 +41,11 @@ def recipe_of(module: nn.Module) -> Recipe:
     return Recipe(path, json.loads(json.dumps(arguments)))
 
 
-def build(recipe: Recipe) -> nn.Module:
+def build(recipe: Recipe, kind: type[M]) -> M:
     """Build a module of this package from its recipe; never imports anything else.
 
     Raises:
-        InputError: a class outside this package, or one that is not there.
+        InputError: a class outside this package, one that is not there, or one that is no `kind`.
     """
     module_name, _, class_name = str(recipe.class_path).rpartition(".")
     if not str(recipe.class_path).startswith(PACKAGE + "."):
@@ -52,8 +55,8 @@ def build(recipe: Recipe) -> nn.Module:
         )
     try:
         cls = getattr(importlib.import_module(module_name), class_name)
-        if not (isinstance(cls, type) and issubclass(cls, nn.Module)):
-            raise TypeError(f"{class_name} is no module")
+        if not (isinstance(cls, type) and issubclass(cls, kind)):
+            raise TypeError(f"{class_name} is no {kind.__name__}")
         module = cls(**recipe.init_args)
     except (ImportError, AttributeError, TypeError) as error:
         raise InputError(f"the map names {recipe.class_path}, which cannot be built: {error}") from error

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.database.compressed import CompressedMap
+from dejavu_torch.features.gather import gather
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.distance import Metric, phase_distances
 from dejavu_torch.recognition.scores import combine_layers
@@ -15,8 +16,16 @@ from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 def same_settings(model: DejaVu) -> DejaVu:
     """A model with the settings of another and no map."""
-    metric, reduction = model.matcher.metric, model.matcher.reduction
-    return DejaVu(model.features, model.periods, metric, reduction, model.threshold, model.batch_size)
+    matcher = model.matcher
+    return DejaVu(
+        model.features,
+        model.periods,
+        matcher.metric,
+        matcher.reduction,
+        model.threshold,
+        model.batch_size,
+        model.preprocess,
+    )
 
 
 def null_control(
@@ -38,7 +47,8 @@ def null_control(
         the map reports nothing.
     """
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
-    shuffled, null = reference[order.to(reference.device)], same_settings(model)
+    parts = order.to(reference.device).split(256)
+    shuffled, null = gather(reference[part] for part in parts), same_settings(model)
     if same_plan:
         templates = null.templates(shuffled, model.map.plan)
         null.map = CompressedMap(model.map.plan, templates, *shuffled.shape).to(shuffled.device)

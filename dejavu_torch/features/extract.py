@@ -70,8 +70,9 @@ def features_of(batch: Tensor, module: nn.Module, name: str = "the input") -> Te
         )
     features: Tensor = module(batch)
     if features.ndim != 2 or len(features) != len(batch):
+        maker = module[-1] if isinstance(module, nn.Sequential) else module
         raise InputError(
-            f"{type(module).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
+            f"{type(maker).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
             f"expected features ({len(batch)}, D)"
         )
     return features

@@ -2,30 +2,88 @@
 
 from __future__ import annotations
 
+import math
+from typing import Literal, get_args
+
 import torch
+from kornia.filters import spatial_gradient
 from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
 from dejavu_torch.types import InputError
 
+Bins = Literal["hard", "linear"]
+Gradient = Literal["central", "sobel"]
+VALUES_AT_ONCE = 2**19  # of the frames of one part, so that what lies between stays in the cache
 
-def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Central differences along rows and columns, zero at the border, of the strongest channel.
+
+def parts(frames: Tensor) -> tuple[Tensor, ...]:
+    """A batch in parts of at most VALUES_AT_ONCE values, at least one frame each."""
+    return torch.split(frames, max(1, VALUES_AT_ONCE // max(1, math.prod(frames.shape[1:]))))
+
+
+def check_names(bins: str, gradient: str) -> None:
+    """Refuse names of bins and gradients that are not known."""
+    if bins not in get_args(Bins):
+        raise InputError(f"HOG got bins={bins!r}; expected 'hard' or 'linear'")
+    if gradient not in get_args(Gradient):
+        raise InputError(f"HOG got gradient={gradient!r}; expected 'central' or 'sobel'")
+
+
+def gradients(frames: Tensor, gradient: Gradient = "central") -> tuple[Tensor, Tensor]:
+    """Gradients along rows and columns, of the strongest channel; see `hog` for the two kinds.
 
     Shape: (B,C,H,W) -> two of (B,H,W).
     """
-    rows = torch.zeros_like(frames)
-    columns = torch.zeros_like(frames)
-    rows[:, :, 1:-1] = frames[:, :, 2:] - frames[:, :, :-2]
-    columns[..., 1:-1] = frames[..., 2:] - frames[..., :-2]
-    if frames.shape[1] == 1:
-        return rows[:, 0], columns[:, 0]
-    strongest = torch.hypot(rows.detach(), columns.detach()).argmax(1, keepdim=True)
-    return rows.gather(1, strongest)[:, 0], columns.gather(1, strongest)[:, 0]
+    if gradient == "sobel":
+        columns, rows = spatial_gradient(frames, "sobel").unbind(2)  # kornia gives x, then y
+    else:
+        rows = torch.zeros_like(frames)
+        columns = torch.zeros_like(frames)
+        rows[:, :, 1:-1] = frames[:, :, 2:] - frames[:, :, :-2]
+        columns[..., 1:-1] = frames[..., 2:] - frames[..., :-2]
+    row, column = rows[:, 0], columns[:, 0]
+    longest, *others = torch.hypot(rows.detach(), columns.detach()).unbind(1)
+    for channel, length in enumerate(others, 1):  # much faster than argmax and gather
+        longer = length > longest
+        longest = torch.where(longer, length, longest)
+        row = torch.where(longer, rows[:, channel], row)
+        column = torch.where(longer, columns[:, channel], column)
+    return row, column
 
 
-def cell_histograms(rows: Tensor, columns: Tensor, orientations: int, cell: int) -> Tensor:
-    """Mean gradient magnitude per cell and unsigned orientation bin; each pixel votes for one bin.
+def bin_shares(
+    rows: Tensor, columns: Tensor, magnitude: Tensor, orientations: int, bins: Bins
+) -> list[tuple[Tensor, Tensor]]:
+    """The orientation bins that each pixel votes for: one pair (bin, share of the magnitude), or two.
+
+    Shape: three of (B,H,W) -> pairs of (B,H,W) int64 and (B,H,W).
+    """
+    if bins == "linear":
+        # atan2 has no gradient at 0, nor where the square underflows: such a pixel has no vote to share
+        columns = columns.masked_fill(rows.square() + columns.square() < torch.finfo(rows.dtype).tiny, 1)
+    with torch.set_grad_enabled(bins == "linear" and torch.is_grad_enabled()):
+        # in degrees 45, 90 and 135 are exact, also in float32: they lie on bin edges
+        degrees = torch.rad2deg(torch.atan2(rows, columns)).remainder(180)
+        position = degrees / (180 / orientations)
+    if bins == "hard":
+        lower = position.long()
+        # rounding may reach the end of the circle; NaN may be anything, and stays NaN in the magnitude
+        return [(lower.masked_fill_((lower < 0) | (lower >= orientations), 0), magnitude)]
+    position = position - 0.5  # bin k has its centre at k + 0.5
+    floor = position.detach().floor()
+    lower, upper_share = floor.long(), position - floor
+    upper = (lower + 1).remainder_(orientations)
+    return [
+        (lower.remainder_(orientations), magnitude * (1 - upper_share)),
+        (upper, magnitude * upper_share),
+    ]
+
+
+def cell_histograms(
+    rows: Tensor, columns: Tensor, orientations: int, cell: int, bins: Bins = "hard"
+) -> Tensor:
+    """Mean gradient magnitude per cell and unsigned orientation bin; see `hog` for the two kinds of bins.
 
     Shape: (B,H,W), (B,H,W) -> (B, H // cell, W // cell, orientations).
     """
@@ -33,19 +91,15 @@ def cell_histograms(rows: Tensor, columns: Tensor, orientations: int, cell: int)
     ny, nx = height // cell, width // cell
     rows, columns = rows[:, : ny * cell, : nx * cell], columns[:, : ny * cell, : nx * cell]
     energy = rows.square() + columns.square()
-    # sqrt has no gradient at 0: a flat pixel takes the constant branch, and its gradient is 0
+    # sqrt has no gradient at 0: a flat pixel is masked on both sides of it, and its gradient is 0
     flat = energy == 0
-    magnitude = torch.where(flat, energy, torch.where(flat, torch.ones_like(energy), energy).sqrt())
-    with torch.no_grad():
-        # in degrees 45, 90 and 135 are exact, also in float32: they lie on bin edges
-        degrees = torch.rad2deg(torch.atan2(rows, columns)).remainder(180)
-        slot = (degrees / (180 / orientations)).long().remainder_(orientations)
-        y = torch.arange(ny * cell, device=rows.device).div(cell, rounding_mode="floor")
-        x = torch.arange(nx * cell, device=rows.device).div(cell, rounding_mode="floor")
-        slot += (y[:, None] * nx + x) * orientations
-        slot += (torch.arange(batch, device=rows.device) * (ny * nx * orientations))[:, None, None]
-    votes = magnitude.new_zeros(batch * ny * nx * orientations)
-    votes = votes.scatter_add(0, slot.flatten(), magnitude.flatten())
+    magnitude = energy.masked_fill(flat, 1).sqrt().masked_fill(flat, 0)
+    y = torch.arange(ny * cell, device=rows.device).div(cell, rounding_mode="floor")
+    x = torch.arange(nx * cell, device=rows.device).div(cell, rounding_mode="floor")
+    first = (y[:, None] * nx + x) * orientations
+    votes = magnitude.new_zeros(batch, ny * nx * orientations)
+    for slot, share in bin_shares(rows, columns, magnitude, orientations, bins):
+        votes = votes.scatter_add(1, slot.add_(first).flatten(1), share.flatten(1))
     return votes.view(batch, ny, nx, orientations) / cell**2
 
 
@@ -62,8 +116,10 @@ def hog(
     cell: int = 8,
     block: int = 2,
     resize: tuple[int, int] | None = None,
+    bins: Bins = "hard",
+    gradient: Gradient = "central",
 ) -> Tensor:
-    """Histograms of oriented gradients, equal to skimage.feature.hog to 1e-6 (section IV-A).
+    """Histograms of oriented gradients, by default equal to skimage.feature.hog to 1e-6 (section IV-A).
 
     Args:
         frames: grey or colour images; of a colour image each pixel takes its strongest channel.
@@ -71,36 +127,47 @@ def hog(
         cell: side of a square cell, pixels. Pixels beyond the last whole cell only feed gradients.
         block: side of a square block, cells. Blocks overlap: they move by one cell.
         resize: (height, width) in pixels to resize to first, antialiased; None keeps the size.
+        bins: "hard": a pixel votes for the bin its orientation lies in, so that only the magnitude carries
+            gradient to the frames. "linear": it shares its vote between the two nearest bin centres,
+            (k + 0.5) * 180 / orientations degrees, cyclic over 180; the orientation carries gradient too.
+        gradient: "central" differences f(x + 1) - f(x - 1), zero at the border, or "sobel": Sobel's
+            smoothed slope, with the border pixels repeated, so that the border votes too. It is half the
+            central difference on a ramp, which the blocks' norm takes out again, and slower.
 
     Shape: (B,C,H,W) -> (B,D) with D = (ny - block + 1) * (nx - block + 1) * block**2 * orientations,
         ny = H // cell, nx = W // cell; ordered as skimage orders its feature vector.
 
-    Convention: bins are hard (a pixel votes for one bin) and blocks are normalised by L2-Hys.
-        Gradients with respect to the frames are finite everywhere, also on a flat image.
+    Convention: blocks are normalised by L2-Hys. Gradients with respect to the frames are finite
+        everywhere, also on a flat image.
 
     Raises:
-        InputError: not (B,C,H,W) float, or smaller than one block.
+        InputError: not (B,C,H,W) float, smaller than one block, or an unknown name.
 
     Example:
         >>> hog(torch.rand(5, 1, 64, 64)).shape
         torch.Size([5, 1764])
     """
+    check_names(bins, gradient)
     if frames.ndim != 4 or not frames.is_floating_point():
         raise InputError(
             f"HOG got {tuple(frames.shape)} {frames.dtype}; expected float frames (B,C,H,W) in [0, 1]"
         )
-    if resize is not None and tuple(frames.shape[-2:]) != tuple(resize):
-        frames = antialiased_resize(frames, resize, antialias=True)
-    height, width = frames.shape[-2:]
+    height, width = frames.shape[-2:] if resize is None else resize
     if min(height, width) < cell * block:
         raise InputError(
             f"HOG got frames of {height} x {width} pixels; "
             f"expected at least one block, {cell * block} x {cell * block}"
         )
-    histograms = cell_histograms(*gradients(frames), orientations, cell)
-    blocks = histograms.unfold(1, block, 1).unfold(2, block, 1)  # (B,by,bx,O,block,block)
-    blocks = blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)
-    return l2_hys(blocks).flatten(1)
+
+    def features(part: Tensor) -> Tensor:
+        if tuple(part.shape[-2:]) != (height, width):
+            part = antialiased_resize(part, (height, width), antialias=True)
+        histograms = cell_histograms(*gradients(part, gradient), orientations, cell, bins)
+        blocks = histograms.unfold(1, block, 1).unfold(2, block, 1)  # (B,by,bx,O,block,block)
+        blocks = blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)
+        return l2_hys(blocks).flatten(1)
+
+    return torch.cat([features(part) for part in parts(frames)])
 
 
 class HOG(nn.Module):
@@ -115,8 +182,11 @@ class HOG(nn.Module):
         cell: int = 8,
         block: int = 2,
         resize: tuple[int, int] | None = None,
+        bins: Bins = "hard",
+        gradient: Gradient = "central",
     ) -> None:
         super().__init__()
+        check_names(bins, gradient)
         if min(orientations, cell, block) < 1:
             raise InputError(
                 f"HOG got orientations={orientations}, cell={cell}, block={block}; expected at least 1 each"
@@ -129,9 +199,14 @@ class HOG(nn.Module):
         self.cell = cell
         self.block = block
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))  # a map gives a list
+        self.bins: Bins = bins
+        self.gradient: Gradient = gradient
 
     def forward(self, frames: Tensor) -> Tensor:
-        return hog(frames, self.orientations, self.cell, self.block, self.resize)
+        return hog(frames, self.orientations, self.cell, self.block, self.resize, self.bins, self.gradient)
 
     def extra_repr(self) -> str:
-        return f"orientations={self.orientations}, cell={self.cell}, block={self.block}, resize={self.resize}"
+        return (
+            f"orientations={self.orientations}, cell={self.cell}, block={self.block}, resize={self.resize}, "
+            f"bins={self.bins}, gradient={self.gradient}"
+        )

@@ -16,6 +16,7 @@ from dejavu_torch.types import InputError, Plan
 
 log = logging.getLogger("dejavu_torch")
 
+NUMBERS_AT_ONCE = 2**22  # of a chunk's features, so that memory does not grow with their number
 HANN_PEAK = 2 / 3  # share of its power that a pure wave holds in its own bin under a Hann window
 
 
@@ -126,7 +127,7 @@ class SpectrogramAnalysis(PeriodFinder):
         self,
         window: int = 1024,
         hop: int | None = None,
-        min_period: int = 8,
+        min_period: int = 4,
         strongest: int = 2,
         peaks: Literal["local", "bins"] = "local",
         false_alarm: float | None = 1e-3,
@@ -183,15 +184,8 @@ class SpectrogramAnalysis(PeriodFinder):
         return chunks
 
     def forward(self, features: Tensor) -> tuple[Spectrum, ...]:
-        if features.ndim != 2 or not features.is_floating_point():
-            raise InputError(
-                f"spectrogram got {tuple(features.shape)} {features.dtype}; expected float features (N,D)"
-            )
-        if not features.isfinite().all():
-            raise InputError("spectrogram got features that are not finite; expected finite numbers")
-        return tuple(
-            Spectrum(start, stop, _power(features[start:stop])) for start, stop in self.chunks(len(features))
-        )
+        chunks = self.chunks(len(_checked(features)))
+        return tuple(Spectrum(start, stop, _power(features[start:stop])) for start, stop in chunks)
 
     def plan(self, features: Tensor) -> Plan:
         """The layers of a traverse, the one place where gradients stop.
@@ -200,22 +194,31 @@ class SpectrogramAnalysis(PeriodFinder):
         """
         with torch.no_grad():
             layers = []
-            for start, stop, power in self(features.detach()):
-                length = stop - start
-                bins = strongest_bins(power, self.strongest, length // self.min_period, self.peaks)
-                if self._stands_out(power, bins, start, stop):
+            for start, stop in self.chunks(len(_checked(features))):
+                bins, share = self._strongest(features[start:stop].detach())
+                if self._stands_out(share, start, stop):
                     layers += cluster_layers(bins, start, stop, self.similar)
             return tuple(layers)
 
-    def _stands_out(self, power: Tensor, bins: Tensor, start: int, stop: int) -> bool:
+    def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
+        """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
+        kept, shares = [], []
+        for columns in chunk.split(max(1, NUMBERS_AT_ONCE // len(chunk)), 1):
+            power = _power(columns)
+            bins = strongest_bins(power, self.strongest, len(chunk) // self.min_period, self.peaks)
+            share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
+            kept.append(bins)
+            shares.append(share.where(bins > 0, 0.0).amax(0))
+        return torch.cat(kept, 1), torch.cat(shares)
+
+    def _stands_out(self, share: Tensor, start: int, stop: int) -> bool:
         """Whether any frequency of a chunk is stronger than noise that is new in every frame."""
         if self.false_alarm is None:
             return True
-        least = noise_share(len(power) - 1, power.shape[1], self.false_alarm)
+        least = noise_share((stop - start) // 2, len(share), self.false_alarm)
         if least > HANN_PEAK:
             self._tell(f"frames {start}-{stop - 1}: too few to tell a period from noise, so none is kept")
-        share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
-        return bool(((share > least) & (bins > 0)).any())
+        return bool((share > least).any())
 
     def _tell(self, message: str) -> None:
         """Log a warning, once."""
@@ -228,8 +231,19 @@ class SpectrogramAnalysis(PeriodFinder):
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
 
+def _checked(features: Tensor) -> Tensor:
+    """The features, if they are (N,D) floats."""
+    if features.ndim != 2 or not features.is_floating_point():
+        raise InputError(
+            f"spectrogram got {tuple(features.shape)} {features.dtype}; expected float features (N,D)"
+        )
+    return features
+
+
 def _power(chunk: Tensor) -> Tensor:
     """Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
+    if not chunk.isfinite().all():
+        raise InputError("spectrogram got features that are not finite; expected finite numbers")
     length = len(chunk)
     centred = chunk - chunk.mean(0)
     # rounding leaves a constant feature a trace of power: zero it, or noise would name its period

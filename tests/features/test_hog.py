@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +13,8 @@ from skimage.feature import hog as skimage_hog
 from torch import Tensor
 
 from dejavu_torch import HOG, InputError, hog
+from dejavu_torch.database.mapfile import recipe_of
+from dejavu_torch.features.hog import cell_histograms, gradients
 
 SIZES = [(16, 16), (64, 64), (37, 45), (64, 41), (33, 100), (21, 16)]
 
@@ -79,12 +84,14 @@ def test_convention_9_equals_skimage_in_other_layouts(
     np.testing.assert_allclose(ours.numpy(), oracle(frames, orientations, cell, block), rtol=0, atol=1e-6)
 
 
-def test_convention_9_gradients_are_finite_on_a_flat_image() -> None:
+@pytest.mark.parametrize("bins", ["hard", "linear"])
+@pytest.mark.parametrize("gradient", ["central", "sobel"])
+def test_convention_9_gradients_are_finite_on_a_flat_image(bins: str, gradient: str) -> None:
     half_flat = torch.full((1, 3, 32, 32), 0.4)
     half_flat[..., 16:] = torch.rand(16)
     for frames in (torch.full((2, 1, 32, 32), 0.5), torch.zeros(1, 3, 32, 32), half_flat):
         frames.requires_grad_()
-        features = hog(frames)
+        features = hog(frames, bins=bins, gradient=gradient)
         features.square().sum().backward()
         assert features.isfinite().all()
         assert frames.grad is not None
@@ -129,20 +136,35 @@ def test_frames_of_any_size_give_features_of_one_length() -> None:
     assert {module(torch.rand(1, 1, *size)).shape[1] for size in SIZES} == {324}
 
 
+@pytest.mark.parametrize("bins", ["hard", "linear"])
+@pytest.mark.parametrize("gradient", ["central", "sobel"])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_batch_is_its_frames_one_by_one(channels: int) -> None:
+def test_a_batch_is_its_frames_one_by_one(channels: int, gradient: str, bins: str) -> None:
     frames = torch.rand(6, channels, 40, 33)
-    together = hog(frames)
-    apart = torch.cat([hog(frame[None]) for frame in frames])
+    together = hog(frames, bins=bins, gradient=gradient)
+    apart = torch.cat([hog(frame[None], bins=bins, gradient=gradient) for frame in frames])
     torch.testing.assert_close(together, apart, rtol=0, atol=1e-6)
     order = torch.randperm(6)
-    torch.testing.assert_close(hog(frames[order]), together[order], rtol=0, atol=1e-6)
+    mixed = hog(frames[order], bins=bins, gradient=gradient)
+    torch.testing.assert_close(mixed, together[order], rtol=0, atol=1e-6)
+
+
+def test_a_large_batch_is_worked_off_in_parts(largest_tensor) -> None:  # type: ignore[no-untyped-def]
+    frames = torch.rand(40, 1, 160, 160)
+    with largest_tensor() as seen:
+        features = hog(frames)
+    torch.testing.assert_close(features[-3:], hog(frames[-3:]), rtol=0, atol=1e-6)
+    assert seen.numel == features.numel()  # nothing of the size of all frames
 
 
 def test_module_equals_function() -> None:
     frames = torch.rand(2, 3, 40, 40)
-    module = HOG(orientations=6, cell=4, block=3, resize=(24, 28))
-    assert torch.equal(module(frames), hog(frames, orientations=6, cell=4, block=3, resize=(24, 28)))
+    arguments = {"orientations": 6, "cell": 4, "block": 3, "resize": (24, 28)}
+    for bins, gradient in itertools.product(["hard", "linear"], ["central", "sobel"]):
+        arguments |= {"bins": bins, "gradient": gradient}
+        module = HOG(**arguments)
+        assert torch.equal(module(frames), hog(frames, **arguments))
+        assert torch.equal(HOG(**recipe_of(module).init_args)(frames), module(frames))
 
 
 def test_state_dict_round_trip() -> None:
@@ -179,8 +201,150 @@ def test_frames_that_do_not_fit_are_refused(frames: Tensor, message: str) -> Non
         ({"block": -1}, r"block=-1.*expected at least 1"),
         ({"resize": (32, 8)}, r"resize=\(32, 8\); expected .* at least 16"),
         ({"resize": (32,)}, r"resize=\(32,\); expected \(height, width\)"),
+        ({"bins": "soft"}, r"bins='soft'; expected 'hard' or 'linear'"),
+        ({"gradient": "scharr"}, r"gradient='scharr'; expected 'central' or 'sobel'"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         HOG(**arguments)
+
+
+def ramp(degrees: float, length: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Gradients along rows and columns of an 8 x 8 ramp that rises towards this angle."""
+    angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
+    ones = length * torch.ones(1, 8, 8, dtype=torch.float64)
+    return angle.sin() * ones, angle.cos() * ones
+
+
+@pytest.mark.parametrize(
+    ("degrees", "shares"),
+    [
+        (10, {0: 1.0}),  # on a centre
+        (90, {4: 1.0}),
+        (-90, {4: 1.0}),  # unsigned
+        (15, {0: 0.75, 1: 0.25}),
+        (44, {1: 0.3, 2: 0.7}),
+        (0, {8: 0.5, 0: 0.5}),  # between the last and the first centre
+        (180, {8: 0.5, 0: 0.5}),
+        (176, {8: 0.7, 0: 0.3}),
+        (-176, {8: 0.3, 0: 0.7}),
+    ],
+)
+def test_linear_bins_of_a_ramp(degrees: float, shares: dict[int, float]) -> None:
+    votes = cell_histograms(*ramp(degrees, 3.0), orientations=9, cell=8, bins="linear")
+    expected = torch.zeros(9, dtype=torch.float64)
+    for slot, share in shares.items():
+        expected[slot] = 3 * share
+    torch.testing.assert_close(votes[0, 0, 0], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("orientations", [1, 2, 8, 9])
+def test_linear_bins_keep_the_mass_of_a_cell(orientations: int) -> None:
+    # small whole numbers: many gradients of length 0, along an axis, and on edges of bins
+    frames = torch.randint(0, 4, (3, 1, 40, 37)).float()
+    hard, linear = (cell_histograms(*gradients(frames), orientations, 8, bins) for bins in ("hard", "linear"))
+    assert (linear >= 0).all()
+    torch.testing.assert_close(linear.sum(-1), hard.sum(-1))
+
+
+def linear_oracle(image: np.ndarray, orientations: int, cell: int, block: int) -> np.ndarray:
+    """HOG with shared votes of a grey image (H,W), pixel by pixel."""
+    height, width = image.shape
+    ny, nx = height // cell, width // cell
+    cells = np.zeros((ny, nx, orientations))
+    for y, x in itertools.product(range(ny * cell), range(nx * cell)):
+        down = image[y + 1, x] - image[y - 1, x] if 0 < y < height - 1 else 0.0
+        right = image[y, x + 1] - image[y, x - 1] if 0 < x < width - 1 else 0.0
+        angle = math.degrees(math.atan2(down, right))
+        for k in range(orientations):
+            apart = abs(angle - (k + 0.5) * 180 / orientations) % 180
+            share = max(0.0, 1 - min(apart, 180 - apart) / (180 / orientations))
+            cells[y // cell, x // cell, k] += share * math.hypot(down, right) / cell**2
+    features = []
+    for y, x in itertools.product(range(ny - block + 1), range(nx - block + 1)):
+        values = cells[y : y + block, x : x + block].ravel()
+        values = np.minimum(values / np.sqrt((values**2).sum() + 1e-10), 0.2)
+        features.append(values / np.sqrt((values**2).sum() + 1e-10))
+    return np.concatenate(features)
+
+
+@pytest.mark.parametrize(("orientations", "cell", "block"), [(9, 8, 2), (4, 5, 1), (2, 4, 3)])
+@pytest.mark.parametrize("levels", [3, 256])
+def test_linear_bins_equal_a_literal_loop(levels: int, orientations: int, cell: int, block: int) -> None:
+    image = np.random.default_rng(0).integers(0, levels, (25, 30)) / 255
+    frames = torch.from_numpy(image)[None, None]
+    for dtype in (torch.float64, torch.float32):
+        ours = hog(frames.to(dtype), orientations, cell, block, bins="linear")[0]
+        expected = linear_oracle(image, orientations, cell, block)
+        np.testing.assert_allclose(ours.numpy(), expected, rtol=0, atol=1e-6 if dtype.itemsize == 8 else 1e-5)
+
+
+@pytest.mark.parametrize("gradient", ["central", "sobel"])
+def test_linear_bins_have_right_gradients(gradient: str) -> None:
+    frames = torch.rand(2, 1, 9, 8, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda x: hog(x, orientations=4, cell=4, block=2, bins="linear", gradient=gradient), frames
+    )
+
+
+@pytest.mark.parametrize(("bins", "turns"), [("hard", False), ("linear", True)])
+def test_the_orientation_carries_gradient_only_with_linear_bins(bins: str, turns: bool) -> None:
+    angle = torch.tensor(math.radians(15), dtype=torch.float64, requires_grad=True)
+    ones = torch.ones(1, 8, 8, dtype=torch.float64)
+    votes = cell_histograms(angle.sin() * ones, angle.cos() * ones, 9, 8, bins)
+    (slope,) = torch.autograd.grad(votes[0, 0, 0, 1], angle)
+    # turning by one bin of 20 degrees moves the whole vote
+    assert slope.item() == pytest.approx(9 / math.pi if turns else 0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("bins", ["hard", "linear"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("small", [0.0, 1e-45, 1e-30, 1e-23, 1e-22, 3e-20, 1e-19, 1e-10])
+def test_gradients_are_finite_at_the_singular_points(small: float, dtype: torch.dtype, bins: str) -> None:
+    """No gradient at all, one along an axis to either side, and those whose square underflows."""
+    for down, right in itertools.product([0.0, -0.0, small, -small, 1.0], repeat=2):
+        rows = torch.full((1, 4, 4), down, dtype=dtype, requires_grad=True)
+        columns = torch.full((1, 4, 4), right, dtype=dtype, requires_grad=True)
+        votes = cell_histograms(rows, columns, 9, 4, bins)
+        slopes = torch.autograd.grad((votes * torch.arange(9)).sum(), [rows, columns])
+        assert votes.isfinite().all()
+        assert all(slope.isfinite().all() for slope in slopes)
+
+
+def test_sobel_of_a_ramp_is_its_slope_and_half_of_it_at_the_border() -> None:
+    y, x = torch.arange(6.0)[:, None], torch.arange(7.0)
+    rows, columns = gradients((2 * y + 3 * x)[None, None], "sobel")
+    slope_y, slope_x = torch.full((6, 7), 2.0), torch.full((6, 7), 3.0)
+    slope_y[[0, -1]] /= 2
+    slope_x[:, [0, -1]] /= 2
+    torch.testing.assert_close(rows[0], slope_y)
+    torch.testing.assert_close(columns[0], slope_x)
+
+
+def test_sobel_equals_a_literal_loop() -> None:
+    image = np.random.default_rng(0).random((9, 11))
+    rows, columns = gradients(torch.from_numpy(image)[None, None], "sobel")
+    around = np.pad(image, 1, mode="edge")
+    for y, x in np.ndindex(image.shape):
+        near = around[y : y + 3, x : x + 3]
+        down = ((near[2] - near[0]) * [1, 2, 1]).sum() / 8
+        right = ((near[:, 2] - near[:, 0]) * [1, 2, 1]).sum() / 8
+        assert rows[0, y, x].item() == pytest.approx(down, abs=1e-12)
+        assert columns[0, y, x].item() == pytest.approx(right, abs=1e-12)
+
+
+@pytest.mark.parametrize("gradient", ["central", "sobel"])
+def test_each_pixel_takes_its_strongest_channel(gradient: str) -> None:
+    frames = torch.rand(2, 4, 12, 13, dtype=torch.float64)
+    alone = [gradients(frames[:, channel, None], gradient) for channel in range(4)]
+    strongest = torch.stack([torch.hypot(*pair) for pair in alone]).argmax(0)
+    for together, apart in zip(gradients(frames, gradient), zip(*alone, strict=True), strict=True):
+        expected = torch.stack(apart).gather(0, strongest[None])[0]
+        torch.testing.assert_close(together, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "value"), [("bins", "soft"), ("gradient", "scharr")])
+def test_the_function_refuses_unknown_names(name: str, value: str) -> None:
+    with pytest.raises(InputError, match=f"{name}='{value}'; expected"):
+        hog(torch.rand(1, 1, 16, 16), **{name: value})

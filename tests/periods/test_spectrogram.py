@@ -6,6 +6,7 @@ import logging
 import math
 from fractions import Fraction
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import InputError, SpectrogramAnalysis
+from dejavu_torch.periods import spectrogram
 from dejavu_torch.periods.spectrogram import bin_period, noise_share, strongest_bins
 from dejavu_torch.types import Plan
 
@@ -118,8 +120,8 @@ def test_periods_lie_between_the_shortest_and_half_the_window(peaks: str) -> Non
     [
         ({"window": 100}, 300, [(0, 100), (100, 200), (200, 300)]),
         ({"window": 100}, 350, [(0, 100), (100, 200), (200, 300), (300, 350)]),
-        ({"window": 100}, 316, [(0, 100), (100, 200), (200, 300), (300, 316)]),
-        ({"window": 100}, 315, [(0, 100), (100, 200), (200, 300)]),  # under two periods of 8
+        ({"window": 100}, 308, [(0, 100), (100, 200), (200, 300), (300, 308)]),
+        ({"window": 100}, 307, [(0, 100), (100, 200), (200, 300)]),  # under two periods of 4
         ({"window": 100, "min_period": 30}, 350, [(0, 100), (100, 200), (200, 300)]),
         ({"window": 100, "hop": 50}, 250, [(0, 100), (50, 150), (100, 200), (150, 250)]),
         ({"window": 100, "hop": 50}, 230, [(0, 100), (50, 150), (100, 200), (150, 230)]),
@@ -138,7 +140,7 @@ def test_chunks(arguments: dict[str, int], frames: int, chunks: list[tuple[int, 
 
 @given(st.integers(16, 60), st.integers(1, 60), st.integers(16, 400))
 def test_chunks_leave_out_less_than_two_of_the_shortest_periods(window: int, hop: int, frames: int) -> None:
-    chunks = SpectrogramAnalysis(window, hop=min(hop, window)).chunks(frames)
+    chunks = SpectrogramAnalysis(window, hop=min(hop, window), min_period=8).chunks(frames)
     assert all(16 <= stop - start <= window for start, stop in chunks)
     assert chunks[0][0] == 0
     assert all(b[0] <= a[1] for a, b in pairwise(chunks))
@@ -157,7 +159,7 @@ def test_each_chunk_has_its_own_periods() -> None:
 
 def test_convention_3_hann_window_of_1024_not_centred_remainder_of_its_own() -> None:
     analysis = SpectrogramAnalysis()
-    assert (analysis.window, analysis.min_period, analysis.strongest) == (1024, 8, 2)
+    assert (analysis.window, analysis.strongest) == (1024, 2)
     assert analysis.chunks(3072) == [(0, 1024), (1024, 2048), (2048, 3072)]
     assert analysis.chunks(2500)[-1] == (2048, 2500)
     features = torch.randn(2500, 1)
@@ -304,7 +306,7 @@ def test_state_dict_round_trip() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"window": 15}, r"window=15, min_period=8.*expected .*window >= 2 \* min_period"),
+        ({"window": 7}, r"window=7, min_period=4.*expected .*window >= 2 \* min_period"),
         ({"min_period": 1}, r"min_period=1.*expected min_period >= 2"),
         ({"strongest": 0}, r"strongest=0.*expected .*strongest >= 1"),
         ({"hop": 0}, r"hop=0; expected 1\.\.1024"),
@@ -327,11 +329,33 @@ def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str)
         (torch.randn(100), r"\(100,\) torch\.float32; expected float features \(N,D\)"),
         (torch.zeros(100, 2).long(), r"torch\.int64; expected float features"),
         (torch.full((100, 2), torch.nan), r"not finite; expected finite numbers"),
-        (torch.randn(15, 2), r"15 frames; expected at least 16, two periods of 8"),
-        (torch.randn(1, 2), r"1 frame; expected at least 16"),
+        (torch.randn(7, 2), r"7 frames; expected at least 8, two periods of 4"),
+        (torch.randn(1, 2), r"1 frame; expected at least 8"),
     ],
 )
 def test_features_that_do_not_fit_are_refused(features: Tensor, message: str) -> None:
     with pytest.raises(InputError, match=message) as error:
         SpectrogramAnalysis().plan(features)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("at_once", [1, 1000, 2**30])
+def test_the_plan_does_not_depend_on_how_many_features_are_in_hand(
+    at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    features = torch.randn(300, 7) + torch.sin(torch.arange(300)[:, None] * torch.arange(7) / 9)
+    finder = SpectrogramAnalysis(window=128)
+    whole = finder.plan(features)
+    monkeypatch.setattr(spectrogram, "NUMBERS_AT_ONCE", at_once)
+    assert len(whole) > 0
+    assert finder.plan(features) == whole
+
+
+def test_planning_holds_less_than_the_features(
+    largest_tensor: type[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spectrogram, "NUMBERS_AT_ONCE", 1024)
+    features = torch.randn(2048, 64)
+    with largest_tensor() as seen:
+        SpectrogramAnalysis(window=128, min_period=4).plan(features)
+    assert seen.numel <= 128 * 64  # one chunk, of eleven features at a time in what is made of it

@@ -1,0 +1,72 @@
+"""All features of a traverse at once, in memory or in a temporary file."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable
+from typing import IO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dejavu_torch.types import InputError
+
+IN_MEMORY = 2**29  # bytes
+
+
+def gather(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor:
+    """The batches as one tensor, which may be larger than the memory.
+
+    Args:
+        batches: each (B,D), one number type.
+        in_memory: bytes kept in memory. More spill to a temporary file, which the tensor then maps: rows
+            are read when they are used. The file has no name and goes with the tensor or the process.
+
+    Shape: (B,D), ... -> (N,D); on the CPU where it spilled.
+
+    Raises:
+        InputError: batches of different D or number type, none at all, or no room for the file.
+
+    Example:
+        >>> gather(torch.arange(6.0).view(3, 2).split(2)).tolist()
+        [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]
+    """
+    parts: list[Tensor] = []
+    file: IO[bytes] | None = None
+    like, held, rows = None, 0, 0
+    for batch in batches:
+        like = batch[:0] if like is None else like
+        if batch.shape[1:] != like.shape[1:] or batch.dtype != like.dtype:
+            raise InputError(
+                f"features {rows}.. are {batch.shape[1]} of {batch.dtype}; "
+                f"expected {like.shape[1]} of {like.dtype} as before"
+            )
+        parts.append(batch)
+        rows += len(batch)
+        held += batch.numel() * batch.element_size()
+        if held > in_memory:
+            file = _spill(parts, file)
+            parts, held = [], 0
+    if like is None:
+        raise InputError("there are no features; expected at least one batch")
+    if file is None:
+        return torch.cat(parts)
+    _spill(parts, file)
+    # copy on write: the tensor may be written to, the file never is
+    return torch.from_numpy(np.memmap(file, like.cpu().numpy().dtype, "c", shape=(rows, like.shape[1])))
+
+
+def _spill(parts: list[Tensor], file: IO[bytes] | None) -> IO[bytes]:
+    """Write the parts to the end of the file, a new one without a name if there is none."""
+    try:
+        file = tempfile.TemporaryFile() if file is None else file  # noqa: SIM115, it goes with the tensor
+        for part in parts:
+            file.write(part.cpu().contiguous().numpy().data)
+        file.flush()
+    except OSError as error:
+        raise InputError(
+            f"the features do not fit into a temporary file: {error.strerror}; "
+            "expected room there, or TMPDIR set to a folder with room"
+        ) from error
+    return file

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch.features.gather import gather
+
+
+@given(
+    rows=st.integers(1, 40), width=st.integers(1, 5), batch=st.integers(1, 9), in_memory=st.integers(0, 500)
+)
+def test_whatever_the_memory_the_rows_are_the_same(rows: int, width: int, batch: int, in_memory: int) -> None:
+    features = torch.randn(rows, width)
+    assert torch.equal(gather(features.split(batch), in_memory), features)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_spilled_rows_keep_their_type_and_can_be_changed_without_harm(dtype: torch.dtype) -> None:
+    features = torch.randn(9, 3, dtype=dtype)
+    spilled = gather(features.split(2), in_memory=0)
+    assert spilled.dtype == dtype
+    assert torch.equal(spilled, features)
+    spilled[0] = 7
+    assert torch.equal(spilled[1:], features[1:])
+    assert spilled[0].eq(7).all()
+
+
+def test_memory_holds_no_more_than_its_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    made: list[weakref.ref[Tensor]] = []
+
+    def batches() -> Iterator[Tensor]:
+        for i in range(100):
+            batch = torch.full((4, 256), float(i))
+            made.append(weakref.ref(batch))
+            yield batch
+            assert sum(ref() is not None for ref in made) <= 3  # two that fit in memory, and the next
+
+    spilled = gather(batches(), in_memory=2 * 4 * 256 * 4)
+    assert list(tmp_path.iterdir()) == []  # the file has no name: nothing is left, whatever happens
+    assert torch.equal(spilled[::4, 0], torch.arange(100.0))
+
+
+def test_a_full_disk_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full:
+        def flush(self) -> None: ...
+
+        def write(self, _: object) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", Full)
+    with refused("do not fit into a temporary file", "No space left on device", "TMPDIR"):
+        gather(torch.rand(4, 4).split(1), in_memory=0)
+
+
+def test_no_folder_for_the_file_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> None:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/nowhere']")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", nowhere)
+    with refused("do not fit into a temporary file", "No usable temporary directory", "TMPDIR"):
+        gather(torch.rand(4, 4).split(1), in_memory=0)
+
+
+def test_what_the_traverse_complains_about_passes() -> None:
+    def batches() -> Iterator[Tensor]:
+        yield torch.rand(2, 2)
+        raise OSError("the camera is gone")
+
+    with pytest.raises(OSError, match="the camera is gone"):
+        gather(batches())
+
+
+def test_mixed_and_missing_batches_are_refused() -> None:
+    with refused("features 2.. are 4 of torch.float32", "expected 3 of torch.float32"):
+        gather([torch.rand(2, 3), torch.rand(2, 4)])
+    with refused("features 2.. are 3 of torch.float64", "expected 3 of torch.float32"):
+        gather([torch.rand(2, 3), torch.rand(2, 3).double()])
+    with refused("no features"):
+        gather([])

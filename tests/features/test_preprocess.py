@@ -1,0 +1,270 @@
+"""Preprocess: a literal loop in float64 is the oracle, gradcheck the judge of gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.enhance import equalize_clahe
+from torch import Tensor
+
+from dejavu_torch.database.mapfile import recipe_of
+from dejavu_torch.features.preprocess import Preprocess, equalise, normalise_patches, select_channel
+
+
+def patch_oracle(image: np.ndarray, patch: int) -> np.ndarray:
+    """Patch normalisation of one channel (H,W), pixel by pixel, in float64."""
+    image = image.astype(np.float64)
+    out, reach = np.zeros_like(image), patch // 2
+    for y, x in np.ndindex(image.shape):
+        near = image[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1]
+        out[y, x] = (image[y, x] - near.mean()) / max(near.std(), 1 / 255)
+    return out
+
+
+def uneven(height: int, width: int, channels: int = 1) -> Tensor:
+    """Frames whose brightness and contrast change across them, in [0, 1]."""
+    light = torch.linspace(0.1, 0.9, width) * torch.linspace(0.5, 1, height)[:, None]
+    return (light + 0.2 * light * torch.randn(2, channels, height, width)).clamp(0, 1)
+
+
+# --- channel
+
+
+def test_channels() -> None:
+    frames = torch.rand(2, 3, 4, 5)
+    red, green, blue = (frames[:, k, None] for k in range(3))
+    for name, expected in {
+        "R": red,
+        "g": green,
+        "B": blue,
+        "R-B": red - blue,
+        "b-g": blue - green,
+        "Grey": 0.299 * red + 0.587 * green + 0.114 * blue,
+    }.items():
+        torch.testing.assert_close(Preprocess(channel=name)(frames), expected)
+
+
+def test_grey_frames_pass_as_grey() -> None:
+    frames = torch.rand(2, 1, 4, 5)
+    assert torch.equal(select_channel(frames, "grey"), frames)
+
+
+def test_gradients_of_channels() -> None:
+    frames = torch.rand(1, 3, 2, 2, dtype=torch.float64, requires_grad=True)
+    for name in ("grey", "G", "R-B"):
+        assert torch.autograd.gradcheck(lambda x, name=name: select_channel(x, name), frames)
+
+
+@pytest.mark.parametrize("channel", ["R", "G-B"])
+@pytest.mark.parametrize("channels", [1, 4])
+def test_frames_without_colours_are_refused(channel: str, channels: int) -> None:
+    with refused(f"'{channel}'", f"{channels} channels", "RGB"):
+        select_channel(torch.rand(1, channels, 8, 8), channel)
+
+
+@pytest.mark.parametrize("channel", ["", "gray2", "RG", "R-", "-", "R-R", "R-G-B", "R-grey", "H", None])
+def test_unknown_channels_are_refused(channel: str) -> None:
+    with refused(f"channel {channel!r} is unknown", "'grey', 'R', 'G', 'B'", "'R-B'"):
+        select_channel(torch.rand(1, 3, 8, 8), channel)
+    if channel is not None:
+        with refused(f"channel {channel!r} is unknown"):
+            Preprocess(channel=channel)
+
+
+# --- patch normalisation
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(("height", "width", "patch"), [(9, 9, 9), (12, 17, 3), (20, 13, 7), (11, 30, 11)])
+def test_patches_equal_a_literal_loop(height: int, width: int, patch: int, dtype: torch.dtype) -> None:
+    frames = uneven(height, width, 3).to(dtype)
+    ours = normalise_patches(frames, patch)
+    assert ours.dtype == dtype
+    for frame, expected in zip(ours.flatten(0, 1), frames.flatten(0, 1), strict=True):
+        np.testing.assert_allclose(frame, patch_oracle(expected.numpy(), patch), rtol=0, atol=1e-6)
+
+
+def test_patches_of_little_contrast_in_bright_light() -> None:
+    """Where the difference of the squares cancels most: a deviation of two grey levels near white."""
+    frames = (0.99 + torch.randn(1, 1, 24, 24) * 2 / 255).clamp(max=1)
+    np.testing.assert_allclose(
+        normalise_patches(frames)[0, 0], patch_oracle(frames[0, 0].numpy(), 9), rtol=0, atol=1e-6
+    )
+
+
+@given(gain=st.floats(0.2, 5), offset=st.floats(-1, 1), seed=st.integers(0, 99))
+def test_patches_do_not_see_gain_and_offset(gain: float, offset: float, seed: int) -> None:
+    frames = torch.rand(1, 2, 12, 14, generator=torch.Generator().manual_seed(seed))  # far above the floor
+    torch.testing.assert_close(
+        normalise_patches(gain * frames + offset, 5), normalise_patches(frames, 5), rtol=0, atol=1e-5
+    )
+
+
+def test_the_floor_keeps_noise_small() -> None:
+    noise = torch.randn(1, 1, 32, 32) * 0.01 / 255
+    sky = normalise_patches(0.7 + noise)
+    assert 0 < sky.abs().max() < 0.05
+    assert torch.equal(normalise_patches(torch.full((1, 1, 16, 16), 0.3)), torch.zeros(1, 1, 16, 16))
+
+
+def test_gradients_of_patches() -> None:
+    frames = torch.rand(2, 1, 6, 5, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: normalise_patches(x, 3), frames)
+    flat = torch.full((1, 1, 6, 5), 0.4, dtype=torch.float64, requires_grad=True)  # below the floor: linear
+    assert torch.autograd.gradcheck(lambda x: normalise_patches(x, 3), flat)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.4, 1.0])
+def test_gradients_of_patches_are_finite_on_flat_frames(value: float) -> None:
+    frames = torch.full((1, 3, 16, 16), value, requires_grad=True)
+    normalise_patches(frames).square().sum().backward()
+    assert frames.grad is not None
+    assert frames.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("patch", [-3, 0, 1, 2, 8])
+def test_patches_even_or_too_small_are_refused(patch: int) -> None:
+    with refused(f"patch is {patch}", "odd", "at least 3"):
+        normalise_patches(torch.rand(1, 1, 16, 16), patch)
+    with refused(f"patch is {patch}"):
+        Preprocess(patch=patch)
+
+
+@pytest.mark.parametrize(("height", "width"), [(8, 20), (20, 8)])
+def test_frames_smaller_than_a_patch_are_refused(height: int, width: int) -> None:
+    with refused(f"{height} x {width} pixels", "9 x 9"):
+        normalise_patches(torch.rand(1, 1, height, width))
+
+
+# --- CLAHE
+
+
+def test_clahe_is_kornias() -> None:
+    frames = uneven(48, 40, 3)
+    assert torch.equal(equalise(frames, 3.0, (4, 2)), equalize_clahe(frames, 3.0, (4, 2)))
+
+
+@given(height=st.integers(1, 40), width=st.integers(1, 40), rows=st.integers(1, 9), columns=st.integers(1, 9))
+def test_clahe_of_any_size_and_grid(height: int, width: int, rows: int, columns: int) -> None:
+    frames = torch.rand(2, 1, height, width)
+    if height <= rows or width <= columns:
+        with refused(f"{height} x {width} pixels", f"at least {rows + 1} x {columns + 1}"):
+            equalise(frames, grid=(rows, columns))
+    else:
+        even = equalise(frames, grid=(rows, columns))
+        assert even.shape == frames.shape
+        assert ((even >= 0) & (even <= 1)).all()
+
+
+def test_clahe_spreads_a_dull_frame_and_clipping_holds_it_back() -> None:
+    frames = 0.45 + 0.1 * torch.rand(1, 1, 64, 64)
+    spread = [equalise(frames, limit, (2, 2)).std() for limit in (1.0, 3.0, 0.0)]
+    assert frames.std() < spread[0] < spread[1] < spread[2]
+
+
+def test_clahe_passes_gradients_straight_through_without_other_values() -> None:
+    frames = uneven(32, 40)
+    weights = torch.randn_like(frames)
+    plain = equalise(frames, grid=(4, 4))
+    leaf = frames.clone().requires_grad_()
+    even = equalise(leaf, grid=(4, 4))
+    torch.testing.assert_close(even, plain, rtol=0, atol=1e-6)
+    (even * weights).sum().backward()
+    torch.testing.assert_close(leaf.grad, weights)
+
+
+@pytest.mark.parametrize("frames", [torch.full((1, 1, 16, 16), 1.5), torch.full((1, 1, 16, 16), -0.25)])
+def test_clahe_of_values_out_of_range_is_refused(frames: Tensor) -> None:
+    with refused(f"values from {frames[0, 0, 0, 0]:g} to", "[0, 1]"):
+        equalise(frames)
+
+
+def test_clahe_of_nan_is_refused() -> None:
+    with refused("nan", "[0, 1]"):
+        equalise(torch.full((1, 1, 16, 16), torch.nan))
+
+
+def test_a_difference_is_moved_into_range_ahead_of_clahe() -> None:
+    frames = torch.rand(2, 3, 32, 32)
+    even = Preprocess(channel="R-B", contrast="clahe", grid=(2, 2))(frames)
+    torch.testing.assert_close(even, equalise((frames[:, :1] - frames[:, 2:] + 1) / 2, grid=(2, 2)))
+
+
+@pytest.mark.parametrize("grid", [(0, 8), (8, -1), (8,), (2, 2, 2), (2.5, 2)])
+def test_bad_grids_are_refused(grid: tuple[int, int]) -> None:
+    for refusing in (lambda: equalise(torch.rand(1, 1, 64, 64), grid=grid), lambda: Preprocess(grid=grid)):
+        with refused(f"grid is {grid}", "(rows, columns)"):
+            refusing()
+
+
+@pytest.mark.parametrize("limit", [-1.0, float("nan"), float("inf")])
+def test_bad_clip_limits_are_refused(limit: float) -> None:
+    for refusing in (lambda: equalise(torch.rand(1, 1, 64, 64), limit), lambda: Preprocess(clip_limit=limit)):
+        with refused(f"clip_limit is {limit}", "at least 0"):
+            refusing()
+
+
+# --- the module
+
+CHOICES = [
+    {"channel": "grey"},
+    {"channel": "R-B", "contrast": "patch", "patch": 5},
+    {"contrast": "patch"},
+    {"contrast": "clahe", "clip_limit": 3, "grid": [2, 3]},
+    {"channel": "G", "contrast": "clahe"},
+]
+
+
+def test_without_choices_the_input_itself_comes_back() -> None:
+    for frames in (torch.rand(2, 3, 8, 8), torch.rand(5, 7)):  # images, and ready-made features
+        assert Preprocess()(frames) is frames
+
+
+def test_module_equals_functions() -> None:
+    frames = torch.rand(2, 3, 24, 30)
+    module = Preprocess(channel="g", contrast="patch", patch=5)
+    assert torch.equal(module(frames), normalise_patches(frames[:, 1:2], 5))
+    module = Preprocess(contrast="clahe", clip_limit=3.0, grid=(2, 3))
+    assert torch.equal(module(frames), equalise(frames, 3.0, (2, 3)))
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_a_batch_is_its_frames_one_by_one(choice: dict) -> None:
+    module = Preprocess(**choice)
+    frames = torch.rand(5, 3, 24, 31)
+    apart = torch.cat([module(frame[None]) for frame in frames])
+    torch.testing.assert_close(module(frames), apart, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_a_large_batch_is_worked_off_in_parts(choice: dict) -> None:
+    module = Preprocess(**choice)
+    frames = torch.rand(12, 3, 160, 160)
+    torch.testing.assert_close(module(frames)[-2:], module(frames[-2:]), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_a_recipe_builds_the_same_module(choice: dict) -> None:
+    module = Preprocess(**choice)
+    again = Preprocess(**recipe_of(module).init_args)
+    assert repr(again) == repr(module)
+    assert again.grid == module.grid
+    assert isinstance(again.grid, tuple)
+    frames = torch.rand(1, 3, 16, 16)
+    assert torch.equal(again(frames), module(frames))
+
+
+def test_unknown_contrast_is_refused() -> None:
+    with refused("contrast 'retinex' is unknown", "'patch'", "'clahe'"):
+        Preprocess(contrast="retinex")
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_what_is_no_batch_of_float_frames_is_refused(choice: dict) -> None:
+    for frames in (torch.rand(3, 16, 16), torch.zeros(1, 3, 16, 16, dtype=torch.uint8)):
+        with refused(str(tuple(frames.shape)), str(frames.dtype), "(B,C,H,W)"):
+            Preprocess(**choice)(frames)
