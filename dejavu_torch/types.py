@@ -104,6 +104,19 @@ class Match(NamedTuple):
     accepted: Tensor
 
 
+class Truth(NamedTuple):
+    """The right places of each query, and what is not to be judged.
+
+    right: (Q,R) int64, every right place of each query, -1 as padding; a row of -1 has no right answer.
+    known: (Q,) bool, False where nothing is known of a query: it is left out of every score.
+    soft: (Q,S) int64, places that count neither as right nor as wrong, -1 as padding; S may be 0.
+    """
+
+    right: Tensor
+    known: Tensor
+    soft: Tensor
+
+
 class PRCurve(NamedTuple):
     """Precision and recall when every query with score <= threshold reports; each (T,) float64."""
 

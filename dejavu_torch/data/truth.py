@@ -5,11 +5,43 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import Truth
+
+PAIRS_AT_ONCE = 2**20
 
 
-def offset_truth(queries: int, places: int, offset: int = 0) -> Tensor:
+def as_truth(truth: Tensor | Truth) -> Truth:
+    """A tensor of right places (Q,R), -1 as padding, as a Truth in which every query is known."""
+    if isinstance(truth, Truth):
+        return truth
+    known = torch.ones(len(truth), dtype=torch.bool)
+    return Truth(truth, known, truth.new_zeros(len(truth), 0))
+
+
+def padded(row: Tensor, place: Tensor, rows: int) -> Tensor:
+    """Pairs of row and place as a table, a line a row, -1 as padding.
+
+    Args:
+        row: (n,) int64, in increasing order. place: (n,) int64.
+
+    Shape: -> (rows,R) int64, R the most places of any row.
+
+    Example:
+        >>> padded(torch.tensor([0, 2, 2]), torch.tensor([5, 6, 7]), rows=3).tolist()
+        [[5, -1], [-1, -1], [6, 7]]
+    """
+    count = torch.bincount(row, minlength=rows)
+    slot = torch.arange(len(row)) - (count.cumsum(0) - count)[row]
+    table = place.new_full((rows, int(count.max()) if rows else 0), -1)
+    table[row, slot] = place
+    return table
+
+
+def offset_truth(queries: int | Tensor, places: int | None, offset: int = 0) -> Tensor:
     """Query i is place i + offset; where that is no place, the query has no right answer (-1).
+
+    Args:
+        queries: how many, or (Q,) int64 the number of each. places: how many, None where unknown.
 
     Shape: -> (Q,1) int64.
 
@@ -17,8 +49,9 @@ def offset_truth(queries: int, places: int, offset: int = 0) -> Tensor:
         >>> offset_truth(3, 3, offset=1).flatten().tolist()
         [1, 2, -1]
     """
-    place = torch.arange(queries) + offset
-    return torch.where((place >= 0) & (place < places), place, -1)[:, None]
+    place = (torch.arange(queries) if isinstance(queries, int) else queries) + offset
+    there = place >= 0 if places is None else (place >= 0) & (place < places)
+    return torch.where(there, place, -1)[:, None]
 
 
 def position_truth(reference: Tensor, query: Tensor) -> Tensor:
@@ -41,44 +74,28 @@ def position_truth(reference: Tensor, query: Tensor) -> Tensor:
     return place.T
 
 
-def read_offset(truth: str) -> int:
-    """The offset that a text means.
-
-    Raises:
-        InputError: no integer.
-    """
-    try:
-        return int(truth)
-    except ValueError as error:
-        raise InputError(f"truth {truth!r} is not known; expected an integer offset such as 0") from error
-
-
-def find_truth(
-    truth: str | None, reference: Traverse, query: Traverse, places: int, queries: int
-) -> Tensor | None:
-    """The truth that a command was given, or what it can know by itself.
+def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
+    """Every reference frame within a distance of each query.
 
     Args:
-        truth: an integer offset (place = query + offset) as text. None: the positions that both
-            traverses carry, else query i is place i where both are equally long, else no truth.
+        reference: (N,K) coordinates of the reference frames. query: (Q,K) those of the queries.
+        radius: inclusive, in the unit of the coordinates.
 
-    Shape: -> (Q,R) int64, every right place of each query, -1 as padding; or None.
+    Shape: -> (Q,R) int64, -1 as padding.
 
-    Raises:
-        InputError: text that is no truth, or a truth in which no query has a right answer.
+    Example:
+        >>> near_truth(torch.tensor([[0.0, 0.0], [3.0, 4.0]]), torch.zeros(1, 2), radius=5.0).tolist()
+        [[0, 1]]
     """
-    if truth is not None:
-        offset = read_offset(truth)
-        right = offset_truth(queries, places, offset)
-        if not (right >= 0).any():
-            raise InputError(
-                f"with truth {offset} no query has a right answer: {queries} queries, {places} places; "
-                f"expected an offset from {1 - queries} to {places - 1}"
-            )
-        return right
-    if reference.place is not None and query.place is not None:
-        return position_truth(reference.place, query.place)
-    return offset_truth(queries, places) if queries == places else None
+    found = []
+    at_once = max(1, PAIRS_AT_ONCE // max(1, len(reference)))
+    for start in range(0, len(query), at_once):
+        part = query[start : start + at_once].double()
+        # matrix products would cancel the metres of large coordinates
+        distance = torch.cdist(part, reference.double(), compute_mode="donot_use_mm_for_euclid_dist")
+        found.append((distance <= radius).nonzero() + torch.tensor([start, 0]))
+    row, place = torch.cat(found).T
+    return padded(row, place, len(query))
 
 
 def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
@@ -94,3 +111,12 @@ def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
     """
     near = (index[:, None] - truth).abs() <= tolerance
     return (near & (truth >= 0) & (index >= 0)[:, None]).any(1)
+
+
+def counted(index: Tensor, truth: Truth, tolerance: int) -> Tensor:
+    """Which queries a score counts: those of known truth that do not report a soft place.
+
+    Shape: (Q,) -> (Q,) bool.
+    """
+    soft = is_right(index, truth.soft, 0)
+    return truth.known & (is_right(index, truth.right, tolerance) | ~soft)

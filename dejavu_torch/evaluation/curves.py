@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.truth import is_right
-from dejavu_torch.types import InputError, Match, PRCurve
+from dejavu_torch.data.truth import as_truth, counted, is_right
+from dejavu_torch.types import InputError, Match, PRCurve, Truth
 
 RECALL_DEFINITION = (
     "TP / all queries with a right answer; *_reported: TP / (TP + FN), a wrong report is no FN"
@@ -86,41 +86,95 @@ def recall_at_full_precision(curve: PRCurve) -> float:
 
 
 def curve_of(
-    match: Match, truth: Tensor, tolerance: int, recall: Literal["all", "reported"] = "all"
+    match: Match, truth: Tensor | Truth, tolerance: int, recall: Literal["all", "reported"] = "all"
 ) -> PRCurve:
-    """`pr_curve` of matches against a truth (Q,R)."""
-    check_truth(match, truth, tolerance)
-    return pr_curve(match.score, is_right(match.index, truth, tolerance), (truth >= 0).any(1), recall)
+    """`pr_curve` of matches against a truth; see `judge`."""
+    match, truth = _judged(match, truth, tolerance)
+    right = is_right(match.index, truth.right, tolerance)
+    return pr_curve(match.score, right, (truth.right >= 0).any(1), recall)
 
 
-def judge(match: Match, truth: Tensor, tolerance: int) -> Scores:
+def judge(match: Match, truth: Tensor | Truth, tolerance: int) -> Scores:
     """All scores of matches against a truth.
 
     Args:
-        truth: (Q,R) int64, every right place of each query, -1 as padding.
+        truth: (Q,R) int64, every right place of each query, -1 as padding; or a Truth. Queries of which
+            nothing is known, and queries that report a soft place, are left out, as if they were never
+            asked: of precision, of recall, and of the count of queries.
         tolerance: frames, inclusive.
 
     Raises:
-        InputError: a truth of another length than the matches, or a negative tolerance.
+        InputError: a truth of another length than the matches, a negative tolerance, or no query left
+            to judge.
+
+    Example:
+        >>> match = Match(torch.tensor([0, 7]), torch.tensor([0.1, 0.2]), torch.tensor([True, True]))
+        >>> judge(match, torch.tensor([[0], [1]]), tolerance=0).recall_at_1
+        0.5
+        >>> truth = Truth(torch.tensor([[0], [1]]), torch.tensor([True, True]), torch.tensor([[-1], [7]]))
+        >>> judge(match, truth, tolerance=0).recall_at_1
+        1.0
     """
-    every = curve_of(match, truth, tolerance, "all")
-    reported = curve_of(match, truth, tolerance, "reported")
-    right = is_right(match.index, truth, tolerance).sum().item()
+    match, truth = _judged(match, truth, tolerance)
+    right = is_right(match.index, truth.right, tolerance)
+    answerable = (truth.right >= 0).any(1)
+    every = pr_curve(match.score, right, answerable, "all")
+    reported = pr_curve(match.score, right, answerable, "reported")
     return Scores(
         area(every),
         area(reported),
         recall_at_full_precision(every),
         recall_at_full_precision(reported),
-        right / max(1, int((match.index >= 0).sum())),
-        right / max(1, int((truth >= 0).any(1).sum())),
+        int(right.sum()) / max(1, int((match.index >= 0).sum())),
+        int(right.sum()) / max(1, int(answerable.sum())),
     )
 
 
-def check_truth(match: Match, truth: Tensor, tolerance: int) -> None:
+def tally(match: Match, truth: Tensor | Truth, tolerance: int) -> dict[str, int]:
+    """How many queries there are, and how many of them the scores count; the keys are keys of report.json.
+
+    queries = judged + unknown + ignored: unknown to the truth, or ignored because a soft place is
+    reported. with_answer are those of the judged that have a right answer; accepted those that are
+    accepted; accepted_right those accepted in a right place.
+
+    Raises:
+        InputError: as `judge`.
+    """
+    kept, right = _judged(match, truth, tolerance)
+    good = is_right(kept.index, right.right, tolerance)
+    queries, judged, unknown = len(match.index), len(kept.index), int((~as_truth(truth).known).sum())
+    return {
+        "queries": queries,
+        "judged": judged,
+        "unknown": unknown,
+        "ignored": queries - judged - unknown,
+        "with_answer": int((right.right >= 0).any(1).sum()),
+        "accepted": int(kept.accepted.sum()),
+        "accepted_right": int((kept.accepted & good).sum()),
+    }
+
+
+def check_truth(match: Match, truth: Tensor | Truth, tolerance: int) -> None:
     """Refuse a truth that does not fit the matches."""
-    if truth.ndim != 2 or len(truth) != len(match.index):
-        raise InputError(
-            f"the truth is {tuple(truth.shape)}; expected ({len(match.index)}, R), a row a query"
-        )
+    right, *others = (truth,) if isinstance(truth, Tensor) else (truth.right, truth.known, truth.soft)
+    queries = len(match.index)
+    if right.ndim != 2 or len(right) != queries:
+        raise InputError(f"the truth is {tuple(right.shape)}; expected ({queries}, R), a row a query")
+    if others and (others[0].shape != (queries,) or others[1].ndim != 2 or len(others[1]) != queries):
+        shapes = " and ".join(str(tuple(other.shape)) for other in others)
+        raise InputError(f"known and soft places are {shapes}; expected ({queries},) and ({queries}, S)")
     if tolerance < 0:
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
+
+
+def _judged(match: Match, truth: Tensor | Truth, tolerance: int) -> tuple[Match, Truth]:
+    """Matches and truth of the queries that the scores count."""
+    check_truth(match, truth, tolerance)
+    truth = as_truth(truth)
+    kept = counted(match.index, truth, tolerance)
+    if not kept.any():
+        raise InputError(
+            f"of {len(kept)} queries {int(truth.known.sum())} are in the truth and none is left to judge; "
+            "expected at least one in the truth that does not report a soft place"
+        )
+    return Match(*(column[kept] for column in match)), Truth(*(column[kept] for column in truth))

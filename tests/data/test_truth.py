@@ -4,27 +4,26 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truth import find_truth, is_right, offset_truth, position_truth
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.data.truth import (
+    as_truth,
+    counted,
+    is_right,
+    near_truth,
+    offset_truth,
+    padded,
+    position_truth,
+)
+from dejavu_torch.types import Truth
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
 
 
-def route(length: int, place: list[float] | None = None) -> Traverse:
-    traverse = ArrayTraverse(torch.rand(length, 2))
-    traverse.place = None if place is None else torch.tensor(place, dtype=torch.float64)
-    return traverse
-
-
-def column(truth: Tensor | None) -> list[int]:
-    assert truth is not None
+def column(truth: Tensor) -> list[int]:
     assert (truth.ndim, truth.shape[1], truth.dtype) == (2, 1, torch.int64)
     return truth[:, 0].tolist()
 
@@ -33,6 +32,12 @@ def column(truth: Tensor | None) -> list[int]:
 def test_offset(queries: int, places: int, offset: int) -> None:
     expected = [i + offset if 0 <= i + offset < places else -1 for i in range(queries)]
     assert column(offset_truth(queries, places, offset)) == expected
+
+
+@given(st.lists(st.integers(0, 30), min_size=1, max_size=9), st.integers(-40, 40))
+def test_offset_of_numbered_queries_on_a_map_of_unknown_length(numbers: list[int], offset: int) -> None:
+    expected = [i + offset if i + offset >= 0 else -1 for i in numbers]
+    assert column(offset_truth(torch.tensor(numbers), None, offset)) == expected
 
 
 @given(POSITIONS, POSITIONS)
@@ -53,34 +58,6 @@ def test_position_beyond_the_route_has_no_right_place() -> None:
     assert column(position_truth(reference, query)) == [-1, 0, 2, 4, -1]
 
 
-@pytest.mark.parametrize(
-    ("truth", "reference", "query", "expected"),
-    [
-        ("0", route(3), route(3), [0, 1, 2]),
-        ("-1", route(3), route(3), [-1, 0, 1]),
-        ("+1", route(3), route(2), [1, 2]),
-        (None, route(3), route(3), [0, 1, 2]),
-        (None, route(3, [0, 1, 2]), route(2, [2, 1]), [2, 1]),
-        (None, route(3, [0, 1, 2]), route(3), [0, 1, 2]),
-        ("1", route(3, [0, 1, 2]), route(3, [2, 1, 0]), [1, 2, -1]),
-    ],
-)
-def test_what_a_command_was_given_or_can_know(
-    truth: str | None, reference: Traverse, query: Traverse, expected: list[int]
-) -> None:
-    assert column(find_truth(truth, reference, query, reference.length or 0, query.length or 0)) == expected
-
-
-def test_without_a_truth_other_lengths_give_none() -> None:
-    assert find_truth(None, route(3), route(4), 3, 4) is None
-
-
-@pytest.mark.parametrize("truth", ["x", "", "1.5", "truth.csv"])
-def test_text_that_is_no_truth_is_refused(truth: str) -> None:
-    with pytest.raises(InputError, match=r"\Atruth '[^\n]*expected an integer offset[^\n]*\Z"):
-        find_truth(truth, route(3), route(3), 3, 3)
-
-
 def test_convention_5_tolerance_is_inclusive() -> None:
     index = torch.tensor([4, 5, 10, 15, 16])
     assert is_right(index, torch.full((5, 1), 10), 5).tolist() == [False, True, True, True, False]
@@ -99,3 +76,58 @@ def test_any_right_place_will_do_and_minus_one_is_none(
     expected = [i >= 0 and any(t >= 0 and abs(i - t) <= tolerance for t in truth) for i, truth in rows]
     index, truth = torch.tensor([i for i, _ in rows]), torch.tensor([t for _, t in rows])
     assert is_right(index, truth, tolerance).tolist() == expected
+
+
+@given(st.lists(st.lists(st.integers(0, 9), max_size=4), min_size=1, max_size=8))
+def test_padded_holds_each_row_in_order(rows: list[list[int]]) -> None:
+    row = torch.tensor([i for i, places in enumerate(rows) for _ in places], dtype=torch.int64)
+    place = torch.tensor([p for places in rows for p in places], dtype=torch.int64)
+    table = padded(row, place, len(rows))
+    assert table.dtype == torch.int64
+    assert table.shape == (len(rows), max(map(len, rows)))
+    assert [[p for p in line if p >= 0] for line in table.tolist()] == rows
+    # the padding stands behind the places
+    assert [line[: len(places)] for line, places in zip(table.tolist(), rows, strict=True)] == rows
+
+
+POINTS = st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=12)
+
+
+@given(POINTS, POINTS, st.integers(0, 6))
+def test_near_is_every_frame_within_the_radius_inclusive(
+    reference: list[tuple[int, int]], query: list[tuple[int, int]], radius: int
+) -> None:
+    # UTM coordinates are large: float32 would not hold their metres
+    far = torch.tensor([500_000, 5_000_000], dtype=torch.float64)
+    found = near_truth(torch.tensor(reference) + far, torch.tensor(query) + far, radius)
+    expected = [
+        [i for i, (a, b) in enumerate(reference) if (a - x) ** 2 + (b - y) ** 2 <= radius**2]
+        for x, y in query
+    ]
+    assert [[place for place in row if place >= 0] for row in found.tolist()] == expected
+
+
+def test_near_needs_no_table_of_all_pairs(largest_tensor: type) -> None:
+    line = torch.stack([torch.arange(2500.0), torch.zeros(2500)], 1)
+    with largest_tensor() as seen:
+        found = near_truth(line, line, 0.0)
+    assert found.flatten().tolist() == list(range(2500))
+    assert seen.numel < 2500 * 2500 / 3
+
+
+def test_a_tensor_of_places_is_a_truth_in_which_all_is_known() -> None:
+    right = torch.tensor([[0, 1], [-1, -1]])
+    truth = as_truth(right)
+    assert torch.equal(truth.right, right)
+    assert truth.known.tolist() == [True, True]
+    assert truth.soft.shape == (2, 0)
+    assert as_truth(truth) is truth
+
+
+def test_a_soft_place_counts_neither_way_and_an_unknown_query_never() -> None:
+    """Right, wrong, soft, silent, soft but right by the tolerance, not known, not known though right."""
+    index = torch.tensor([10, 30, 20, -1, 11, 30, 10])
+    known = torch.tensor([True] * 5 + [False] * 2)
+    truth = Truth(torch.full((7, 1), 10), known, torch.tensor([[20, 11]] * 7))
+    assert counted(index, truth, 1).tolist() == [True, True, False, True, True, False, False]
+    assert counted(index, truth, 0).tolist() == [True, True, False, True, False, False, False]

@@ -9,6 +9,7 @@ from typing import Literal
 
 import pytest
 import torch
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -20,8 +21,9 @@ from dejavu_torch.evaluation.curves import (
     judge,
     pr_curve,
     recall_at_full_precision,
+    tally,
 )
-from dejavu_torch.types import InputError, Match, PRCurve
+from dejavu_torch.types import InputError, Match, PRCurve, Truth
 
 INF = float("inf")
 Recall = Literal["all", "reported"]
@@ -259,3 +261,88 @@ def test_a_truth_that_does_not_fit_is_refused(truth: Tensor) -> None:
 def test_a_negative_tolerance_is_refused() -> None:
     with pytest.raises(InputError, match=r"\Athe tolerance is -1; expected at least 0\Z"):
         judge(match_of([0, 1]), torch.zeros(2, 1).long(), -1)
+
+
+# what is not judged
+
+PLACE = st.integers(-1, 6)
+ASKED = st.lists(
+    st.tuples(
+        SCORE, PLACE, st.lists(PLACE, min_size=2, max_size=2), st.booleans(), st.lists(PLACE, min_size=1)
+    ),
+    min_size=1,
+    max_size=12,
+)
+
+
+@given(ASKED, st.integers(0, 2))
+def test_queries_that_are_not_counted_are_as_if_never_asked(
+    rows: list[tuple[float, int, list[int], bool, list[int]]], tolerance: int
+) -> None:
+    soft = [(row[4] * 12)[:3] for row in rows]
+    match = match_of([row[1] for row in rows], [row[0] for row in rows])
+    truth = Truth(
+        torch.tensor([row[2] for row in rows]), torch.tensor([row[3] for row in rows]), torch.tensor(soft)
+    )
+    kept = []
+    for i, (place, (_, _, right, known, _)) in enumerate(zip(match.index.tolist(), rows, strict=True)):
+        good = any(t >= 0 and abs(place - t) <= tolerance for t in right if place >= 0)
+        if known and (good or place < 0 or place not in soft[i]):
+            kept.append(i)
+    if not kept:
+        for judging in (judge, curve_of, tally):
+            with refused(f"of {len(rows)} queries", "none is left", "expected"):
+                judging(match, truth, tolerance)
+        return
+    rest, right = Match(*(column[kept] for column in match)), truth.right[kept]
+    assert judge(match, truth, tolerance) == judge(rest, right, tolerance)
+    for recall in ("all", "reported"):
+        left, expected = curve_of(match, truth, tolerance, recall), curve_of(rest, right, tolerance, recall)
+        assert points_of(left) == points_of(expected)
+    counts, rest_counts = tally(match, truth, tolerance), tally(rest, right, tolerance)
+    assert counts["queries"] == len(rows) == counts["judged"] + counts["unknown"] + counts["ignored"]
+    assert counts["unknown"] == sum(not row[3] for row in rows)
+    assert rest_counts["unknown"] == rest_counts["ignored"] == 0
+    for name in ("judged", "with_answer", "accepted", "accepted_right"):
+        assert counts[name] == rest_counts[name]
+
+
+def test_soft_places_and_unknown_queries_by_hand() -> None:
+    """Right, wrong, soft, unknown, silent with an answer, wrong without an answer and not accepted."""
+    match = match_of([10, 40, 20, 10, 0, 40], [1.0, 2.0, 0.5, 0.1, INF, 3.0])
+    match = match._replace(accepted=match.accepted & (match.score < 3))
+    right = torch.tensor([[10]] * 5 + [[-1]])
+    truth = Truth(right, torch.tensor([True] * 3 + [False] + [True] * 2), torch.tensor([[20]] * 6))
+    assert tally(match, truth, 5) == {
+        "queries": 6,
+        "judged": 4,
+        "unknown": 1,
+        "ignored": 1,
+        "with_answer": 3,
+        "accepted": 2,
+        "accepted_right": 1,
+    }
+    scores = judge(match, truth, 5)
+    assert scores.recall_at_1 == scores.recall_at_100_precision == pytest.approx(1 / 3)
+    assert scores.precision_at_100_recall == pytest.approx(1 / 3)
+    # the soft and the unknown query would else lead the curve
+    assert points_of(curve_of(match, truth, 5))[0] == (1.0, pytest.approx(1 / 3), 1.0)
+
+
+def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right() -> None:
+    truth = Truth(torch.tensor([[10]]), torch.tensor([True]), torch.tensor([[12]]))
+    assert judge(match_of([12]), truth, 2).recall_at_1 == 1.0
+    with refused("none is left"):
+        judge(match_of([12]), truth, 1)
+
+
+@pytest.mark.parametrize(
+    ("known", "soft"),
+    [((3,), (2, 0)), ((2, 1), (2, 0)), ((2,), (3, 1)), ((2,), (2,))],
+)
+def test_a_truth_whose_parts_do_not_fit_is_refused(known: tuple[int, ...], soft: tuple[int, ...]) -> None:
+    parts = torch.ones(known, dtype=torch.bool), torch.zeros(soft, dtype=torch.int64)
+    with refused("known and soft places are", "(2,) and (2, S)"):
+        judge(match_of([0, 1]), Truth(torch.zeros(2, 1).long(), *parts), 5)
+    with refused("the truth is (3, 1)", "(2, R)"):
+        judge(match_of([0, 1]), Truth(torch.zeros(3, 1).long(), *parts), 5)

@@ -1,0 +1,90 @@
+"""Judge matches that lie in a file, whatever method found them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+import dejavu_torch
+from dejavu_torch.data.truthfile import check_truth_text, find_truth
+from dejavu_torch.evaluation.curves import RECALL_DEFINITION, curve_of, judge, tally
+from dejavu_torch.evaluation.matches import read_matches
+from dejavu_torch.evaluation.plots import Picture, plot_coverage, plot_curves
+from dejavu_torch.evaluation.report import Contender, Report
+from dejavu_torch.types import InputError, Match, Traverse, Truth
+
+
+class Evaluation(NamedTuple):
+    """An evaluation's figures, what was judged, and its pictures; `queries` (Q,) is the number of each."""
+
+    report: Report
+    queries: Tensor
+    match: Match
+    truth: Truth
+    pictures: Mapping[str, Picture]
+
+
+def evaluate(
+    matches: Path,
+    truth: str | None,
+    tolerance: int = 5,
+    interpolate: bool = False,
+    reference: Traverse | None = None,
+    query: Traverse | None = None,
+) -> Evaluation:
+    """Scores and pictures of the matches in a csv.
+
+    Args:
+        matches: see `read_matches`.
+        truth: see `find_truth`; None needs both traverses.
+        tolerance: frames within which a place is right, inclusive.
+        interpolate: see `read_truth`.
+        reference, query: the traverses, where the truth lies in them; a reference also tells how many
+            places there are.
+
+    Raises:
+        InputError: matches or truth that cannot be read, do not fit each other, or leave nothing to judge.
+    """
+    if tolerance < 0:
+        raise InputError(f"the tolerance is {tolerance}; expected at least 0")
+    if truth is not None:
+        check_truth_text(truth, interpolate)
+    queries, match = read_matches(matches)
+    places = None if reference is None else reference.length
+    if places is not None and int(match.index.max()) >= places:
+        raise InputError(f"{matches} reports place {int(match.index.max())}; expected one below {places}")
+    known = find_truth(truth, reference, query, places, queries, interpolate)
+    if known is None:
+        raise InputError("there is no truth; expected one, or two traverses that carry their positions")
+    counts = tally(match, known, tolerance)
+    facts = counts | {
+        "accepted_precision": counts["accepted_right"] / counts["accepted"] if counts["accepted"] else None,
+        "tolerance": tolerance,
+        "recall_definition": RECALL_DEFINITION,
+        "matches": str(matches),
+        "truth": truth,
+        "version": dejavu_torch.__version__,
+        "torch": torch.__version__,
+    }
+    ours = Contender(matches.name, judge(match, known, tolerance))
+    seen = 1 + max(int(table.max()) for table in (match.index, known.right))
+    pictures = {
+        "pr": Picture(
+            plot_curves(
+                {matches.name: curve_of(match, known, tolerance)}, f"right within {tolerance} frames"
+            ),
+            "precision and recall",
+            "How many of the reported places are right, against how many of the queries are answered right, "
+            "as the threshold rises.",
+        ),
+        "coverage": Picture(
+            plot_coverage(match, known, tolerance, seen if places is None else places, queries),
+            "places reported",
+            "Where along the route each query was put. In its right place it is green, in a wrong one red.",
+        ),
+    }
+    return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)

@@ -1,0 +1,426 @@
+"""TRUTH as text: offset, csv, npz, and coordinates in image names."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from torch import Tensor
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.folder import ImageFolder
+from dejavu_torch.data.truth import is_right
+from dejavu_torch.data.truthfile import check_truth_text, find_truth, read_truth
+from dejavu_torch.types import InputError, Traverse, Truth
+
+
+def route(length: int, place: list[float] | None = None) -> Traverse:
+    traverse = ArrayTraverse(torch.rand(length, 2))
+    traverse.place = None if place is None else torch.tensor(place, dtype=torch.float64)
+    return traverse
+
+
+def sets(table: Tensor) -> list[set[int]]:
+    assert table.dtype == torch.int64
+    return [{place for place in row if place >= 0} for row in table.tolist()]
+
+
+def written(folder: Path, text: str | bytes) -> str:
+    path = folder / "truth.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return str(path)
+
+
+# offsets and what traverses carry
+
+
+@pytest.mark.parametrize(
+    ("truth", "reference", "query", "expected"),
+    [
+        ("0", route(3), route(3), [0, 1, 2]),
+        ("-1", route(3), route(3), [-1, 0, 1]),
+        ("+1", route(3), route(2), [1, 2]),
+        (None, route(3), route(3), [0, 1, 2]),
+        (None, route(3, [0, 1, 2]), route(2, [2, 1]), [2, 1]),
+        (None, route(3, [0, 1, 2]), route(3), [0, 1, 2]),
+        ("1", route(3, [0, 1, 2]), route(3, [2, 1, 0]), [1, 2, -1]),
+    ],
+)
+def test_what_a_command_was_given_or_can_know(
+    truth: str | None, reference: Traverse, query: Traverse, expected: list[int]
+) -> None:
+    found = find_truth(truth, reference, query, reference.length, query.length or 0)
+    assert found is not None
+    assert found.right[:, 0].tolist() == expected
+    assert found.known.all()
+    assert found.soft.shape == (query.length, 0)
+
+
+def test_without_a_truth_other_lengths_or_missing_traverses_give_none() -> None:
+    assert find_truth(None, route(3), route(4), 3, 4) is None
+    assert find_truth(None, None, route(3), 3, 3) is None
+    assert find_truth(None, route(3), None, None, torch.tensor([0])) is None
+
+
+def test_numbered_queries_get_their_own_rows() -> None:
+    numbers = torch.tensor([3, 0])
+    by_offset = find_truth("2", None, None, None, numbers)
+    by_position = find_truth(None, route(3, [0, 1, 2]), route(4, [2, 9, 9, 1]), 3, numbers)
+    by_length = find_truth(None, route(4), route(4), 4, numbers)
+    for found, expected in ((by_offset, [5, 2]), (by_position, [1, 2]), (by_length, [3, 0])):
+        assert found is not None
+        assert found.right[:, 0].tolist() == expected
+    with refused("query 3", "below 3"):
+        find_truth(None, route(3, [0, 1, 2]), route(3, [0, 1, 2]), 3, numbers)
+
+
+def test_an_offset_without_any_right_answer_is_refused() -> None:
+    with refused("truth 9", "from -3 to 4"):
+        read_truth("9", 5, 4)
+    with refused("truth -9", "from -8"):
+        read_truth("-9", None, torch.tensor([2, 8]))
+    assert read_truth("-8", None, torch.tensor([2, 8])).right.tolist() == [[-1], [0]]
+
+
+# any text
+
+
+@pytest.mark.parametrize(
+    "truth", ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" * 30, "truth.txt"]
+)
+def test_text_that_is_no_truth_is_refused(truth: str) -> None:
+    with refused(f"truth {truth!r}", "expected an integer offset", ".csv", ".npz", "utm:25"):
+        check_truth_text(truth)
+    with refused(repr(truth)):
+        find_truth(truth, route(3), route(3), 3, 3)
+    with refused(repr(truth)):
+        read_truth(truth, 3, 3)
+
+
+@pytest.mark.parametrize("name", ["none.csv", "none.npz", "none.CSV"])
+def test_a_file_that_is_not_there_is_refused_early(tmp_path: Path, name: str) -> None:
+    with refused(name, "No such file", "expected"):
+        check_truth_text(str(tmp_path / name))
+    (tmp_path / name).mkdir()
+    with refused(name, "directory"):
+        check_truth_text(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("truth", ["3", "utm", "utm:7.5"])
+def test_only_a_csv_can_be_interpolated(truth: str) -> None:
+    check_truth_text(truth)
+    with refused(truth, "interpolated", ".csv"):
+        check_truth_text(truth, interpolate=True)
+
+
+# csv
+
+LISTED = st.dictionaries(st.integers(0, 12), st.lists(st.integers(0, 9), max_size=3), min_size=1, max_size=9)
+TABLE = "query,place...\n0,4\n2,1,7\n3\n5,-1\n"
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("truth")
+
+
+def test_csv_by_hand(tmp_path: Path) -> None:
+    truth = read_truth(written(tmp_path, TABLE), 8, 7)
+    assert sets(truth.right) == [{4}, set(), {1, 7}, set(), set(), set(), set()]
+    assert truth.known.tolist() == [True, False, True, True, False, True, False]
+    assert truth.soft.shape == (7, 0)
+
+
+@given(LISTED, st.booleans(), st.lists(st.integers(0, 20), min_size=1, max_size=9, unique=True))
+def test_csv_holds_what_was_written(
+    scratch: Path, listed: dict[int, list[int]], header: bool, numbers: list[int]
+) -> None:
+    lines = [",".join(map(str, [query, *places])) for query, places in listed.items()]
+    path = written(scratch, "\n".join(["query,place", *lines] if header else lines))
+    wanted = [set(listed.get(query, [])) for query in numbers]
+    if not any(query in listed for query in numbers) or not any(wanted):
+        with refused("expected some" if not any(query in listed for query in numbers) else "no query"):
+            read_truth(path, 10, torch.tensor(numbers))
+        return
+    truth = read_truth(path, 10, torch.tensor(numbers))
+    assert sets(truth.right) == wanted
+    assert truth.known.tolist() == [query in listed for query in numbers]
+    assert truth.right.shape[1] == max(len(listed.get(query, [])) for query in numbers)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        TABLE.replace("\n", "\r\n"),
+        "\ufeff" + TABLE,
+        TABLE.replace("\n", "\n\n") + "\n , ,\n",
+        TABLE.replace(",", " , "),
+        TABLE.replace(",", ";"),
+        TABLE.replace(",", "\t"),
+        TABLE.replace(",", " "),
+        TABLE.replace("4", "4.0").replace("\n5", "\n5.0"),
+        TABLE.replace("0,4", "0,4,,,").replace("\n3", "\n3,,,"),
+        TABLE.split("\n", 1)[1],
+        '"query","place"\n"0","4"\n"2","1","7"\n"3"\n"5","-1"\n',
+        "3\n5\n2,1,7\n0,4",
+        TABLE.encode("utf-8").rstrip(b"\n"),
+    ],
+)
+def test_csv_is_read_leniently(tmp_path: Path, text: str | bytes) -> None:
+    expected = read_truth(written(tmp_path, TABLE), 8, 7)
+    truth = read_truth(written(tmp_path, text), 8, 7)
+    assert sets(truth.right) == sets(expected.right)
+    assert truth.known.tolist() == expected.known.tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("query,place\n0,1\n1,x\n", ("line 3", "'x'", "expected")),
+        ("0,1\n\n1,nan\n", ("line 3", "'nan'")),
+        ("0,1\n1,inf\n", ("line 2", "'inf'")),
+        ("0,1\n1,1e300\n", ("line 2", "'1e300'")),
+        ("query;place\n0;1,5\n", ("line 2", "'1,5'")),
+        ("0,1\n2,1\n0,3\n", ("line 3", "query 0", "twice")),
+        ("0,1\n-1,1\n", ("line 2", "query -1")),
+        ("0,1\n1.5,1\n", ("line 2", "query 1.5")),
+        ("0,1\n,5\n", ("line 2", "''")),
+        ("0,1\n1,8\n", ("line 2", "place 8", "0 to 7")),
+        ("0,1\n1,-2\n", ("line 2", "place -2", "-1 for none")),
+        ("0,1\n1,2.5\n", ("line 2", "place 2.5", "whole", "interpolation")),
+        ("x,1\n", ("line 1", "'x'")),
+        (",query,place\n0,0,1\n", ("line 1", ",query,place", "expected query,place")),
+        ("place,query\n0,1\n", ("line 1", "place,query")),
+        ("", ("lists no query",)),
+        ("query,place\n", ("lists no query",)),
+        ("7,1\n9,1\n", ("7 to 9", "0 to 6")),
+        ("0,-1\n1\n", ("no query has a right answer",)),
+        (b"\x89PNG\r\n\x1a\n", ("UTF-8", "query,place")),
+        (b"0,1\n\x00\x00", ("no text",)),
+    ],
+)
+def test_a_csv_that_is_none_is_refused(tmp_path: Path, text: str | bytes, words: tuple[str, ...]) -> None:
+    with refused("truth.csv", *words):
+        read_truth(written(tmp_path, text), 8, 7)
+
+
+def test_places_are_not_bounded_where_the_map_is_not_known(tmp_path: Path) -> None:
+    assert read_truth(written(tmp_path, "0,100000"), None, 1).right.tolist() == [[100000]]
+    with refused("place -3", "from 0,"):
+        read_truth(written(tmp_path, "0,-3"), None, 1)
+
+
+@given(st.dictionaries(st.integers(0, 30), st.integers(0, 60), min_size=1, max_size=6))
+def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
+    scratch: Path, listed: dict[int, int]
+) -> None:
+    path = written(scratch, "".join(f"{query},{place}\n" for query, place in listed.items()))
+    truth = read_truth(path, 61, 34, interpolate=True)
+    expected: dict[int, float] = dict(listed)
+    for a, b in pairwise(sorted(listed)):
+        expected |= {q: listed[a] + (listed[b] - listed[a]) * (q - a) / (b - a) for q in range(a, b)}
+    assert truth.known.tolist() == [query in expected for query in range(34)]
+    for query, found in enumerate(sets(truth.right)):
+        assert len(found) == (query in expected)
+        assert all(abs(place - expected[query]) <= 0.5 + 1e-9 for place in found)
+    assert all(sets(truth.right)[query] == {place} for query, place in listed.items())
+
+
+def test_interpolation_by_hand(tmp_path: Path) -> None:
+    path = written(tmp_path, "1,10\n5,12.4\n6,0\n")
+    truth = read_truth(path, 20, 8, interpolate=True)
+    assert truth.right[:, 0].tolist() == [-1, 10, 11, 11, 12, 12, 0, -1]
+    some = read_truth(path, 20, torch.tensor([5, 2]), interpolate=True)
+    assert some.right[:, 0].tolist() == [12, 11]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0,1\n1,2,3\n", ("line 2", "2 places", "one")),
+        ("0,1\n1\n", ("line 2", "0 places")),
+        ("0,1\n1,-1\n", ("line 2", "0 places")),
+        ("0,1\n1,7.5\n", ("line 2", "place 7.5", "0 to 7")),
+        ("40,1\n50,2\n", ("40 to 50", "0 to 6")),
+    ],
+)
+def test_a_csv_that_cannot_be_interpolated_is_refused(
+    tmp_path: Path, text: str, words: tuple[str, ...]
+) -> None:
+    with refused("truth.csv", *words):
+        read_truth(written(tmp_path, text), 8, 7, interpolate=True)
+
+
+def test_convention_5_the_tolerance_applies_on_top_of_listed_places(tmp_path: Path) -> None:
+    right = read_truth(written(tmp_path, "0,3,4\n1,3,4\n2,3,4\n3,3,4"), None, 4).right
+    index = torch.tensor([1, 2, 4, 5])
+    assert is_right(index, right, 0).tolist() == [False, False, True, False]
+    assert is_right(index, right, 1).tolist() == [False, True, True, True]
+
+
+# npz
+
+MATRIX = st.integers(1, 6).flatmap(
+    lambda places: st.integers(1, 6).flatmap(
+        lambda queries: st.lists(
+            st.lists(st.sampled_from(["hard", "soft", "both", ""]), min_size=queries, max_size=queries),
+            min_size=places,
+            max_size=places,
+        )
+    )
+)
+
+
+def saved(folder: Path, **arrays: np.ndarray) -> str:
+    path = folder / "truth.npz"
+    np.savez(path, **arrays)
+    return str(path)
+
+
+@given(MATRIX, st.sampled_from([bool, np.uint8, np.float64]))
+def test_npz_rows_are_places_and_columns_queries(scratch: Path, cells: list[list[str]], dtype: type) -> None:
+    hard = np.array([[cell in ("hard", "both") for cell in row] for row in cells])
+    soft = np.array([[cell in ("soft", "both") for cell in row] for row in cells])
+    places, queries = hard.shape
+    path = saved(scratch, GThard=hard.astype(dtype), GTsoft=soft.astype(dtype), other=np.zeros(3))
+    if not hard.any():
+        with refused("no query has a right answer"):
+            read_truth(path, places, queries)
+        return
+    truth = read_truth(path, places, queries)
+    assert sets(truth.right) == [{i for i in range(places) if hard[i, q]} for q in range(queries)]
+    # what is right is not soft
+    assert sets(truth.soft) == [{i for i in range(places) if cells[i][q] == "soft"} for q in range(queries)]
+    assert truth.known.all()
+    turned = read_truth(path, places, torch.arange(queries).flip(0))
+    assert sets(turned.right) == sets(truth.right)[::-1]
+    assert sets(turned.soft) == sets(truth.soft)[::-1]
+
+
+def test_npz_with_one_matrix_only(tmp_path: Path) -> None:
+    matrix = np.array([[True, False], [True, False], [False, True]])
+    for name in ("GThard", "GTsoft"):
+        truth = read_truth(saved(tmp_path, **{name: matrix}), 3, 2)
+        assert sets(truth.right) == [{0, 1}, {2}]
+        assert truth.soft.shape == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "places", "queries", "words"),
+    [
+        ((3, 2), 2, 3, ("(3, 2)", "(2, 3)", "transposed it fits")),
+        ((3, 2), None, 3, ("(3, 2)", "(places, 3)", "transposed it fits")),
+        ((3, 5), None, torch.tensor([0, 2]), ("(3, 5)", "(places, 3)")),
+        ((3, 2), None, torch.tensor([0, 2]), ("transposed it fits",)),
+        ((4, 4), 3, 4, ("(4, 4)", "(3, 4)")),
+        ((3, 4), 3, 5, ("(3, 4)", "(3, 5)")),
+        ((3, 6), 3, 5, ("(3, 6)", "(3, 5)")),
+        ((3,), 3, 1, ("(3,)", "a column a query")),
+    ],
+)
+def test_a_matrix_that_does_not_fit_is_refused(
+    tmp_path: Path, shape: tuple[int, ...], places: int | None, queries: int | Tensor, words: tuple[str, ...]
+) -> None:
+    with refused("truth.npz: GThard", *words):
+        read_truth(saved(tmp_path, GThard=np.ones(shape, dtype=bool)), places, queries)
+
+
+def test_only_what_fits_transposed_is_called_so(tmp_path: Path) -> None:
+    path = saved(tmp_path, GThard=np.ones((3, 4), dtype=bool))
+    with pytest.raises(InputError) as caught:
+        read_truth(path, 5, 6)
+    assert "transposed it fits" not in str(caught.value)
+
+
+def test_some_queries_of_a_larger_matrix(tmp_path: Path) -> None:
+    path = saved(tmp_path, GThard=np.eye(4, 9, dtype=bool))
+    assert sets(read_truth(path, None, torch.tensor([6, 1, 2])).right) == [set(), {1}, {2}]
+
+
+def test_other_npz_files_are_refused(tmp_path: Path) -> None:
+    square = np.eye(3, dtype=bool)
+    with refused("truth.npz", "holds gt, S", "GThard"):
+        read_truth(saved(tmp_path, gt=square, S=square), 3, 3)
+    with refused("differ in shape"):
+        read_truth(saved(tmp_path, GThard=square, GTsoft=np.ones((2, 3))), None, 3)
+    with refused("no whole .npz"):
+        read_truth(saved(tmp_path, GThard=np.array([[{}]], dtype=object)), 1, 1)
+    with refused("GThard", "<U1"):
+        read_truth(saved(tmp_path, GThard=np.array([["1"]])), 1, 1)
+    path = Path(saved(tmp_path, GThard=square))
+    whole = path.read_bytes()
+    for data in (whole[: len(whole) // 2], b"", b"query,place\n"):
+        path.write_bytes(data)
+        with refused("truth.npz", "no whole .npz", "GThard"):
+            read_truth(str(path), 3, 3)
+    with path.open("wb") as file:
+        np.save(file, square)
+    with refused("no whole .npz"):
+        read_truth(str(path), 3, 3)
+
+
+# coordinates in image names
+
+
+def images(folder: Path, points: list[tuple[float, float]]) -> ImageFolder:
+    folder.mkdir()
+    for i, (east, north) in enumerate(points):
+        Image.new("L", (2, 2)).save(folder / f"{i:03}@{east:.2f}@{north:.2f}@33@T@@@.png")
+    return ImageFolder(folder)
+
+
+def test_utm_makes_every_reference_frame_near_by_right(tmp_path: Path) -> None:
+    reference = images(tmp_path / "a", [(500_000 + 10 * i, 4_000_000) for i in range(8)])
+    query = images(tmp_path / "b", [(500_030, 4_000_000), (500_000, 4_000_025), (500_000, 4_000_026)])
+    expected = [{1, 2, 3, 4, 5}, {0}, set()]
+    for text in ("utm", "utm:25"):
+        truth = find_truth(text, reference, query, 8, 3)
+        assert truth is not None
+        assert sets(truth.right) == expected
+        assert truth.known.all()
+    near = find_truth("utm:10", reference, query, 8, torch.tensor([2, 0]))
+    assert near is not None
+    assert sets(near.right) == [set(), {2, 3, 4}]
+    with refused("no query has a right answer", "within 1 m"):
+        find_truth("utm:1", reference, query, 8, torch.tensor([2, 1]))
+
+
+def test_utm_needs_two_folders_of_images_with_coordinates(tmp_path: Path) -> None:
+    good = images(tmp_path / "a", [(1, 2)])
+    (tmp_path / "b").mkdir()
+    for name in ("1.png", "@1@.png", "@x@3@.png"):
+        Image.new("L", (2, 2)).save(tmp_path / "b" / name)
+        with refused(name, "@easting@northing@"):
+            find_truth("utm", good, ImageFolder(tmp_path / "b"), 1, 1)
+        (tmp_path / "b" / name).unlink()
+    with refused("no image names", "folders of images"):
+        find_truth("utm", route(1), good, 1, 1)
+    for lacking in (lambda: find_truth("utm", good, None, 1, 1), lambda: read_truth("utm", 1, 1)):
+        with refused("truth utm", "both traverses"):
+            lacking()
+    with refused("query 1", "below 1"):
+        find_truth("utm", good, good, 1, torch.tensor([1]))
+
+
+# real data
+
+
+def test_the_corridor_truth(data_dir: Path) -> None:
+    truth = read_truth(str(data_dir / "corridor" / "truth.csv"), 111, 111)
+    assert isinstance(truth, Truth)
+    assert truth.known.all()
+    found = sets(truth.right)
+    assert found[0] == {0, 1, 2}
+    assert found[110] == {108, 109, 110}
+    assert all(found)
+    # a slow camera: right places follow each other without gaps, and never go far back
+    assert all(max(places) - min(places) == len(places) - 1 for places in found)
+    assert math.isclose(sum(min(places) for places in found) / 111, 53, abs_tol=3)

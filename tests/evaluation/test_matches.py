@@ -1,0 +1,130 @@
+"""Matches in a csv: what is written is read, and what others write too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch.evaluation.matches import read_matches, write_matches
+from dejavu_torch.types import Match
+
+INF = float("inf")
+ROWS = st.lists(
+    st.tuples(
+        st.integers(0, 2**40), st.floats(width=32, allow_nan=False, allow_infinity=False), st.booleans()
+    ),
+    min_size=1,
+    max_size=12,
+)
+PLAIN = "query,place,score,accepted\n0,7,0.5,1\n1,-1,inf,0\n2,3,-2,0\n"
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("matches")
+
+
+def written(folder: Path, text: str | bytes) -> Path:
+    path = folder / "matches.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def told(path: Path) -> list[tuple[int, int, float, bool]]:
+    """The rows that were read, by query."""
+    queries, match = read_matches(path)
+    assert [queries.dtype, match.index.dtype, match.score.dtype] == [torch.int64, torch.int64, torch.float64]
+    assert match.accepted.dtype == torch.bool
+    columns = (queries, *match)
+    return sorted(zip(*(column.tolist() for column in columns), strict=True))
+
+
+@given(ROWS, st.integers(1, 5))
+def test_what_is_written_in_parts_is_read(
+    scratch: Path, rows: list[tuple[int, float, bool]], size: int
+) -> None:
+    index, score, accepted = (torch.tensor(column) for column in zip(*rows, strict=True))
+    score = score.float()
+    silent = index % 5 == 0
+    match = Match(torch.where(silent, -1, index), torch.where(silent, torch.inf, score), accepted & ~silent)
+    parts = zip(*(column.split(size) for column in match), strict=True)
+    path = scratch / "m.csv"
+    assert write_matches(path, (Match(*part) for part in parts)) == (len(rows), int(match.accepted.sum()))
+    queries, read = read_matches(path)
+    assert queries.tolist() == list(range(len(rows)))
+    assert torch.equal(read.index, match.index)
+    assert torch.equal(read.accepted, match.accepted)
+    # nine digits hold every float32
+    assert torch.equal(read.score.float(), match.score)
+
+
+def test_by_hand(tmp_path: Path) -> None:
+    assert told(written(tmp_path, PLAIN)) == [(0, 7, 0.5, True), (1, -1, INF, False), (2, 3, -2.0, False)]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        PLAIN.replace("\n", "\r\n"),
+        "\ufeff" + PLAIN,
+        PLAIN.replace("\n", "\n\n"),
+        PLAIN.replace(",", " , "),
+        PLAIN.replace("0,7,", "0.0,7.0,").replace("query", "Query"),
+        PLAIN.replace(",1\n", ",True\n").replace(",0\n", ",false\n"),
+        "name,accepted,score,place,query\nc,0,-2,3,2\na,1,0.5,7,0\nb,0,inf,-1,1\n",
+        'query,place,score,accepted,note\n0,7,0.5,1,"a, b"\n1,-1,Infinity,0,\n2,3,-2,0,x,y\n',
+    ],
+)
+def test_other_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
+    assert told(written(tmp_path, text)) == told(written(tmp_path, PLAIN))
+
+
+def test_without_the_column_every_finite_score_is_accepted(tmp_path: Path) -> None:
+    path = written(tmp_path, "query,place,score\n5,1,0.25\n3,2,inf\n4,-1,0.5\n")
+    assert told(path) == [(3, -1, INF, False), (4, -1, INF, False), (5, 1, 0.25, True)]
+
+
+def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path: Path) -> None:
+    path = written(tmp_path, "query,place,score,accepted\n0,-1,0.5,1\n1,4,inf,1\n")
+    assert told(path) == [(0, -1, INF, False), (1, -1, INF, False)]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("query,score\n0,1\n", ("line 1", "no column place", "query,place,score")),
+        ("0,7,0.5,1\n", ("line 1", "no column query")),
+        ("\nplace,query,x\n", ("line 2", "no column score")),
+        (PLAIN + "3,x,1,1\n", ("line 5", "place is 'x'", "at least -1")),
+        (PLAIN + "3,1.5,1,1\n", ("line 5", "place is '1.5'")),
+        (PLAIN + "3,-2,1,1\n", ("line 5", "place is '-2'")),
+        (PLAIN + "\n-1,1,1,1\n", ("line 6", "query is '-1'", "at least 0")),
+        (PLAIN + "1e99,1,1,1\n", ("line 5", "query is '1e99'")),
+        (PLAIN + "3,1,nan,1\n", ("line 5", "score is 'nan'")),
+        (PLAIN + "3,1,-inf,1\n", ("line 5", "score is '-inf'")),
+        (PLAIN + "3,1,,1\n", ("line 5", "score is ''")),
+        (PLAIN + "3,1,0.5,2\n", ("line 5", "accepted is '2'", "1 or 0")),
+        (PLAIN + "3,1,0.5\n", ("line 5", "3 cells", "expected 4")),
+        (PLAIN + "0,1,0.5,1\n", ("line 5", "query 0", "twice")),
+        (PLAIN + "3," + "1" * 200_000 + ",1,1\n", ("line 5", "field larger")),
+        ("query,place,score\n", ("no matches",)),
+        ("", ("no matches",)),
+        (b"\x89PNG\r\n\x1a\n", ("UTF-8",)),
+        (b"query,place,score\n\x00", ("no text",)),
+    ],
+)
+def test_what_cannot_be_read_is_refused(tmp_path: Path, text: str | bytes, words: tuple[str, ...]) -> None:
+    with refused("matches.csv", *words):
+        read_matches(written(tmp_path, text))
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with refused("none.csv", "No such file", "query,place,score"):
+        read_matches(tmp_path / "none.csv")
+    with refused("directory"):
+        read_matches(tmp_path)

@@ -1,0 +1,204 @@
+"""Matches in a file, judged: the same figures as in memory, for every kind of truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import Fixed, refused
+from PIL import Image
+
+from dejavu_torch import DejaVu, FrequencyLayer, ImageFolder, Match
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.curves import RECALL_DEFINITION, judge
+from dejavu_torch.evaluation.matches import write_matches
+from dejavu_torch.evaluation.report import score_table, text_table, write_report
+from dejavu_torch.experiments.evaluate import Evaluation, evaluate
+from dejavu_torch.types import Truth
+
+HEADER = "query,place,score,accepted\n"
+# right, right but far, wrong, silent, accepted though wrong
+MATCHES = HEADER + "0,0,0.1,1\n1,4,0.2,1\n2,50,0.3,0\n3,-1,inf,0\n4,30,0.4,1\n"
+
+
+def written(folder: Path, text: str, name: str = "matches.csv") -> Path:
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def scores_of(result: Evaluation) -> dict[str, float]:
+    assert result.report.ours.scores is not None
+    return result.report.ours.scores._asdict()
+
+
+def found(path: Path) -> Match:
+    """What a small map makes of noisy queries, some of which nothing covers."""
+    features = torch.rand(96, 8)
+    model = DejaVu(periods=Fixed(FrequencyLayer(24, 24, 0, 60, (0, 1, 2, 3))))
+    match = model.learn(ArrayTraverse(features)).localize(ArrayTraverse(features + 0.1 * torch.rand(96, 8)))
+    silent = torch.arange(96) % 7 == 0
+    match = Match(
+        torch.where(silent, -1, match.index),
+        torch.where(silent, torch.inf, match.score),
+        match.accepted & ~silent & (match.score < match.score.median()),
+    )
+    write_matches(path, [match])
+    return match
+
+
+def test_the_file_gives_the_scores_of_the_matches_in_memory(tmp_path: Path) -> None:
+    match = found(tmp_path / "m.csv")
+    right = torch.arange(96)[:, None]
+    result = evaluate(tmp_path / "m.csv", "0", tolerance=3)
+    assert result.report.ours.scores == judge(match, right, 3)
+    assert 0 < scores_of(result)["recall_at_1"] < 1
+    assert 0 < scores_of(result)["auc"] < 1
+    # and so does a table of the same places, and a matrix
+    table = written(tmp_path, "".join(f"{i},{i}\n" for i in range(96)), "truth.csv")
+    np.savez(tmp_path / "truth.npz", GThard=np.eye(96, dtype=bool))
+    for truth in (table, tmp_path / "truth.npz"):
+        assert evaluate(tmp_path / "m.csv", str(truth), tolerance=3).report.ours.scores == judge(
+            match, right, 3
+        )
+
+
+def test_facts_by_hand(tmp_path: Path) -> None:
+    path = written(tmp_path, MATCHES)
+    facts = evaluate(path, "0", tolerance=3).report.facts
+    expected = {"queries": 5, "judged": 5, "unknown": 0, "ignored": 0, "with_answer": 5, "accepted": 3}
+    assert {name: facts[name] for name in expected} == expected
+    assert (facts["accepted_right"], facts["accepted_precision"]) == (2, pytest.approx(2 / 3))
+    assert (facts["tolerance"], facts["recall_definition"]) == (3, RECALL_DEFINITION)
+    assert (facts["matches"], facts["truth"]) == (str(path), "0")
+    assert {"version", "torch"} <= facts.keys()
+    # the tolerance is inclusive, and decides over query 1
+    assert evaluate(path, "0", tolerance=2).report.facts["accepted_right"] == 1
+    assert evaluate(path, "0", tolerance=0).report.facts["accepted_right"] == 1
+
+
+def test_queries_the_truth_does_not_know_are_left_out(tmp_path: Path) -> None:
+    path, truth = written(tmp_path, MATCHES), written(tmp_path, "1,4\n2,2\n9,9\n", "truth.csv")
+    result = evaluate(path, str(truth), tolerance=0)
+    facts = result.report.facts
+    assert [facts[k] for k in ("queries", "judged", "unknown", "accepted", "accepted_right")] == [
+        5,
+        2,
+        3,
+        1,
+        1,
+    ]
+    assert scores_of(result)["recall_at_1"] == 0.5
+    between = evaluate(path, str(truth), tolerance=0, interpolate=True).report.facts
+    assert [between[k] for k in ("judged", "unknown")] == [4, 1]
+
+
+def test_soft_places_count_neither_way(tmp_path: Path) -> None:
+    path = written(tmp_path, MATCHES)
+    hard = np.eye(60, 5, dtype=bool)
+    soft = hard.copy()
+    soft[50, 2] = soft[4, 1] = True
+    np.savez(tmp_path / "gt.npz", GThard=hard, GTsoft=soft)
+    facts = evaluate(path, str(tmp_path / "gt.npz"), tolerance=0).report.facts
+    assert [facts[k] for k in ("judged", "ignored", "accepted", "accepted_right")] == [3, 2, 2, 1]
+    # within the tolerance of a right place a soft one is right
+    assert evaluate(path, str(tmp_path / "gt.npz"), tolerance=3).report.facts["ignored"] == 1
+
+
+def test_numbered_queries_in_any_order(tmp_path: Path) -> None:
+    path = written(tmp_path, HEADER + "40,41,0.5,1\n10,11,0.1,1\n20,7,0.9,1\n")
+    result = evaluate(path, "1", tolerance=0)
+    assert result.queries.tolist() == [40, 10, 20]
+    assert result.truth.right[:, 0].tolist() == [41, 11, 21]
+    assert scores_of(result)["recall_at_1"] == pytest.approx(2 / 3)
+    assert scores_of(result)["recall_at_100_precision"] == pytest.approx(2 / 3)
+
+
+def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
+    reference, query = tmp_path / "reference", tmp_path / "query"
+    for folder, easts in ((reference, range(0, 600, 10)), (query, (0, 40, 20, 30, 300))):
+        folder.mkdir()
+        for i, east in enumerate(easts):
+            Image.new("L", (2, 2)).save(folder / f"{i}@{east}@0@.png")
+    path = written(tmp_path, MATCHES)
+    pair = {"reference": ImageFolder(reference), "query": ImageFolder(query)}
+    facts = evaluate(path, "utm:5", tolerance=0, **pair).report.facts
+    assert (facts["with_answer"], facts["accepted_right"]) == (5, 3)
+    with refused("utm", "both traverses"):
+        evaluate(path, "utm:5")
+    stored, seen = ArrayTraverse(torch.rand(60, 2)), ArrayTraverse(torch.rand(5, 2))
+    with refused("no truth"):
+        evaluate(path, None, reference=stored, query=seen)
+    stored.place, seen.place = torch.arange(60.0), torch.tensor([0.0, 4.2, 2.0, 3.0, 30.0])
+    assert evaluate(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, MATCHES)
+    with refused("tolerance is -1"):
+        evaluate(path, "0", tolerance=-1)
+    with refused("'maybe'"):
+        evaluate(tmp_path / "none.csv", "maybe")  # the text first: it costs nothing
+    with refused("no truth"):
+        evaluate(path, None)
+    with refused("place 50", "below 20"):
+        evaluate(path, "0", reference=ArrayTraverse(torch.rand(20, 2)))
+    np.savez(tmp_path / "gt.npz", GThard=np.eye(60, 4, dtype=bool))
+    with refused("GThard is (60, 4)", "(places, 5)"):
+        evaluate(path, str(tmp_path / "gt.npz"))
+    only = written(tmp_path, HEADER + "0,7,0.5,1\n", "one.csv")
+    soft = np.ones((9, 1), dtype=bool)
+    np.savez(tmp_path / "gt.npz", GThard=np.eye(9, 1, dtype=bool), GTsoft=soft)
+    with refused("none is left to judge"):
+        evaluate(only, str(tmp_path / "gt.npz"))
+
+
+def test_report_of_an_evaluation(tmp_path: Path) -> None:
+    truth = written(tmp_path, "0,0\n1,1\n2,2\n4,4\n", "truth.csv")
+    result = evaluate(written(tmp_path, MATCHES), str(truth), tolerance=3)
+    out = tmp_path / "out"
+    out.mkdir()
+    write_report(out, result.report, result.pictures, "matches <judged>", "dejavu evaluate matches.csv")
+    told = json.loads((out / "report.json").read_text())
+    assert told == result.report.as_json()
+    assert told["judged"] == 4
+    assert told["recall_at_1"] == scores_of(result)["recall_at_1"]
+    page = (out / "index.html").read_text()
+    for text in (
+        "matches &lt;judged&gt;",
+        "5 queries; right within 3 frames. 4 of the queries are in the truth. ",
+        "Of 4 judged 3 are accepted, 2 rightly.",
+        "<pre>dejavu evaluate matches.csv",
+        "precision and recall</h2>",
+        "In its right place it is green",
+    ):
+        assert text in page
+    # nothing was learnt, and nothing stands beside it
+    for text in ("Learning", "the map", "Null", "bytes", "None"):
+        assert text not in page
+    assert page.count("data:image/png;base64,") == 2
+    assert {file.name for file in out.iterdir()} == {"report.json", "index.html", "pr.png", "coverage.png"}
+    assert "matches.csv" in text_table(score_table(result.report))
+
+
+def test_a_silent_method_has_a_report_too(tmp_path: Path) -> None:
+    result = evaluate(written(tmp_path, HEADER + "0,-1,inf,0\n1,-1,inf,0\n"), "0")
+    assert set(scores_of(result).values()) == {0.0}
+    assert result.report.facts["accepted_precision"] is None
+    write_report(tmp_path, result.report, result.pictures, "silent", "")
+
+
+def test_corridor(tmp_path: Path, data_dir: Path) -> None:
+    """Matches on the diagonal of two passes, judged by the places that were listed by hand."""
+    path = tmp_path / "m.csv"
+    write_matches(path, [Match(torch.arange(111), torch.arange(111.0), torch.ones(111) > 0)])
+    result = evaluate(path, str(data_dir / "corridor" / "truth.csv"), tolerance=0)
+    assert isinstance(result.truth, Truth)
+    assert result.report.facts["judged"] == result.report.facts["with_answer"] == 111
+    rows = (data_dir / "corridor" / "truth.csv").read_text().split("\n")[1:112]
+    listed = [[int(cell) for cell in row.split(",")] for row in rows]
+    right = sum(query in places for query, *places in listed)
+    assert result.report.facts["accepted_right"] == right
+    assert scores_of(result)["recall_at_1"] == pytest.approx(right / 111)
