@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from dejavu_torch import DejaVu
-from dejavu_torch.cli import MODEL, build_parser
+from dejavu_torch.cli.parser import MODEL, build_parser
 from dejavu_torch.database.mapfile import recipe_of
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -125,7 +125,10 @@ def test_a_wrong_arrow_is_caught(file: str, source: str) -> None:
         ),
         ("data/simulate/aerial.py", "from .paint import Canvas\nfrom ..strip import read_strip"),
         ("model.py", "from .data import arrays\nfrom . import types"),
-        ("cli.py", "from dejavu_torch import __version__\nfrom dejavu_torch.experiments import compare"),
+        (
+            "cli/parser.py",
+            "from dejavu_torch import model\nfrom dejavu_torch.experiments import compare",
+        ),
         ("types.py", "import dejavu_torch_other\nfrom torch import cli"),
     ],
 )

@@ -35,7 +35,7 @@ def test_every_linked_file_is_there() -> None:
 
 
 def test_every_command_shown_is_understood() -> None:
-    from dejavu_torch.cli import build_parser
+    from dejavu_torch.cli.parser import build_parser
 
     shown = re.findall(r"^(dejavu .*?)(?:\s+#.*)?$", README, re.MULTILINE)
     assert len(shown) >= 4

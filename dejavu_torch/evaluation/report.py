@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import base64
-import csv
 import html
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from dejavu_torch.data.files import whole_file
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import Plot
-from dejavu_torch.types import Match
+from dejavu_torch.evaluation.plots import Picture
 
 
 class Contender(NamedTuple):
@@ -35,8 +33,10 @@ class Contender(NamedTuple):
 class Report(NamedTuple):
     """Everything report.json holds.
 
-    ours: the map's scores, which stand at top level. contenders: entries by key, such as
-    `uncompressed`. facts: the other top-level keys, such as `frames` and `map_bytes`.
+    ours: the scores that are reported, which stand at top level. contenders: entries by key, such as
+    `uncompressed`, that they stand beside; there may be none. facts: the other top-level keys, of which
+    `queries`, `tolerance`, `recall_definition`, `version` and `torch` must be there; the page tells of
+    others, such as `frames` and `seconds_learn`, only where they are.
     """
 
     ours: Contender
@@ -51,40 +51,31 @@ class Report(NamedTuple):
 
 
 def write_report(
-    folder: Path, report: Report, pictures: Mapping[str, Plot], title: str, command: str, plan: str
+    folder: Path,
+    report: Report,
+    pictures: Mapping[str, Picture],
+    title: str,
+    command: str,
+    plan: str | None = None,
 ) -> None:
     """Write report.json, one PNG for each picture, and index.html with all of it inside.
 
     Args:
-        pictures: file name without ending -> (figure, axes).
-        plan: the plan and certificate in lines.
+        pictures: by file name without ending.
+        title: heading of the page. command: what made it.
+        plan: the plan and certificate in lines; None where there is no map.
     """
-    images = {}
-    for name, (figure, _) in pictures.items():
+    shown = []
+    for name, picture in pictures.items():
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png")
-        images[name] = buffer.getvalue()
+        picture.plot[0].savefig(buffer, format="png")
+        shown.append(_picture(picture, buffer.getvalue()))
         with whole_file(folder / f"{name}.png") as temporary:
-            temporary.write_bytes(images[name])
+            temporary.write_bytes(buffer.getvalue())
     with whole_file(folder / "index.html") as temporary:
-        temporary.write_text(_page(report, images, title, command, plan), encoding="utf-8")
+        temporary.write_text(_page(report, "".join(shown), title, command, plan), encoding="utf-8")
     with whole_file(folder / "report.json") as temporary:
         temporary.write_text(json.dumps(report.as_json(), indent=1) + "\n", encoding="utf-8")
-
-
-def write_matches(path: Path, matches: Iterable[Match]) -> tuple[int, int]:
-    """Write query,place,score,accepted for matches that come in parts; (queries, accepted) written."""
-    total = accepted = 0
-    with whole_file(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["query", "place", "score", "accepted"])
-        for match in matches:
-            rows = zip(match.index.tolist(), match.score.tolist(), match.accepted.tolist(), strict=True)
-            for place, score, good in rows:
-                writer.writerow([total, place, f"{score:.9g}", int(good)])
-                total += 1
-                accepted += good
-    return total, accepted
 
 
 _COLUMNS = {
@@ -98,21 +89,15 @@ _COLUMNS = {
 
 
 def score_table(report: Report) -> list[list[str]]:
-    """The scores as rows of text, the header first."""
-    places = max(1, report.facts["frames"])
-    rows = [["", *_COLUMNS.values(), "bytes", "per place"]]
+    """The scores as rows of text, the header first; bytes only where the number of frames is known."""
+    frames = report.facts.get("frames")
+    rows = [["", *_COLUMNS.values(), *(["bytes", "per place"] if frames else [])]]
     for contender in (report.ours, *report.contenders.values()):
-        s = contender.scores
-        size = [f"{contender.bytes}", f"{contender.bytes / places:.1f}"] if contender.bytes else ["", ""]
-        figures = [getattr(s, field) for field in _COLUMNS] if s else []
-        rows.append(
-            [
-                contender.name,
-                *(f"{value:.3f}" for value in figures),
-                *[""] * (len(_COLUMNS) - len(figures)),
-                *size,
-            ]
-        )
+        s, size = contender.scores, contender.bytes
+        row = [contender.name, *(f"{getattr(s, field):.3f}" if s else "" for field in _COLUMNS)]
+        if frames:
+            row += [f"{size}", f"{size / frames:.1f}"] if size else ["", ""]
+        rows.append(row)
     return rows
 
 
@@ -128,19 +113,37 @@ def text_table(rows: list[list[str]]) -> str:
     )
 
 
-_HEADINGS = {
-    "pr": "precision and recall",
-    "coverage": "places reported",
-    "chunks": "periods found along the route",
-    "activations": "two layers and their fusion",
-}
+def summary(report: Report) -> str:
+    """What was judged, in a few sentences: those that the facts can tell."""
+    facts = report.facts
+    places = f" on {facts['frames']} places" if "frames" in facts else ""
+    right = f"right within {facts['tolerance']} frames"
+    scored = right if report.ours.scores else "no truth was given, so nothing is scored"
+    told = [f"{facts['queries']} queries{places}; {scored}"]
+    if facts.get("unknown"):
+        told.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")
+    if facts.get("ignored"):
+        told.append(f"{facts['ignored']} report a place that counts neither as right nor as wrong")
+    if "accepted_right" in facts:
+        told.append(
+            f"Of {facts['judged']} judged {facts['accepted']} are accepted, {facts['accepted_right']} rightly"
+        )
+    if "seconds_learn" in facts:
+        told.append(
+            f"Learning took {facts['seconds_learn']:.1f} s, localizing {facts['seconds_localize']:.1f} s"
+        )
+    return ". ".join(told) + "."
+
 
 _NOTE = """
 R@100P: recall at 100 % precision; P@100R: precision when every query reports; rep.: the second definition of
-recall. A curve starts at its first threshold: matches that all have one score enclose no area. Null controls
-learn from the reference in shuffled order, where nothing repeats. The first seeks the periods anew, and
-reports nothing where no frequency passes the test for noise. The second keeps this map's layers: what it
-recognises comes from how much the map stores, not from periods.
+recall. A curve starts at its first threshold: matches that all have one score enclose no area.
+"""
+
+_NULL_NOTE = """
+Null controls learn from the reference in shuffled order, where nothing repeats. The first seeks the periods
+anew, and reports nothing where no frequency passes the test for noise. The second keeps this map's layers:
+what it recognises comes from how much the map stores, not from periods.
 """
 
 _STYLE = """
@@ -150,35 +153,37 @@ div.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tab
 td,th{padding:.25rem .5rem;font-size:.9rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
 td:first-child,th:first-child{text-align:left}tr.ours{background:#eaf2fb;font-weight:600}
 img{max-width:100%;height:auto}pre{background:#f6f6f6;padding:.7rem;white-space:pre-wrap;font-size:.85rem}
-p.note{color:#555;font-size:.9rem}
+p.note,figcaption{color:#555;font-size:.9rem}figure{margin:0}
 """
 
 
-def _page(report: Report, images: Mapping[str, bytes], title: str, command: str, plan: str) -> str:
+def _page(report: Report, pictures: str, title: str, command: str, plan: str | None) -> str:
     head, *rows = score_table(report)
     facts = report.facts
     table = _row("th", head) + "".join(
         _row("td", row, " class=ours" if j == 0 else "") for j, row in enumerate(rows)
     )
-    pictures = "".join(
-        f'<h2>{_HEADINGS.get(name, name)}</h2><img alt="{_HEADINGS.get(name, name)}" '
-        f'src="data:image/png;base64,{base64.b64encode(data).decode()}">'
-        for name, data in images.items()
-    )
-    right = f"right within {facts['tolerance']} frames."
-    scored = right if report.ours.scores else "no truth was given, so nothing is scored."
+    note = _NOTE + (_NULL_NOTE if "null" in report.contenders else "")
     return f"""<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width,initial-scale=1"><title>{html.escape(title)}</title>
 <style>{_STYLE}</style><h1>{html.escape(title)}</h1>
-<p>{facts["queries"]} queries on {facts["frames"]} places; {scored}
-Learning took {facts["seconds_learn"]:.1f} s, localizing {facts["seconds_localize"]:.1f} s.</p>
+<p>{html.escape(summary(report))}</p>
 <div class="wide"><table>{table}</table></div>
-<p class="note">recall = {html.escape(facts["recall_definition"])}. {_NOTE}</p>
-<h2>the map</h2><pre>{html.escape(plan)}</pre>
+<p class="note">recall = {html.escape(facts["recall_definition"])}. {note}</p>
+{"" if plan is None else f"<h2>the map</h2><pre>{html.escape(plan)}</pre>"}
 {pictures}
 <h2>made by</h2><pre>{html.escape(command)}
 dejavu_torch {html.escape(str(facts["version"]))}, torch {html.escape(str(facts["torch"]))}</pre></html>
 """
+
+
+def _picture(picture: Picture, png: bytes) -> str:
+    heading = html.escape(picture.heading)
+    data = base64.b64encode(png).decode()
+    return (
+        f'<h2>{heading}</h2><figure><img alt="{heading}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
+    )
 
 
 def _row(tag: str, cells: list[str], attributes: str = "") -> str:

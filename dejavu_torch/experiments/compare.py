@@ -7,19 +7,21 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.truth import find_truth, read_offset
+from dejavu_torch.data.truth import as_truth, counted
+from dejavu_torch.data.truthfile import check_truth_text, find_truth
 from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
-from dejavu_torch.evaluation.curves import RECALL_DEFINITION, curve_of, judge
-from dejavu_torch.evaluation.plots import Plot, plot_activations, plot_chunks, plot_coverage, plot_curves
+from dejavu_torch.evaluation.curves import RECALL_DEFINITION, judge, tally
+from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Contender, Report
+from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import frame_shape
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.distance import phase_distances
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.periods.stft import BACKEND
+from dejavu_torch.recognition.l1 import l1_backend
+from dejavu_torch.types import InputError, Match, Traverse, Truth
 
 
 class Comparison(NamedTuple):
@@ -28,7 +30,7 @@ class Comparison(NamedTuple):
     report: Report
     match: Match
     model: DejaVu
-    pictures: Mapping[str, Plot]
+    pictures: Mapping[str, Picture]
 
 
 def compare(
@@ -39,6 +41,7 @@ def compare(
     tolerance: int = 5,
     leave_out: int | None = None,
     seed: int = 0,
+    interpolate: bool = False,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and judge that against what else could be stored.
@@ -51,6 +54,7 @@ def compare(
         leave_out: also query the reference with itself, leaving out this many frames to each side of
             the query from every mean; a diagnostic.
         seed: of the shuffle of the null control.
+        interpolate: see `read_truth`.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -58,8 +62,12 @@ def compare(
     """
     if tolerance < 0 or (leave_out is not None and leave_out < 0):
         raise InputError(f"tolerance is {tolerance}, leave_out {leave_out}; expected at least 0")
-    if truth is not None:
-        read_offset(truth)  # before the long work
+    known = None
+    early = reference.length is not None and query.length is not None
+    if early:  # a truth that does not fit is told before the long work
+        known = find_truth(truth, reference, query, reference.length, query.length or 0, interpolate)
+    elif truth is not None:
+        check_truth_text(truth, interpolate)
     model = DejaVu() if model is None else model
     began = time.perf_counter()
     stored = model.extract_all(reference, "learning" if progress else None)
@@ -70,7 +78,8 @@ def compare(
     match = model.localize(seen)
     localized = time.perf_counter()
 
-    right = find_truth(truth, reference, query, len(stored), len(seen))
+    if not early:
+        known = find_truth(truth, reference, query, len(stored), len(seen), interpolate)
     itemsize = model.map.templates.element_size()
     size = model.map_bytes
     frames, dimension = stored.shape
@@ -93,14 +102,15 @@ def compare(
         found["leave_out"] = (f"reference on itself, +-{leave_out} left out", itself, None)
 
     def contender(
-        name: str, match: Match, truth: Tensor | None, bytes: int | None, k: int | None
+        name: str, match: Match, truth: Truth | None, bytes: int | None, k: int | None
     ) -> Contender:
-        return Contender(name, None if truth is None else judge(match, truth, tolerance), bytes, k)
+        judged = truth is not None and bool(counted(match.index, truth, tolerance).any())
+        return Contender(name, judge(match, truth, tolerance) if truth and judged else None, bytes, k)
 
     contenders = {}
     for key, (name, other, stride) in found.items():
         bytes = None if stride is None else stride_bytes(frames, dimension, itemsize, stride)
-        own = torch.arange(len(stored))[:, None] if key == "leave_out" else right
+        own = as_truth(torch.arange(len(stored))[:, None]) if key == "leave_out" else known
         contenders[key] = contender(name, other, own, bytes, stride)
 
     plan = model.map.plan
@@ -124,86 +134,20 @@ def compare(
         "seconds_learn": learnt - began,
         "seconds_localize": localized - learnt,
         "accepted": int(match.accepted.sum()),
+        "l1_backend": l1_backend(),
+        "spectrogram_backend": BACKEND,
         "threshold": model.threshold,
         "reference": reference.name,
         "query": query.name,
         "version": dejavu_torch.__version__,
         "torch": torch.__version__,
     }
-    ours = contender("this map", match, right, size, None)
-    pictures = _pictures(model, reference, seen, match, right, tolerance, found)
+    if known is not None:
+        facts |= tally(match, known, tolerance)
+    ours = contender("this map", match, known, size, None)
+    pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, found)
+    facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     return Comparison(Report(ours, contenders, facts), match, model, pictures)
-
-
-def _pictures(
-    model: DejaVu,
-    reference: Traverse,
-    seen: Tensor,
-    match: Match,
-    truth: Tensor | None,
-    tolerance: int,
-    found: Mapping[str, tuple[str, Match, int | None]],
-) -> dict[str, Plot]:
-    pictures = {}
-    if truth is not None:
-        curves = {"this map": curve_of(match, truth, tolerance)}
-        for key, (name, other, _) in found.items():
-            if key != "leave_out":  # it has other queries
-                curves[name] = curve_of(other, truth, tolerance)
-        pictures["pr"] = plot_curves(curves, f"right within {tolerance} frames")
-    pictures["coverage"] = plot_coverage(match, truth, tolerance, model.map.places)
-    pictures["chunks"] = plot_chunks(model.map.plan, model.map.places)
-    drawn = draw_activations(model, reference, seen, truth)
-    return pictures | ({"activations": drawn} if drawn else {})
-
-
-def draw_activations(model: DejaVu, reference: Traverse, seen: Tensor, truth: Tensor | None) -> Plot | None:
-    """Two layers of one chunk answering one query, and their fusion; None where no chunk has two layers.
-
-    The longest chunk, its two layers of most features, and the query whose right place is nearest to
-    the chunk's middle (without truth: the middle query).
-    """
-    plan = model.map.plan
-    groups = {
-        (p.start, p.stop): [j for j, q in enumerate(plan) if (q.start, q.stop) == (p.start, p.stop)]
-        for p in plan
-    }
-    groups = {chunk: members for chunk, members in groups.items() if len(members) > 1}
-    if not groups:
-        return None
-    start, stop = max(groups, key=lambda chunk: (chunk[1] - chunk[0], -chunk[0]))
-    chosen = sorted(groups[start, stop], key=lambda j: -len(plan[j].features))[:2]
-    query, places = len(seen) // 2, []
-    if truth is not None:
-        apart = torch.where(truth >= 0, (truth - (start + stop) / 2).abs(), torch.inf).amin(1)
-        query = int(apart.argmin())
-        places = [place for place in truth[query].tolist() if start <= place < stop]
-    one = seen[query : query + 1]
-    blocks, features = model.map.blocks(), model.map.layer_features()
-    scores = [
-        phase_distances(one[:, features[j]], blocks[j], model.matcher.metric)[0, plan[j].place_phases].cpu()
-        for j in chosen
-    ]
-    with torch.no_grad():
-        fused = model.matcher(one, model.map)[0, start:stop].cpu()
-    strip = slit_scan(reference, start, stop)
-    return plot_activations([plan[j] for j in chosen], scores, fused, query, places, strip)
-
-
-def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:
-    """The middle image column of each of the frames [start, stop), side by side: (C,H,stop - start).
-
-    None where the traverse holds features.
-    """
-    columns: list[Tensor] = []
-    seen = 0
-    for batch in traverse.batches(64):
-        if batch.ndim == 2 or seen >= stop:
-            break
-        middle = batch[max(0, start - seen) : stop - seen, ..., batch.shape[-1] // 2]
-        columns.append(middle.clone())  # a view would keep the whole frames
-        seen += len(batch)
-    return torch.cat(columns).permute(1, 2, 0).float() if columns else None
 
 
 def _plain(period: object) -> int | float:

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dejavu_torch import ArrayTraverse, DejaVu, InputError, SlidingWindow, SpectrogramAnalysis
-from dejavu_torch.experiments.compare import compare, draw_activations, slit_scan
+from dejavu_torch import ArrayTraverse, DejaVu, InputError, SpectrogramAnalysis
+from dejavu_torch.experiments.compare import compare
 
 
 def route(seed: int, frames: int = 240) -> torch.Tensor:
@@ -28,7 +28,9 @@ def test_scores_of_a_route_that_repeats(model: DejaVu) -> None:
     # lcm(12, 20) = 60: of four places that look alike the first is reported
     assert report["recall_at_1"] == pytest.approx(60 / 240, abs=0.15)
     assert report["uncompressed"]["bytes"] == 240 * 60 * 4
-    assert set(result.pictures) == {"pr", "coverage", "chunks", "activations"}
+    pictures = {"pr", "auc", "coverage", "chunks", "spectrogram", "templates", "activations"}
+    assert set(result.pictures) == pictures
+    assert 0 <= report["activations"]["fused"]["inside"] <= 1
 
 
 def test_leave_out_is_printed_beside_never_instead(model: DejaVu) -> None:
@@ -53,12 +55,6 @@ def test_refuses_a_negative_tolerance(model: DejaVu) -> None:
         compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model, tolerance=-1)
 
 
-def test_slit_scan_holds_no_more_than_it_shows() -> None:
-    frames = torch.rand(300, 1, 16, 16)
-    scan = slit_scan(ArrayTraverse(frames), 10, 290)
-    assert scan.untyped_storage().nbytes() <= 2 * 280 * 16 * 4
-
-
 def test_a_callable_metric() -> None:
     model = DejaVu(periods=SpectrogramAnalysis(window=240), metric=torch.cdist)
     result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model)
@@ -68,15 +64,3 @@ def test_a_callable_metric() -> None:
 def test_a_truth_without_any_right_answer_is_refused(model: DejaVu) -> None:
     with pytest.raises(InputError, match="no query has a right answer"):
         compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "1000", model)
-
-
-def test_slit_scan_of_a_sliding_window_is_the_strip() -> None:
-    strip = torch.rand(3, 8, 200)
-    scan = slit_scan(SlidingWindow(strip, width=10), 20, 120)
-    assert torch.equal(scan, strip[:, :, 25:125])
-    assert slit_scan(ArrayTraverse(route(0)), 0, 10) is None
-
-
-def test_no_activations_where_no_chunk_has_two_layers() -> None:
-    model = DejaVu(periods=SpectrogramAnalysis(window=240, strongest=1)).learn(torch.zeros(240, 3))
-    assert draw_activations(model, ArrayTraverse(torch.zeros(240, 3)), torch.zeros(240, 3), None) is None

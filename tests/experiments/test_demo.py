@@ -14,6 +14,7 @@ from dejavu_torch import DejaVu
 from dejavu_torch.cli import main
 
 README = Path(__file__).parents[2] / "README.md"
+PICTURES = ("pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations")
 SCORES = {
     "auc",
     "auc_reported",
@@ -74,7 +75,7 @@ def test_map_bytes_is_the_size_of_the_file(demo: Path, report: dict[str, Any]) -
 
 
 def test_pictures_show_something(demo: Path) -> None:
-    for name in ("pr", "coverage", "chunks", "activations"):
+    for name in PICTURES:
         with Image.open(demo / f"{name}.png") as image:
             assert min(image.size) > 300
             assert len(image.convert("RGB").resize((100, 100)).getcolors(10_000)) > 20
@@ -82,7 +83,7 @@ def test_pictures_show_something(demo: Path) -> None:
 
 def test_page_is_self_contained(demo: Path) -> None:
     page = (demo / "index.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 8
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "right within 5 frames" in page
     assert "null: all learnt shuffled" in page

@@ -1,0 +1,66 @@
+"""`dejavu`: every stage as a command."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NoReturn
+
+from dejavu_torch.cli import commands
+from dejavu_torch.cli.parser import MODEL, UsageError, build_parser
+from dejavu_torch.model import DejaVu
+from dejavu_torch.types import InputError
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": commands.run_demo,
+    "learn": commands.run_learn,
+    "localize": commands.run_localize,
+    "compare": commands.run_compare,
+    "evaluate": commands.run_evaluate,
+    "bench": commands.run_bench,
+    "info": commands.run_info,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the `dejavu` command."""
+    logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:  # so that temporary files are removed
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    parser = build_parser()
+    try:
+        parsed = parser.parse_args(given)
+        if parsed.command is None:
+            parser.print_help()
+            raise SystemExit(2)
+        chosen = parser.instantiate(parsed)[parsed.command].as_dict()
+        chosen.pop("config", None)
+        if parsed.command in ("demo", "learn", "compare"):
+            chosen["model"] = DejaVu(**{name: chosen.pop(name) for name in MODEL})
+        if parsed.command in ("demo", "compare", "evaluate"):
+            chosen["command"] = shlex.join(["dejavu", *given])
+        COMMANDS[parsed.command](**chosen)
+    except UsageError as error:
+        config = [value for name, value in pairwise(given) if name == "--config"]
+        fail(f"{error} (with --config {config[0]})" if config else f"{error} (see --help)")
+    except (InputError, OSError) as error:
+        fail(str(error))
+    except ValueError as error:  # a constructor's own refusal arrives wrapped
+        cause = error.__cause__ or error.__context__
+        if not isinstance(cause, InputError):
+            raise
+        fail(str(cause))
+    except KeyboardInterrupt:
+        print("dejavu: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def fail(message: str) -> NoReturn:
+    """One line on stderr, exit status 2."""
+    print(f"dejavu: {' '.join(message.split())}", file=sys.stderr)
+    raise SystemExit(2)

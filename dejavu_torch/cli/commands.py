@@ -1,0 +1,120 @@
+"""What the commands do: each a thin skin over functions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from dejavu_torch.data.files import check_output_file, make_output_folder
+from dejavu_torch.data.source import open_source
+from dejavu_torch.database.certificate import describe
+from dejavu_torch.evaluation.matches import write_matches
+from dejavu_torch.evaluation.report import Report, score_table, summary, text_table, write_report
+from dejavu_torch.experiments import bench
+from dejavu_torch.experiments.compare import Comparison, compare
+from dejavu_torch.experiments.evaluate import evaluate
+from dejavu_torch.model import DejaVu
+from dejavu_torch.periods.stft import BACKEND
+from dejavu_torch.recognition.l1 import l1_backend
+
+
+def run_demo(out: Path, seed: int, model: DejaVu, command: str) -> None:
+    """The main job on the built-in route."""
+    make_output_folder(out)
+    reference = open_source(f"sim:aerial?seed={seed}")
+    query = open_source(f"sim:aerial?seed={seed}&traverse=1")
+    print(f"learning {reference.name}, then finding {query.name} on it")
+    result = compare(reference, query, model=model, progress=True)
+    _publish(result, out, "dejavu demo: the built-in route", command, save_map=True)
+
+
+def run_learn(source: str, map: Path, model: DejaVu) -> None:
+    """Learn a map and print its plan."""
+    check_output_file(map)
+    model.learn(open_source(source), progress=True)
+    model.save(map)
+    _print_plan(model)
+
+
+def run_localize(map: Path, source: str, out: Path, threshold: float | None, features: Any) -> None:
+    """Find the frames of a source on a map; one csv row each."""
+    check_output_file(out)
+    model = DejaVu.load(map, features)
+    model.threshold = model.threshold if threshold is None else threshold
+    if model.threshold is None:
+        print("no threshold given or stored in the map: every query with a finite score is accepted")
+    queries, accepted = write_matches(out, model.matches(open_source(source), progress=True))
+    print(f"{queries} queries, {accepted} accepted; written to {out}")
+
+
+def run_compare(
+    reference: str,
+    query: str,
+    truth: str | None,
+    tolerance: int,
+    interpolate: bool,
+    leave_out: int | None,
+    out: Path,
+    model: DejaVu,
+    command: str,
+) -> None:
+    """Learn, localize and judge; report beside baselines and null control."""
+    pair = open_source(reference), open_source(query)
+    make_output_folder(out)
+    result = compare(*pair, truth, model, tolerance, leave_out, interpolate=interpolate, progress=True)
+    _publish(result, out, f"{query} found on {reference}", command)
+
+
+def run_evaluate(
+    matches: Path,
+    truth: str,
+    tolerance: int,
+    interpolate: bool,
+    reference: str | None,
+    query: str | None,
+    out: Path,
+    command: str,
+) -> None:
+    """Judge the matches in a csv, whatever found them."""
+    pair = [None if source is None else open_source(source) for source in (reference, query)]
+    make_output_folder(out)
+    result = evaluate(matches, truth, tolerance, interpolate, *pair)
+    write_report(out, result.report, result.pictures, f"{matches} judged by {truth}", command)
+    _print_scores(result.report, out)
+
+
+def run_info(map: Path, features: Any) -> None:
+    """Tell what is in a map."""
+    model = DejaVu.load(map, features)
+    _print_plan(model)
+    for part in (model.preprocess, model.features, model.periods, model.matcher):
+        print(f"{type(part).__name__}: {part.extra_repr()}")
+    print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
+
+
+def run_bench(what: str, out: Path) -> None:
+    """Time this package beside what a user would pick instead."""
+    print(text_table(bench.bench_table(bench.run_bench(what, out))))
+    print(f"x ours: seconds / those of the fastest dejavu; written to {out / 'bench.json'}")
+
+
+def _print_plan(model: DejaVu) -> None:
+    if not model.map.plan:
+        print("this route does not repeat")
+    print(describe(model.certificate))
+
+
+def _publish(result: Comparison, out: Path, title: str, command: str, save_map: bool = False) -> None:
+    _print_plan(result.model)
+    if result.report.ours.scores is None:
+        print("the traverses differ in length and no --truth was given: matches and pictures, no scores")
+    write_matches(out / "matches.csv", [result.match])
+    if save_map:
+        result.model.save(out / "map.safetensors")
+    write_report(out, result.report, result.pictures, title, command, describe(result.model.certificate))
+    _print_scores(result.report, out)
+
+
+def _print_scores(report: Report, out: Path) -> None:
+    print(text_table(score_table(report)))
+    print(f"{summary(report)} Report: {out / 'index.html'}")

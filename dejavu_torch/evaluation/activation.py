@@ -1,0 +1,126 @@
+"""How often single layers, and their fusion, answer with the right phase (figure 17 of the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.truth import counted, is_right
+from dejavu_torch.types import FrequencyLayer, Truth
+
+
+class Rate(NamedTuple):
+    """Share of right answers among queries inside and outside a chunk, and by chance.
+
+    None where there are no such queries.
+    """
+
+    inside: float | None
+    outside: float | None
+    chance: float
+
+    def describe(self) -> str:
+        """In words.
+
+        Example:
+            >>> Rate(0.912, None, 0.064).describe()
+            'right 91 %, by chance 6 %'
+        """
+        here = "" if self.inside is None else f"{self.inside:.0%}"
+        elsewhere = "" if self.outside is None else f"{self.outside:.0%} elsewhere"
+        between = " here, " if here and elsewhere else ""
+        chance = f"{self.chance:.{int(self.chance < 0.01)}%}"
+        return f"right {here}{between}{elsewhere}, by chance {chance}".replace("%", " %")
+
+
+class ActivationRates(NamedTuple):
+    """Rates of the layers of the chunk [start, stop), and of all layers fused."""
+
+    start: int
+    stop: int
+    layers: tuple[Rate, ...]
+    fused: Rate
+
+    def as_json(self) -> dict[str, Any]:
+        """An entry of report.json."""
+        return self._asdict() | {
+            "layers": [rate._asdict() for rate in self.layers],
+            "fused": self.fused._asdict(),
+        }
+
+
+def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int) -> Tensor:
+    """Whether the best phase of each query is the phase of any of these places, within the tolerance.
+
+    Shape: best (Q,) int64, places (Q,R) int64 with -1 as padding -> (Q,) bool.
+
+    Convention: the distance of two phases is counted around the cycle, in frames, and may be at most
+        the tolerance. Phases count from absolute frame 0, so a place outside the layer's chunk has
+        the phase it would have if the layer went on.
+
+    Example:
+        >>> from fractions import Fraction
+        >>> layer = FrequencyLayer(Fraction(10), 10, 0, 40, (0,))
+        >>> in_phase(layer, torch.tensor([9, 9]), torch.tensor([[21], [25]]), tolerance=2).tolist()
+        [True, False]
+    """
+    apart = (best[:, None] - layer.phase(places)).abs()
+    apart = torch.minimum(apart, layer.phases - apart)
+    return ((apart <= _phases_within(layer, tolerance)) & (places >= 0)).any(1)
+
+
+def activation_rates(
+    layers: Sequence[FrequencyLayer],
+    best: Sequence[Tensor],
+    index: Tensor,
+    truth: Truth,
+    tolerance: int,
+    places: int,
+) -> ActivationRates:
+    """How often each of some layers of one chunk answers in phase, and how often the map is right.
+
+    A query of known truth is *inside* where one of its right places lies in the chunk, *outside*
+    where it has right places but none in the chunk.
+
+    For a layer, the rate is the share of the queries whose best phase (argmin over k of eq. 3) is
+    within the tolerance of the phase of a right place (`in_phase`): inside, a right place in the
+    chunk; outside, any, with the phase it would have if the layer went on. Outside the layer learnt
+    nothing: a rate near chance says that its period ends with the chunk, or slips there; a rate as
+    inside, that it goes on. Chance is the share of phases within the tolerance of any one phase,
+    (2 * tolerance + 1) / period where phases = period, at most 1.
+
+    For the fusion, the rate is the share of the queries whose reported place is right within the
+    tolerance; outside, that is the work of the layers of other chunks. Chance is
+    (2 * tolerance + 1) / places, at most 1.
+
+    Args:
+        layers: layers of one chunk. best: for each (Q,) the best phase of each query.
+        index: (Q,) the place reported when all layers are fused.
+        tolerance: frames, inclusive. places: N.
+    """
+    start, stop = layers[0].start, layers[0].stop
+    right = torch.where(truth.known[:, None], truth.right, -1)
+    here = torch.where((right >= start) & (right < stop), right, -1)
+    inside = (here >= 0).any(1)
+    outside = (right >= 0).any(1) & ~inside
+    rates = []
+    for layer, phase in zip(layers, best, strict=True):
+        near, far = (in_phase(layer, phase, which, tolerance) for which in (here, right))
+        chance = min(1.0, (2 * _phases_within(layer, tolerance) + 1) / layer.phases)
+        rates.append(Rate(_share(near, inside), _share(far, outside), chance))
+    found = is_right(index, right, tolerance)
+    judged = counted(index, truth, tolerance)
+    chance = min(1.0, (2 * tolerance + 1) / places)
+    fused = Rate(_share(found, inside & judged), _share(found, outside & judged), chance)
+    return ActivationRates(start, stop, tuple(rates), fused)
+
+
+def _phases_within(layer: FrequencyLayer, tolerance: int) -> int:
+    return int(tolerance * layer.phases / layer.period)
+
+
+def _share(right: Tensor, among: Tensor) -> float | None:
+    return float(right[among].double().mean()) if among.any() else None

@@ -1,0 +1,237 @@
+"""Pictures of single features: through time, folded, and on a frame; each returns (figure, axes)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from matplotlib.collections import LineCollection
+from matplotlib.colors import PowerNorm
+from torch import Tensor
+
+from dejavu_torch.evaluation.plots import (
+    BLUE,
+    DARK,
+    GREY,
+    LABELLED,
+    LAYERS,
+    ORANGE,
+    WIDTH,
+    Plot,
+    canvas,
+    period_axis,
+)
+from dejavu_torch.periods.spectrogram import Spectrum
+from dejavu_torch.types import FrequencyLayer, InputError
+
+ROWS, CYCLES = 64, 100  # drawn at most
+_BESIDE = {  # a number next to a mark, readable on any colour
+    "textcoords": "offset points",
+    "va": "center",
+    "fontsize": 9,
+    "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.8},
+}
+_DOTS = 4000  # along a picture; a longer line is drawn as the range it covers
+
+
+class HogParts(NamedTuple):
+    """What each feature of a HOG vector looks at.
+
+    block_row, block_column: its block. cell_row, cell_column: its cell, counted over the whole image.
+    orientation: its bin; bin o holds gradients of about (o + 1/2) * 180 / orientations degrees.
+    """
+
+    block_row: Tensor
+    block_column: Tensor
+    cell_row: Tensor
+    cell_column: Tensor
+    orientation: Tensor
+
+
+def hog_parts(
+    features: Tensor, size: tuple[int, int], orientations: int = 9, cell: int = 8, block: int = 2
+) -> HogParts:
+    """Take feature indices of `hog` apart.
+
+    Args:
+        features: indices. size: (height, width) of the frames that HOG saw, in pixels, after its resize.
+        orientations, cell, block: as HOG has them.
+
+    Shape: (F,) int64 -> five of (F,) int64.
+
+    Raises:
+        InputError: an index that HOG of such frames does not have.
+
+    Example:
+        >>> hog_parts(torch.tensor([0, 1763]), (64, 64))
+        HogParts(block_row=tensor([0, 6]), block_column=tensor([0, 6]), cell_row=tensor([0, 7]),
+            cell_column=tensor([0, 7]), orientation=tensor([0, 8]))
+    """
+    rows, columns = (max(0, pixels // cell - block + 1) for pixels in size)
+    shape = (rows, columns, block, block, orientations)
+    if len(features) and not 0 <= int(features.min()) <= int(features.max()) < math.prod(shape):
+        raise InputError(
+            f"got features {int(features.min())}..{int(features.max())}; HOG of frames of {size[0]} x "
+            f"{size[1]} pixels has {math.prod(shape)}"
+        )
+    row, column, down, right, orientation = torch.unravel_index(features, shape)
+    return HogParts(row, column, row + down, column + right, orientation)
+
+
+def edges_seen(
+    features: Tensor, size: tuple[int, int], orientations: int = 9, cell: int = 8, block: int = 2
+) -> tuple[Tensor, Tensor]:
+    """The edges that HOG features respond to, as line segments, and how many of the features share each.
+
+    Args: as `hog_parts`.
+
+    Shape: (F,) -> (E,2,2) end points (x, y) in pixels, where (0, 0) is the middle of the first pixel;
+        (E,) int64, in how many (overlapping) blocks the features have this cell and orientation.
+
+    Convention: an edge lies across its gradient, through the middle of its cell.
+    """
+    _, _, row, column, orientation = hog_parts(features, size, orientations, cell, block)
+    distinct, count = torch.stack([row, column, orientation], 1).unique(dim=0, return_counts=True)
+    middle = (distinct[:, :2].flip(1) + 0.5) * cell - 0.5
+    angle = (distinct[:, 2] + 0.5) * math.pi / orientations  # of the gradient, from x towards y
+    along = torch.stack([-angle.sin(), angle.cos()], 1) * (0.45 * cell)
+    return torch.stack([middle - along, middle + along], 1), count
+
+
+def plot_spectrogram(
+    values: Tensor,
+    spectra: Sequence[Spectrum],
+    kept: Sequence[Sequence[float]],
+    shortest: float = 2,
+    feature: int = 0,
+) -> Plot:
+    """One feature through time, and its spectrogram, a column a chunk (figure 3 of the paper).
+
+    Args:
+        values: (N,) the feature. spectra: its spectrum in each chunk, power (K,1).
+        kept: for each chunk the periods kept, in frames; they are marked.
+        shortest: the shortest period shown, frames.
+        feature: its number.
+
+    Convention: where chunks overlap, each column ends where the next begins.
+    """
+    figure, (above, below) = canvas(5.4, 2, sharex=True, height_ratios=(1, 1.7))
+    if len(values) > _DOTS:
+        step = -(-len(values) // (_DOTS // 2))
+        low, high = zip(*((float(part.min()), float(part.max())) for part in values.split(step)), strict=True)
+        above.fill_between(range(0, len(values), step), low, high, color=DARK, linewidth=0.5)
+    else:
+        above.plot(values, color=DARK, linewidth=0.7)
+    above.set_title(f"feature {feature} through time", loc="left", fontsize=10)
+    above.set(ylabel="value")
+    shares = [(power[2:] / power[1:].sum()).nan_to_num() for _, _, power in spectra]
+    strongest = max(float(share.max()) for share in shares)
+    norm = PowerNorm(0.5, 0, max(strongest, 1e-6) * 100)
+    ends = [*(spectrum.start for spectrum in spectra[1:]), spectra[-1].stop]
+    mesh: Any = None
+    for (start, stop, _), share, end, periods in zip(spectra, shares, ends, kept, strict=True):
+        right = min(stop, end)
+        borders = (stop - start) / (torch.arange(len(share) + 1) + 1.5)  # between two bins
+        mesh = below.pcolormesh([start, right], borders.numpy(), share.numpy() * 100, norm=norm, cmap="Blues")
+        for axis in (above, below):
+            axis.axvline(start, color=GREY, linewidth=0.8, linestyle=":")
+        for period in periods:
+            middle = (start + right) / 2
+            size = 11 if len(spectra) <= LABELLED else 3
+            below.plot(middle, period, "o", color=ORANGE, markersize=size, markerfacecolor="none")
+            if len(spectra) <= LABELLED:
+                below.annotate(f"{period:.4g}", (middle, period), (10, 0), **_BESIDE)
+    figure.colorbar(mesh, ax=below, label="% of its power", pad=0.01, aspect=30)
+    period_axis(below, shortest, max((stop - start) / 1.5 for start, stop, _ in spectra))
+    below.set(xlim=(0, len(values)), xlabel="place (reference frame)")
+    below.set_title("power at each period, chunk by chunk; circles: kept", loc="left", fontsize=10)
+    return figure, (above, below)
+
+
+def plot_templates(layer: FrequencyLayer, values: Tensor, templates: Tensor, chosen: int) -> Plot:
+    """The frames of equal phase averaged into templates (figure 4 of the paper).
+
+    Args:
+        layer: its features and period.
+        values: (n,) one feature at the frames of the layer's chunk.
+        templates: (P,F) of the layer.
+        chosen: position of that feature among the layer's.
+
+    Convention: of more than 100 cycles every k-th is drawn. Of more than 64 features those are drawn that
+        vary most from phase to phase; rows are ordered by where in the cycle they are high, each from
+        its lowest (white) to its highest (dark).
+    """
+    figure, (above, below) = canvas(5.8, 2, sharex=True, height_ratios=(1, 1.4))
+    period, number = float(layer.period), layer.features[chosen]
+    frames = torch.arange(layer.start, layer.stop)
+    cycle = frames * layer.period.denominator // layer.period.numerator
+    within = frames - cycle.double() * period
+    parts = torch.unique_consecutive(cycle, return_counts=True)[1].tolist()
+    cycles = list(zip(within.split(parts), values.split(parts), strict=True))
+    for x, y in cycles[:: -(-len(cycles) // CYCLES)]:
+        above.plot(x, y, color=GREY, linewidth=0.6, alpha=0.6)
+    # phase k holds the frames that lie from k to k + 1 phases into their cycle
+    phase = (torch.arange(layer.phases) + 0.5) * period / layer.phases - 0.5
+    above.plot(phase, templates[:, chosen], color=BLUE, linewidth=2.2)
+    text = f"feature {number}, {len(cycles)} cycles of {period:.4g} frames; thick: their mean"
+    above.set_title(text, loc="left", fontsize=10)
+    above.set(ylabel="value")
+    rows = templates.var(0, correction=0).argsort(descending=True, stable=True)[:ROWS]
+    wave = torch.fft.fft(templates[:, rows].double(), dim=0)[1 % layer.phases]
+    rows = rows[wave.angle().neg().remainder(2 * math.pi).argsort(stable=True)]
+    picture = templates[:, rows].T
+    low, high = picture.amin(1, keepdim=True), picture.amax(1, keepdim=True)
+    picture = (picture - low) / (high - low).clamp(min=torch.finfo(picture.dtype).tiny)
+    extent = (-0.5, period - 0.5, len(rows) - 0.5, -0.5)
+    below.imshow(picture.numpy(), aspect="auto", extent=extent, cmap="Blues", interpolation="nearest")
+    total = len(layer.features)
+    text = f"{total} features" if len(rows) == total else f"{len(rows)} of {total} features"
+    below.set_title(f"templates of {text}; white: lowest, dark: highest", loc="left", fontsize=10)
+    mark = (rows == chosen).nonzero().flatten().tolist()
+    below.set_yticks(mark, [str(number)] * len(mark))
+    below.set(xlabel="phase (frames into the cycle)", ylabel="feature", xlim=(-0.5, period - 0.5))
+    return figure, (above, below)
+
+
+def plot_features(
+    frame: Tensor,
+    layers: Sequence[FrequencyLayer],
+    orientations: int = 9,
+    cell: int = 8,
+    block: int = 2,
+) -> Plot:
+    """HOG features that take part in a layer, on a frame of the route (figures 15 and 16 of the paper).
+
+    Args:
+        frame: (C,H,W) in [0,1], of the size that HOG saw. layers: one picture each.
+        orientations, cell, block: as HOG has them.
+
+    Convention: each is drawn as the edge it responds to, across its gradient; the stronger the line, the
+        more of the overlapping blocks have this cell and orientation in the layer.
+    """
+    height, width = frame.shape[-2:]
+    beside = width <= 1.6 * height and width <= 12 * cell
+    rows, columns = (1, len(layers)) if beside else (len(layers), 1)
+    wide = 0.97 * WIDTH / columns
+    figure, axes = canvas((min(2 * WIDTH, wide * height / width) + 0.36) * rows, rows, columns, squeeze=False)
+    points = 72 * wide * cell / width  # a cell's side
+    grey = frame.mean(0).clamp(0, 1)
+    for axis, layer, colour in zip(axes.flat, layers, LAYERS * len(layers), strict=False):
+        axis.imshow(
+            (0.35 + 0.65 * grey).numpy(), cmap="gray", vmin=0, vmax=1
+        )  # pale, so that lines stand out
+        edges, count = edges_seen(torch.tensor(layer.features), (height, width), orientations, cell, block)
+        strength = count / count.max()
+        axis.add_collection(
+            LineCollection(
+                list(edges.numpy()),
+                colors=colour,
+                linewidths=(points * (0.02 + 0.07 * strength)).tolist(),
+                alpha=(0.3 + 0.7 * strength).tolist(),
+            )
+        )
+        axis.set_axis_off()
+        axis.set_title(f"period {float(layer.period):.4g}, {len(layer.features)} features", fontsize=10)
+    return figure, axes

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch.data.truth import as_truth
+from dejavu_torch.evaluation.activation import Rate, activation_rates, in_phase
+from dejavu_torch.types import FrequencyLayer, Truth
+
+
+def layer(period: Fraction | int, phases: int, start: int = 0, stop: int = 40) -> FrequencyLayer:
+    return FrequencyLayer(Fraction(period), phases, start, stop, (0,))
+
+
+def test_rates_in_closed_form() -> None:
+    # chunk [0, 40), period 10: of the places 3, 13, 27 inside and 41, 52 outside
+    truth = as_truth(torch.tensor([[3], [13], [27], [41], [52]]))
+    best = torch.tensor([3, 4, 0, 0, 7])  # 0, 1 and 3 phases off inside; 1 and 5 off outside
+    index = torch.tensor([3, 20, 26, 42, -1])  # right, wrong, right; right, nothing reported
+    rates = activation_rates([layer(10, 10)], [best], index, truth, tolerance=1, places=60)
+    assert rates.layers == (Rate(pytest.approx(2 / 3), pytest.approx(1 / 2), pytest.approx(3 / 10)),)
+    assert rates.fused == Rate(pytest.approx(2 / 3), pytest.approx(1 / 2), pytest.approx(3 / 60))
+    assert rates.as_json() == {
+        "start": 0,
+        "stop": 40,
+        "layers": [{"inside": 2 / 3, "outside": 1 / 2, "chance": 3 / 10}],
+        "fused": {"inside": 2 / 3, "outside": 1 / 2, "chance": 3 / 60},
+    }
+
+
+def test_a_layer_that_covers_the_route_has_no_outside() -> None:
+    truth = as_truth(torch.tensor([[3], [13]]))
+    rates = activation_rates([layer(10, 10)], [torch.tensor([3, 3])], torch.tensor([3, 3]), truth, 0, 40)
+    assert rates.layers[0] == Rate(1.0, None, 0.1)
+    assert rates.fused.outside is None
+
+
+def test_unknown_queries_and_those_without_an_answer_do_not_count() -> None:
+    right = torch.tensor([[3], [13], [-1]])
+    truth = Truth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))
+    wrong = torch.tensor([8, 3, 3])
+    rates = activation_rates([layer(10, 10)], [wrong], wrong, truth, 0, 40)
+    assert rates.layers[0][:2] == rates.fused[:2] == (0.0, None)
+
+
+def test_a_query_that_reports_a_soft_place_does_not_count_in_the_fusion() -> None:
+    truth = Truth(torch.tensor([[3], [5]]), torch.tensor([True, True]), torch.tensor([[20], [-1]]))
+    rates = activation_rates([layer(10, 10)], [torch.tensor([0, 5])], torch.tensor([20, 5]), truth, 0, 40)
+    assert rates.layers[0].inside == 0.5
+    assert rates.fused.inside == 1.0
+
+
+def test_a_right_place_outside_does_not_help_a_query_inside() -> None:
+    truth = as_truth(torch.tensor([[3, 48]]))
+    rates = activation_rates([layer(10, 10)], [torch.tensor([8])], torch.tensor([48]), truth, 0, 60)
+    assert rates.layers[0].inside == 0.0
+
+
+def test_chance_is_at_most_one() -> None:
+    truth = as_truth(torch.tensor([[3]]))
+    rates = activation_rates([layer(4, 4)], [torch.tensor([1])], torch.tensor([3]), truth, 50, 60)
+    assert rates.layers[0].chance == rates.fused.chance == 1.0
+
+
+def test_fewer_phases_than_frames_count_the_distance_in_frames() -> None:
+    coarse = layer(20, 5)  # a phase is 4 frames: frames 0-3 have phase 0, 16-19 phase 4
+    best, places = torch.arange(5), torch.zeros(5, 1, dtype=torch.int64)
+    assert in_phase(coarse, best, places, 3).tolist() == [True, False, False, False, False]
+    assert in_phase(coarse, best, places, 4).tolist() == [True, True, False, False, True]
+
+
+@given(st.fractions(2, 60, max_denominator=7), st.integers(0, 500), st.integers(0, 9), st.data())
+def test_the_phase_of_a_place_is_in_phase_with_it_and_shifts_go_around(
+    period: Fraction, place: int, tolerance: int, data: st.DataObject
+) -> None:
+    phases = data.draw(st.integers(1, int(period)))
+    one = layer(period, phases)
+    best = torch.arange(phases)
+    found = in_phase(one, best, torch.full((phases, 1), place), tolerance)
+    own = int(one.phase(torch.tensor(place)))
+    off = [min((k - own) % phases, (own - k) % phases) * period / phases for k in range(phases)]
+    assert found.tolist() == [frames <= tolerance for frames in off]
+    assert not in_phase(one, best, torch.full((phases, 1), -1), tolerance).any()
+
+
+@pytest.mark.parametrize(
+    ("rate", "text"),
+    [
+        (Rate(0.98, 0.87, 0.118), "right 98 % here, 87 % elsewhere, by chance 12 %"),
+        (Rate(1.0, None, 0.0036), "right 100 %, by chance 0.4 %"),
+        (Rate(None, 0.25, 0.1), "right 25 % elsewhere, by chance 10 %"),
+    ],
+)
+def test_rates_in_words(rate: Rate, text: str) -> None:
+    assert rate.describe() == text

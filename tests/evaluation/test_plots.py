@@ -1,0 +1,295 @@
+"""What is drawn, read back from the figures."""
+
+from __future__ import annotations
+
+import io
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from PIL import Image
+from torch import Tensor
+
+from dejavu_torch import HOG, hog
+from dejavu_torch.evaluation.feature_plots import (
+    edges_seen,
+    hog_parts,
+    plot_features,
+    plot_spectrogram,
+    plot_templates,
+)
+from dejavu_torch.evaluation.plots import (
+    WIDTH,
+    plot_activations,
+    plot_auc,
+    plot_chunks,
+    plot_coverage,
+    plot_curves,
+)
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.types import FrequencyLayer, Match, PRCurve, Truth
+
+
+def layer(period: Fraction | int, start: int, stop: int, features: int = 2) -> FrequencyLayer:
+    return FrequencyLayer(Fraction(period), int(period), start, stop, tuple(range(features)))
+
+
+def render(figure: Figure) -> Image.Image:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    assert figure.get_figwidth() == WIDTH
+    return Image.open(buffer).convert("RGB")
+
+
+def told(figure: Figure) -> list[str]:
+    """Every text of a figure that says something."""
+    render(figure)
+    return [text.get_text() for text in figure.findobj(match=lambda one: hasattr(one, "get_text"))]
+
+
+def matched(*index: int) -> Match:
+    place = torch.tensor(index)
+    return Match(place, torch.zeros(len(place)), place >= 0)
+
+
+def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
+    """The points of each group of a coverage plot by its label."""
+    return {
+        line.get_label(): list(zip(*(map(float, part) for part in line.get_data()), strict=True))
+        for line in axis.lines  # type: ignore[attr-defined]
+    }
+
+
+def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
+    figure, axis = plot_coverage(matched(0, 9, -1, 4), torch.arange(4)[:, None], tolerance=1, places=10)
+    assert dots(axis) == {
+        "1 wrong": [(1, 9)],
+        "2 right (within 1 frames)": [(0, 0), (3, 4)],
+        "1 not reported": [(2, 0)],
+    }
+    render(figure)
+
+
+def test_coverage_leaves_grey_what_is_not_judged() -> None:
+    right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
+    truth = Truth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
+    figure, axis = plot_coverage(
+        matched(0, 1, 7, -1, 9), truth, 0, 10, queries=torch.tensor([10, 20, 30, 40, 50])
+    )
+    assert dots(axis) == {
+        "3 not judged": [(20, 1), (30, 7)],
+        "1 wrong": [(50, 9)],
+        "1 right (within 0 frames)": [(10, 0)],
+    }
+    assert axis.get_xlim() == (10, 50)
+    assert "3 not judged" in told(figure)
+
+
+def test_coverage_without_truth_or_of_one_query() -> None:
+    figure, axis = plot_coverage(matched(3), None, 5, 10)
+    assert dots(axis) == {"1 reported": [(0, 3)]}
+    render(figure)
+
+
+def test_auc_bars_are_as_long_as_the_areas_in_the_colours_of_the_curves() -> None:
+    areas = {"this map": 0.75, "null: shuffled": 0.0}
+    figure, axis = plot_auc(areas)
+    assert [bar.get_width() for bar in axis.patches] == [0.75, 0.0]
+    assert {"this map", "0.750", "null: shuffled", "0.000"} <= set(told(figure))
+    curve = PRCurve(*torch.rand(3, 4, dtype=torch.float64))
+    _, other = plot_curves(dict.fromkeys(areas, curve))
+    assert axis.patches[0].get_facecolor()[:3] == pytest.approx(_rgb(other.lines[0]))
+
+
+def _rgb(line: object) -> tuple[float, ...]:
+    colour = line.get_color().lstrip("#")  # type: ignore[attr-defined]
+    return tuple(int(colour[j : j + 2], 16) / 255 for j in (0, 2, 4))
+
+
+def test_a_curve_that_reports_nothing_says_so() -> None:
+    figure, _ = plot_curves({"null: x": PRCurve(*[torch.zeros(0)] * 3)})
+    assert "null: x (reports nothing)" in told(figure)
+
+
+def test_chunks_are_drawn_at_their_periods() -> None:
+    plan = (layer(93, 0, 512, 4), layer(171, 0, 512), layer(Fraction(195, 2), 512, 1024))
+    figure, axis = plot_chunks(plan, 1024)
+    drawn = {tuple(map(tuple, part.get_segments()[0].tolist())) for part in axis.collections}
+    assert drawn == {
+        ((0, 93), (512, 93)),
+        ((0, 171), (512, 171)),
+        ((512, 97.5), (1024, 97.5)),
+    }
+    assert {"93", "171", "97.5", "widest bar: 4 features"} <= set(told(figure))
+
+
+def test_chunks_of_a_route_without_layers() -> None:
+    assert "this route does not repeat: no layers" in told(plot_chunks((), 100)[0])
+
+
+def test_activations_show_the_scores_and_mark_the_best() -> None:
+    layers, scores = (layer(4, 8, 16), layer(2, 8, 16)), torch.rand(2, 8)
+    figure, rows = plot_activations(layers, scores, scores.sum(0), 5, [11], torch.rand(3, 6, 8))
+    for axis, values in zip(rows[1:], (*scores, scores.sum(0)), strict=True):
+        curve, best = axis.lines[:2]
+        assert curve.get_xdata().tolist() == list(range(8, 16))
+        assert curve.get_ydata().tolist() == values.tolist()
+        assert float(best.get_xdata()[0]) == 8 + int(values.argmin())
+    assert {"period 4, 2 features", "all layers fused", "true place"} <= set(told(figure))
+
+
+def wave(period: float, frames: int = 256) -> Tensor:
+    return torch.sin(torch.arange(frames) * 2 * torch.pi / period)
+
+
+@pytest.mark.parametrize("hop", [None, 64])
+def test_spectrogram_is_darkest_at_the_period(hop: int | None) -> None:
+    values = torch.cat([wave(32), wave(16)])
+    spectra = SpectrogramAnalysis(window=256, hop=hop)(values[:, None])
+    figure, (above, below) = plot_spectrogram(values, spectra, [[32.0]] * len(spectra), 8, 7)
+    assert above.lines[0].get_ydata().tolist() == values.tolist()
+    for mesh, period in zip((below.collections[0], below.collections[-1]), (32, 16), strict=True):
+        borders = mesh.get_coordinates()[:, 0, 1]
+        power = mesh.get_array().ravel()
+        assert borders[power.argmax()] > period > borders[power.argmax() + 1]
+        assert power.max() == pytest.approx(100 * 2 / 3, rel=1e-3)  # what a pure wave holds under Hann
+    starts = [float(mesh.get_coordinates()[0, 0, 0]) for mesh in below.collections]
+    assert starts == [start for start, _, _ in spectra]
+    assert "feature 7 through time" in told(figure)
+
+
+def test_spectrogram_of_a_long_or_constant_feature() -> None:
+    values = wave(32, 9000)
+    analysis = SpectrogramAnalysis(window=1024)
+    _, (above, _) = plot_spectrogram(values, analysis(values[:, None]), [[]] * 9)
+    extremes = above.collections[0].get_datalim(above.transData)
+    assert extremes.y0 == pytest.approx(-1, abs=1e-3)
+    assert extremes.y1 == pytest.approx(1, abs=1e-3)
+    flat = torch.ones(64)
+    figure, _ = plot_spectrogram(flat, SpectrogramAnalysis(window=64)(flat[:, None]), [[]])
+    render(figure)
+
+
+def test_templates_lie_over_the_frames_they_are_the_mean_of() -> None:
+    one = FrequencyLayer(Fraction(5), 5, 3, 15, (4, 9))
+    values = torch.arange(3, 15).remainder(5).float()  # the phase itself
+    templates = torch.stack([torch.arange(5.0), torch.ones(5)], 1)
+    figure, (above, below) = plot_templates(one, values, templates, 0)
+    assert [np.stack(line.get_data(), 1).tolist() for line in above.lines[:-1]] == [
+        [[3, 3], [4, 4]],
+        [[0, 0], [1, 1], [2, 2], [3, 3], [4, 4]],
+        [[0, 0], [1, 1], [2, 2], [3, 3], [4, 4]],
+    ]
+    mean = above.lines[-1]
+    assert mean.get_xdata().tolist() == mean.get_ydata().tolist() == [0, 1, 2, 3, 4]
+    assert below.images[0].get_array().shape == (2, 5)
+    assert [label.get_text() for label in below.get_yticklabels()] == ["4"]
+    assert "feature 4, 3 cycles of 5 frames; thick: their mean" in told(figure)
+
+
+@pytest.mark.parametrize(("period", "phases"), [(Fraction(15, 2), 3), (Fraction(2), 1), (Fraction(8), 8)])
+def test_templates_of_any_period_and_of_many_features(period: Fraction, phases: int) -> None:
+    one = FrequencyLayer(period, phases, 0, 40, tuple(range(100)))
+    values = torch.rand(40)
+    figure, (above, below) = plot_templates(one, values, torch.rand(phases, 100), 3)
+    shown = above.lines[-1].get_xdata()
+    # the mean stands in the middle of the frames it averages
+    assert shown[0] - -0.5 == pytest.approx(float(period - Fraction(1, 2)) - shown[-1])
+    assert below.images[0].get_array().shape == (64, phases)
+    render(figure)
+
+
+def test_of_many_cycles_some_are_drawn() -> None:
+    one = FrequencyLayer(Fraction(2), 2, 0, 500, (0,))
+    figure, (above, _) = plot_templates(one, torch.rand(500), torch.rand(2, 1), 0)
+    assert 50 <= len(above.lines) - 1 <= 100
+    assert "feature 0, 250 cycles of 2 frames; thick: their mean" in told(figure)
+
+
+LAYOUTS = st.tuples(
+    st.integers(6, 9), st.sampled_from([6, 8]), st.integers(2, 3)
+)  # orientations, cell, block
+CELLS = st.tuples(st.integers(3, 5), st.integers(3, 6))
+
+
+@given(LAYOUTS, CELLS, st.data())
+def test_a_cell_changes_the_features_of_the_blocks_that_hold_it(
+    layout: tuple[int, int, int], cells: tuple[int, int], data: st.DataObject
+) -> None:
+    _, cell, block = layout
+    rows, columns = cells
+    row, column = data.draw(st.integers(0, rows - 1)), data.draw(st.integers(0, columns - 1))
+    generator = torch.Generator().manual_seed(3)
+    height, width = rows * cell + 1, columns * cell + 2  # pixels beyond the last whole cell are none
+    frame = torch.rand(1, 1, height, width, generator=generator, dtype=torch.float64)
+    other = frame.clone()
+    # the inner pixels: their gradients lie in this cell alone
+    inside = slice(row * cell + 1, (row + 1) * cell - 1), slice(column * cell + 1, (column + 1) * cell - 1)
+    other[0, 0, *inside] = torch.rand(cell - 2, cell - 2, generator=generator, dtype=torch.float64)
+    before, after = hog(torch.cat([frame, other]), *layout)
+    parts = hog_parts(torch.arange(len(before)), (height, width), *layout)
+    blocks = torch.stack([parts.block_row, parts.block_column], 1)
+    own = (parts.cell_row == row) & (parts.cell_column == column)
+    changed = {tuple(pair) for pair in blocks[before != after].tolist()}
+    assert changed == {tuple(pair) for pair in blocks[own].tolist()}
+    assert changed == {
+        (y, x)
+        for y in range(max(0, row - block + 1), min(row, rows - block) + 1)
+        for x in range(max(0, column - block + 1), min(column, columns - block) + 1)
+    }
+
+
+def test_hog_parts_refuse_what_hog_does_not_have() -> None:
+    size = HOG()(torch.rand(1, 1, 64, 64)).shape[1]
+    hog_parts(torch.tensor([size - 1]), (64, 64))
+    with refused("1764..1764", "64 x 64", "has 1764"):
+        hog_parts(torch.tensor([size]), (64, 64))
+
+
+@pytest.mark.parametrize("degrees", range(10, 180, 20))
+def test_an_edge_in_the_frame_is_drawn_where_it_is(degrees: int) -> None:
+    """One edge through the middle of the frame: what lights up there is drawn along it."""
+    # the gradient points to `degrees` from x towards y, the middle of a bin
+    angle = torch.deg2rad(torch.tensor(float(degrees)))
+    y, x = torch.meshgrid(torch.arange(72) - 35.5, torch.arange(72) - 35.5, indexing="ij")
+    frame = torch.erf((x * angle.cos() + y * angle.sin()) / 2) + 0.03 * torch.rand(72, 72)  # noise elsewhere
+    values = HOG()(frame[None, None])[0]
+    lit = (values > 0.75 * values.max()).nonzero().flatten()
+    edges, count = edges_seen(lit, (72, 72))
+    assert len(edges) >= 3
+    assert count.max() <= 4  # blocks that share a cell
+    for (x0, y0), (x1, y1) in edges.tolist():
+        along = (x1 - x0, y1 - y0)
+        length = (along[0] ** 2 + along[1] ** 2) ** 0.5
+        across = abs(along[0] * float(angle.cos()) + along[1] * float(angle.sin())) / length
+        assert across < 0.35  # perpendicular to the gradient, or the bin beside it: sin(20 degrees)
+        off = ((x0 + x1) / 2 - 35.5) * float(angle.cos()) + ((y0 + y1) / 2 - 35.5) * float(angle.sin())
+        assert abs(off) < 4 * float(angle.cos().abs() + angle.sin().abs()) + 3  # its cell meets the edge
+
+
+def test_edges_count_the_blocks_that_share_them() -> None:
+    # 3 x 3 cells, one orientation: the middle cell stands in all four blocks, at another corner of each
+    edges, count = edges_seen(torch.tensor([3, 6, 9, 12, 0]), (24, 24), orientations=1)
+    assert count.tolist() == [1, 4]
+    assert edges.mean(1).tolist() == [[3.5, 3.5], [11.5, 11.5]]
+    assert edges[1].tolist() == [pytest.approx([15.1, 11.5]), pytest.approx([7.9, 11.5])]
+
+
+@pytest.mark.parametrize("shape", [(3, 64, 64), (1, 32, 64), (1, 120, 160), (1, 64, 16)])
+def test_features_are_drawn_on_a_frame_of_any_shape(shape: tuple[int, int, int]) -> None:
+    frame = torch.rand(shape)
+    features = range(0, HOG()(frame[None]).shape[1], 3)
+    layers = [FrequencyLayer(Fraction(p), p, 0, 60, tuple(features)) for p in (9, 20)]
+    for some in (layers, layers[:1]):
+        figure, axes = plot_features(frame, some)
+        assert axes.size == len(some)
+        lines = axes.flat[0].collections[0]
+        seen = edges_seen(torch.tensor(some[0].features), shape[1:])[0]
+        assert np.array_equal(lines.get_segments(), seen)
+        image = render(figure)
+        assert image.width < 6 * image.height

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import io
+from fractions import Fraction
+
+import pytest
+import torch
+from helpers import Fixed
+from torch import Tensor, nn
+
+from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, SlidingWindow, SpectrogramAnalysis
+from dejavu_torch.data.truth import as_truth, offset_truth
+from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.experiments.pictures import (
+    best_explained,
+    best_phases,
+    draw_pictures,
+    frames_between,
+    leading_layers,
+    slit_scan,
+)
+from dejavu_torch.types import FrequencyLayer, Truth
+
+ALL = ["pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"]
+
+
+def layer(period: int, start: int, stop: int, *features: int) -> FrequencyLayer:
+    return FrequencyLayer(Fraction(period), period, start, stop, features)
+
+
+def frames(seed: int, length: int = 120, channels: int = 1) -> Tensor:
+    """Stripes that pass with periods 12 and 20 in the upper and the lower half, and noise."""
+    i = torch.arange(length, dtype=torch.float32)[:, None, None]
+    rows, columns = torch.meshgrid(torch.arange(24), torch.arange(24), indexing="ij")
+    period = torch.where(rows < 12, 12, 20)
+    stripes = 0.5 + 0.4 * torch.sin(2 * torch.pi * (i + columns) / period)
+    noise = torch.rand(length, channels, 24, 24, generator=torch.Generator().manual_seed(seed))
+    return 0.9 * stripes[:, None] + 0.1 * noise
+
+
+def drawn(
+    model: DejaVu, reference: Tensor, query: Tensor, truth: Truth | None, **found: Match
+) -> dict[str, Picture]:
+    traverse = ArrayTraverse(reference)
+    stored, seen = model.extract_all(traverse), model.extract_all(ArrayTraverse(query))
+    model.learn_features(stored)
+    others = {key: (f"the {key}", match, None) for key, match in found.items()}
+    pictures = draw_pictures(model, traverse, stored, seen, model.localize(seen), truth, 2, others)
+    for picture in pictures.values():
+        buffer = io.BytesIO()
+        picture.plot[0].savefig(buffer, format="png")
+        assert buffer.tell() > 5000
+        assert picture.heading
+        assert picture.caption.endswith(".")
+    return pictures
+
+
+def short(**options: object) -> DejaVu:
+    return DejaVu(HOG(), SpectrogramAnalysis(window=60, min_period=4), **options)  # type: ignore[arg-type]
+
+
+def same_places(length: int = 120) -> Truth:
+    return as_truth(offset_truth(length, length))
+
+
+def test_every_picture_of_frames_that_repeat() -> None:
+    other = Match(torch.arange(120), torch.zeros(120), torch.ones(120, dtype=torch.bool))
+    pictures = drawn(short(), frames(0), frames(1), same_places(), stride=other, leave_out=other)
+    assert list(pictures) == ALL
+    labels = [text.get_text() for text in pictures["auc"].plot[1].texts]
+    assert {"this map", "the stride"} < set(labels)
+    assert "the leave_out" not in labels
+    assert [name for name, picture in pictures.items() if picture.numbers] == ["activations"]
+    numbers = pictures["activations"].numbers
+    assert (numbers["start"], numbers["stop"]) == (0, 60)
+    assert all(0 <= rate["inside"] <= 1 and 0 <= rate["outside"] <= 1 for rate in numbers["layers"])
+    assert 0 <= numbers["fused"]["inside"] <= 1
+
+
+def test_a_route_of_one_chunk_has_nothing_elsewhere() -> None:
+    model = DejaVu(periods=SpectrogramAnalysis(window=120, min_period=4))
+    pictures = drawn(model, frames(0), frames(1), same_places())
+    numbers = pictures["activations"].numbers
+    assert [rate["outside"] for rate in (*numbers["layers"], numbers["fused"])] == [None] * 3
+
+
+def test_without_truth_nothing_is_scored() -> None:
+    pictures = drawn(short(), frames(0), frames(1)[:50], None)
+    assert list(pictures) == ALL[2:]
+    assert pictures["activations"].numbers == {}
+
+
+def test_a_truth_in_which_some_is_unknown() -> None:
+    right = offset_truth(120, 120)
+    known = torch.arange(120) % 3 > 0
+    pictures = drawn(short(), frames(0), frames(1), Truth(right, known, right - 5))
+    assert list(pictures) == ALL
+
+
+def test_a_truth_that_judges_nothing_gives_no_curve() -> None:
+    right = torch.full((120, 1), -1)
+    soft = torch.arange(120).expand(120, -1)  # whatever is reported
+    pictures = drawn(short(), frames(0), frames(1), Truth(right, torch.ones(120, dtype=torch.bool), soft))
+    assert list(pictures) == ALL[2:]
+
+
+def test_a_route_without_layers_keeps_what_needs_none() -> None:
+    pictures = drawn(DejaVu(periods=Fixed()), frames(0), frames(1), same_places())
+    assert list(pictures) == ["pr", "auc", "coverage", "chunks"]
+
+
+def test_ready_features_have_no_frame_to_draw_on() -> None:
+    made = [HOG()(frames(seed)) for seed in (0, 1)]
+    assert list(drawn(short(), *made, same_places())) == [name for name in ALL if name != "features"]
+
+
+def test_one_layer_has_no_partner() -> None:
+    model = DejaVu(periods=Fixed(layer(12, 0, 120, 0, 1, 2)))
+    pictures = drawn(model, frames(0), frames(1), same_places())
+    # the spectrogram is that of SpectrogramAnalysis
+    assert list(pictures) == ["pr", "auc", "coverage", "chunks", "templates", "features"]
+
+
+def test_features_are_drawn_for_our_hog_only() -> None:
+    class Other(HOG):
+        """Looks at the frame otherwise."""
+
+    for module in (Other(), nn.Sequential(nn.AvgPool2d(2), nn.Flatten())):
+        model = DejaVu(module, SpectrogramAnalysis(window=60, min_period=4))
+        assert "features" not in drawn(model, frames(0), frames(1), None)
+
+
+def test_features_are_drawn_on_the_frame_as_hog_resizes_it() -> None:
+    model = DejaVu(HOG(cell=4, resize=(16, 40)), SpectrogramAnalysis(window=60, min_period=4))
+    pictures = drawn(model, frames(0, channels=3), frames(1, channels=3), None)
+    assert pictures["features"].plot[1].flat[0].images[0].get_array().shape == (16, 40)
+    assert "frame 30" in pictures["features"].caption
+
+
+@pytest.mark.parametrize(
+    ("plan", "leading"),
+    [
+        ((), []),
+        ((layer(4, 0, 20, 1),), [0]),
+        ((layer(4, 0, 20, 1), layer(5, 0, 20, 1, 2), layer(6, 0, 20, 1, 2, 3)), [2, 1]),
+        ((layer(4, 0, 30, 1), layer(4, 30, 50, 1), layer(6, 30, 50, 2)), [1, 2]),  # two layers before length
+        ((layer(4, 0, 10, 1), layer(5, 0, 10, 1), layer(4, 10, 30, 1), layer(6, 10, 30, 2)), [2, 3]),
+    ],
+)
+def test_leading_layers(plan: tuple[FrequencyLayer, ...], leading: list[int]) -> None:
+    assert leading_layers(plan) == leading
+
+
+def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain() -> None:
+    wave = torch.sin(torch.arange(80) * 2 * torch.pi / 8)
+    noise = torch.randn(80, 3)
+    stored = torch.stack([torch.ones(80), wave + noise[:, 0], wave + 0.1 * noise[:, 1], 5 * noise[:, 2]], 1)
+    one = layer(8, 0, 80, 0, 1, 2, 3)
+    templates = DejaVu(periods=Fixed(one)).learn_features(stored).map.blocks()[0]
+    assert best_explained(stored, one, templates) == 2
+
+
+def test_best_phases_are_those_that_the_chunk_has() -> None:
+    # period 50 in a chunk of 20 frames from 10: phases 10..29; the others' templates are 0
+    stored = torch.randn(40, 6).abs() + 1
+    model = DejaVu(periods=Fixed(layer(50, 10, 30, *range(6)))).learn_features(stored)
+    queries = torch.cat([stored[10:30], torch.zeros(1, 6)])
+    best = best_phases(model, queries, 0)
+    assert best[:20].tolist() == list(range(10, 30))
+    assert 10 <= int(best[20]) < 30
+
+
+def test_frames_between_are_those_frames() -> None:
+    clip = torch.rand(200, 1, 2, 2)
+    assert torch.equal(torch.cat(list(frames_between(ArrayTraverse(clip), 60, 140))), clip[60:140])
+    assert list(frames_between(ArrayTraverse(torch.rand(9, 4)), 0, 5)) == []
+
+
+def test_slit_scan_holds_no_more_than_it_shows() -> None:
+    scan = slit_scan(ArrayTraverse(torch.rand(300, 1, 16, 16)), 10, 290)
+    assert scan is not None
+    assert scan.untyped_storage().nbytes() <= 2 * 280 * 16 * 4
+
+
+def test_slit_scan_of_a_sliding_window_is_the_strip() -> None:
+    strip = torch.rand(3, 8, 200)
+    scan = slit_scan(SlidingWindow(strip, width=10), 20, 120)
+    assert scan is not None
+    assert torch.equal(scan, strip[:, :, 25:125])
+    assert slit_scan(ArrayTraverse(torch.rand(20, 4)), 0, 10) is None

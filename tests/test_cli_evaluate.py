@@ -1,0 +1,168 @@
+"""`dejavu evaluate`, the truths of `compare`, and options ahead of the features, as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_cli import fails, frames, run
+
+from dejavu_torch import DejaVu
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two traverses of one route: the second starts four frames later and ends eight frames earlier."""
+    folder = tmp_path_factory.mktemp("pair")
+    np.save(folder / "first.npy", frames(96, seed=1))
+    np.save(folder / "second.npy", frames(96, seed=2)[4:88])
+    return folder / "first.npy", folder / "second.npy"
+
+
+@pytest.fixture(scope="module")
+def matches(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("matches")
+    run("learn", pair[0], "--map", folder / "map.safetensors")
+    run("localize", folder / "map.safetensors", pair[1], "--out", folder / "matches.csv")
+    return folder / "matches.csv"
+
+
+def report_of(folder: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    return report
+
+
+def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(
+    pair: tuple[Path, Path], matches: Path, tmp_path: Path
+) -> None:
+    rows = [f"{query},{query + 4}" for query in range(84)]
+    (tmp_path / "all.csv").write_text("query,place\n" + "\n".join(rows))
+    (tmp_path / "some.csv").write_text("\n".join([rows[0], rows[37], rows[83]]))
+    hard = np.zeros((96, 84), dtype=bool)
+    hard[np.arange(84) + 4, np.arange(84)] = True
+    np.savez(tmp_path / "truth.npz", GThard=hard)
+    run("compare", *pair, "--truth", "4", "--out", tmp_path / "compare")
+    expected = report_of(tmp_path / "compare")
+    forms = (
+        ["4"],
+        [tmp_path / "all.csv"],
+        [tmp_path / "some.csv", "--interpolate"],
+        [tmp_path / "truth.npz"],
+    )
+    for number, form in enumerate(forms):
+        run("evaluate", matches, "--truth", *form, "--out", tmp_path / f"e{number}")
+        run("compare", *pair, "--truth", *form, "--out", tmp_path / f"c{number}")
+        for folder in (f"e{number}", f"c{number}"):
+            report = report_of(tmp_path / folder)
+            for key in (
+                "auc",
+                "auc_reported",
+                "recall_at_1",
+                "recall_at_100_precision",
+                "queries",
+                "accepted",
+            ):
+                assert report[key] == pytest.approx(expected[key], abs=1e-6), (folder, key)
+
+
+def test_evaluate_writes_a_report_and_says_what_was_judged(
+    matches: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "some.csv").write_text("query,place\n0,4\n50,54\n60,-1\n")
+    run("evaluate", matches, "--truth", tmp_path / "some.csv", "--tolerance", "2", "--out", tmp_path / "out")
+    out = capsys.readouterr().out
+    assert "AUC" in out
+    assert "right within 2 frames" in out
+    assert "3 of the queries are in the truth" in out
+    report = report_of(tmp_path / "out")
+    assert (report["queries"], report["judged"], report["unknown"], report["with_answer"]) == (84, 3, 81, 2)
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "<pre>dejavu evaluate" in page
+    assert page.count("data:image/png;base64,") == 2
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "report.json",
+        "index.html",
+        "pr.png",
+        "coverage.png",
+    }
+
+
+def test_coordinates_in_image_names_are_a_truth(tmp_path: Path) -> None:
+    for name, seed, shift in (("first", 1, 0.0), ("second", 2, 3.0)):
+        (tmp_path / name).mkdir()
+        for i, image in enumerate(frames(64, seed)):
+            path = tmp_path / name / f"@{500000 + 10 * i + shift:.2f}@{4000000:.2f}@{i:04d}@.jpg"
+            Image.fromarray(image).save(path)
+    both = (tmp_path / "first", tmp_path / "second")
+    run("compare", *both, "--truth", "utm:4", "--tolerance", "0", "--out", tmp_path / "compare")
+    run("compare", *both, "--truth", "0", "--tolerance", "0", "--out", tmp_path / "zero")
+    assert report_of(tmp_path / "compare")["auc"] == report_of(tmp_path / "zero")["auc"]
+    options = ("--truth", "utm:4", "--tolerance", "0", "--out", tmp_path / "evaluate")
+    run(
+        "evaluate", tmp_path / "compare" / "matches.csv", *options, "--reference", both[0], "--query", both[1]
+    )
+    assert report_of(tmp_path / "evaluate")["auc"] == report_of(tmp_path / "zero")["auc"]
+
+
+def test_what_evaluate_refuses(matches: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ("--out", tmp_path / "out")
+    assert "nowhere.csv" in fails(capsys, "evaluate", tmp_path / "nowhere.csv", "--truth", "0", *out)
+    assert "'maybe'" in fails(capsys, "evaluate", matches, "--truth", "maybe", *out)
+    assert "-1" in fails(capsys, "evaluate", matches, "--truth", "0", "--tolerance", "-1", *out)
+    assert "cannot be interpolated" in fails(
+        capsys, "evaluate", matches, "--truth", "0", "--interpolate", *out
+    )
+    assert "required: truth" in fails(capsys, "evaluate", matches, *out)
+    assert "both traverses" in fails(capsys, "evaluate", matches, "--truth", "utm", *out)
+    (tmp_path / "truth.csv").write_text("query,place\n0,four\n")
+    error = fails(capsys, "evaluate", matches, "--truth", tmp_path / "truth.csv", *out)
+    assert "truth.csv" in error
+    assert "line 2" in error
+    assert not (tmp_path / "out" / "report.json").exists()
+
+
+def test_channel_and_contrast_are_options_and_stay_with_the_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    route = tmp_path / "map.safetensors"
+    options = ("--preprocess.channel", "R-B", "--preprocess.contrast", "patch", "--preprocess.patch", "5")
+    run("learn", "sim:aerial?frames=128", "--map", route, *options)
+    preprocess = DejaVu.load(route).preprocess
+    assert (preprocess.channel, preprocess.contrast, preprocess.patch) == ("R-B", "patch", 5)
+    run("localize", route, "sim:aerial?frames=16", "--out", tmp_path / "m.csv")
+    run("info", route)
+    assert "channel='R-B', contrast='patch'" in capsys.readouterr().out
+    np.save(tmp_path / "grey.npy", frames(16, size=64))
+    error = fails(capsys, "localize", route, tmp_path / "grey.npy", "--out", tmp_path / "m.csv")
+    assert "R-B" in error
+    assert "frames with 1 channel" in error
+    error = fails(capsys, "learn", "sim:aerial?frames=128", "--map", route, "--preprocess.channel", "X")
+    assert "'X'" in error
+
+
+def test_a_command_that_is_ended_leaves_no_broken_file(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    run("learn", "sim:aerial?frames=64", "--map", tmp_path / "map.safetensors")
+    (tmp_path / "out").mkdir()
+    source = ("sim:aerial?frames=32768", "--out", str(tmp_path / "out" / "m.csv"))
+    command = [
+        sys.executable,
+        "-m",
+        "dejavu_torch.cli",
+        "localize",
+        str(tmp_path / "map.safetensors"),
+        *source,
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    while not list((tmp_path / "out").iterdir()) and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 143
+    assert list((tmp_path / "out").iterdir()) == []
