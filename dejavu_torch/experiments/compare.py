@@ -88,8 +88,8 @@ def compare(
     everything, strided, sparse = nearest_frames(stored, seen, (1, k, coarsest), model.matcher.metric)
     found = {
         "uncompressed": (f"all {len(stored)} frames", everything, 1),
-        "stride": (f"every {_ordinal(k)} frame (the map's bytes)", strided, k),
-        "stride_coarsest": (f"every {_ordinal(coarsest)} frame (2 x tolerance)", sparse, coarsest),
+        "stride": (f"{_every(k)} (the map's bytes)", strided, k),
+        "stride_coarsest": (f"{_every(coarsest)} (2 x tolerance)", sparse, coarsest),
         "null": ("null: all learnt shuffled", null_control(model, stored, seen, seed), None),
         "null_same_plan": (
             "null: this map's layers, shuffled",
@@ -128,7 +128,12 @@ def compare(
         "template_numbers": model.map.templates.numel(),
         "periods": sorted({_plain(layer.period) for layer in plan}),
         "chunks": [
-            {"start": c.start, "stop": c.stop, "periods": [_plain(period) for period in c.periods]}
+            {
+                "start": c.start,
+                "stop": c.stop,
+                "periods": [_plain(period) for period in c.periods],
+                "features": list(c.features),
+            }
             for c in chunks
         ],
         "seconds_learn": learnt - began,
@@ -155,5 +160,5 @@ def _plain(period: object) -> int | float:
     return int(value) if value.is_integer() else value
 
 
-def _ordinal(k: int) -> str:
-    return {1: "1st", 2: "2nd", 3: "3rd"}.get(k, f"{k}th")
+def _every(k: int) -> str:
+    return "every frame" if k == 1 else f"every {({2: '2nd', 3: '3rd'}.get(k, f'{k}th'))} frame"

@@ -45,7 +45,8 @@ def test_report_has_every_key(report: dict[str, Any]) -> None:
     assert set(report) >= SCORES | set(facts.split()) | {"uncompressed", "stride", "null", "null_same_plan"}
     for name in ("uncompressed", "stride", "null"):
         assert set(report[name]) >= SCORES
-    assert set(report["chunks"][0]) == {"start", "stop", "periods"}
+    assert set(report["chunks"][0]) == {"start", "stop", "periods", "features"}
+    assert all(len(chunk["features"]) == len(chunk["periods"]) for chunk in report["chunks"])
     assert report["frames"] == report["queries"] == 3072
     assert report["tolerance"] == 5
 
