@@ -92,8 +92,17 @@ def write_map(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) ->
 
 
 def _plain(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    # a clone, since weights that share memory are refused
-    return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    """As safetensors takes them: whole, and none in another's memory."""
+    plain: dict[str, Tensor] = {}
+    taken: set[int] = set()
+    for name, tensor in tensors.items():
+        tensor = tensor.detach().cpu().contiguous()
+        memory = tensor.untyped_storage()
+        if memory.data_ptr() in taken or memory.nbytes() != tensor.nbytes:
+            tensor = tensor.clone()
+        taken.add(tensor.untyped_storage().data_ptr())
+        plain[name] = tensor
+    return plain
 
 
 def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

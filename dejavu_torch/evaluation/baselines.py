@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from dejavu_torch.recognition.distance import Metric, phase_distances
 from dejavu_torch.recognition.select import best_match
@@ -15,13 +16,18 @@ DISTANCES_AT_ONCE = 2**22
 
 
 def nearest_frames(
-    reference: Tensor, query: Tensor, strides: Sequence[int] = (1,), metric: Metric = "l1"
+    reference: Tensor,
+    query: Tensor,
+    strides: Sequence[int] = (1,),
+    metric: Metric = "l1",
+    progress: bool = False,
 ) -> list[Match]:
     """Nearest stored frame of each query, where every k-th reference frame is stored.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
         strides: each k; 1 stores all frames. All are found in one pass over the distances.
+        progress: show a progress bar on a terminal.
 
     Returns:
         For each k a Match of (Q,), index in reference frames.
@@ -29,7 +35,8 @@ def nearest_frames(
     rows = max(1, DISTANCES_AT_ONCE // len(reference))
     parts: list[list[Match]] = [[] for _ in strides]
     with torch.no_grad():
-        for batch in query.split(rows):
+        batches = query.split(rows)
+        for batch in tqdm(batches, "baselines", disable=None if progress else True, leave=False):
             distances = phase_distances(batch, reference, metric)
             for found, k in zip(parts, strides, strict=True):
                 match = best_match(distances[:, ::k])

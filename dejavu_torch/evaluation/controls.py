@@ -29,7 +29,12 @@ def same_settings(model: DejaVu) -> DejaVu:
 
 
 def null_control(
-    model: DejaVu, reference: Tensor, query: Tensor, seed: int = 0, same_plan: bool = False
+    model: DejaVu,
+    reference: Tensor,
+    query: Tensor,
+    seed: int = 0,
+    same_plan: bool = False,
+    progress: bool = False,
 ) -> Match:
     """Matches of a map learnt from the reference in shuffled order.
 
@@ -41,6 +46,7 @@ def null_control(
         same_plan: keep the layers of the model and learn only the templates anew. Otherwise the periods
             are sought anew too; the default preset then finds none, since shuffled frames are noise
             in time, and reports nothing.
+        progress: show a progress bar on a terminal.
 
     Returns:
         Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
@@ -54,7 +60,7 @@ def null_control(
         null.map = CompressedMap(model.map.plan, templates, *shuffled.shape).to(shuffled.device)
     else:
         null.learn_features(shuffled)
-    match = null.localize(query)
+    match = null.localize(query, progress)
     return match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
 
 

@@ -85,15 +85,20 @@ def compare(
     frames, dimension = stored.shape
     k = fair_stride(frames, dimension, itemsize, size, tolerance)
     coarsest = max(1, 2 * tolerance)
-    everything, strided, sparse = nearest_frames(stored, seen, (1, k, coarsest), model.matcher.metric)
+    metric = model.matcher.metric
+    everything, strided, sparse = nearest_frames(stored, seen, (1, k, coarsest), metric, progress)
     found = {
         "uncompressed": (f"all {len(stored)} frames", everything, 1),
         "stride": (f"{_every(k)} (the map's bytes)", strided, k),
         "stride_coarsest": (f"{_every(coarsest)} (2 x tolerance)", sparse, coarsest),
-        "null": ("null: all learnt shuffled", null_control(model, stored, seen, seed), None),
+        "null": (
+            "null: all learnt shuffled",
+            null_control(model, stored, seen, seed, progress=progress),
+            None,
+        ),
         "null_same_plan": (
             "null: this map's layers, shuffled",
-            null_control(model, stored, seen, seed, same_plan=True),
+            null_control(model, stored, seen, seed, same_plan=True, progress=progress),
             None,
         ),
     }
@@ -161,4 +166,4 @@ def _plain(period: object) -> int | float:
 
 
 def _every(k: int) -> str:
-    return "every frame" if k == 1 else f"every {({2: '2nd', 3: '3rd'}.get(k, f'{k}th'))} frame"
+    return "every frame" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } frame"

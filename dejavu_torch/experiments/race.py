@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
+from tqdm import tqdm
 
 Run = Callable[[], Tensor]
 
@@ -60,7 +61,9 @@ def race(case: str, ours: Runner, others: Sequence[Runner], repeats: int) -> lis
     """
     rows, runs = {}, {}
     expected: Tensor | None = None
+    bar = tqdm(total=(1 + len(others)) * (1 + repeats), desc=case, disable=None, leave=False)
     for name, threads, ready in (ours, *others):
+        bar.update()
         try:
             began = time.perf_counter()
             run = ready()
@@ -93,6 +96,8 @@ def race(case: str, ours: Runner, others: Sequence[Runner], repeats: int) -> lis
             began = time.perf_counter()
             run()
             best[name] = min(best[name], scale * (time.perf_counter() - began))
+            bar.update()
+    bar.close()
     fastest = min(seconds for name, seconds in best.items() if name.startswith("dejavu"))
     for name, seconds in best.items():
         rows[name] = rows[name]._replace(seconds=seconds, ratio_to_ours=seconds / fastest)
