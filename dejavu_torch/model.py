@@ -108,10 +108,12 @@ class DejaVu(nn.Module):
         """
         if len(learnt_from or ()) == 3 and features.shape[1] > MANY_FEATURES:
             log.warning(
-                "each frame gives %d features; smaller frames make a smaller and faster map, as "
-                "--features.resize [90,160] or, of a video, ?width=160 does",
+                "each frame gives %d features; smaller frames make a smaller and faster map, as ?width=160 "
+                "behind a folder or video does",
                 features.shape[1],
             )
+        if len(learnt_from or ()) == 1 and (self.preprocess.channel or self.preprocess.contrast):
+            log.warning("these are ready features: channel and contrast are left as they are")
         plan = self.periods.plan(features)
         with torch.no_grad():
             templates = self.templates(features, plan)
@@ -122,9 +124,8 @@ class DejaVu(nn.Module):
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
-        self.check_queries(tuple(queries.shape[1:]), "the query")
         features = features_of(queries, self.pipeline, "the query")
-        self._check_dimension(features, tuple(queries.shape[1:]), "the query")
+        self.check_queries(tuple(queries.shape[1:]), features.shape[1], "the query")
         scores: Tensor = self.matcher(features, self.map)
         return scores
 
@@ -148,9 +149,9 @@ class DejaVu(nn.Module):
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         queries = as_traverse(queries)
         shape = frame_shape(queries)
-        self.check_queries(shape, queries.name)
-        for features in self.extract(queries, "localizing" if progress else None):
-            self._check_dimension(features, shape, queries.name)
+        for i, features in enumerate(self.extract(queries, "localizing" if progress else None)):
+            if i == 0:
+                self.check_queries(shape, features.shape[1], queries.name)
             for part in features.split(at_once):
                 with torch.no_grad():
                     match = best_match(self.matcher(part, self.map), self.threshold)
@@ -250,11 +251,11 @@ class DejaVu(nn.Module):
         weights = {f"features.{n}": t for n, t in self.features.state_dict().items() if isinstance(t, Tensor)}
         return tensors | weights, header
 
-    def check_queries(self, shape: tuple[int, ...], name: str) -> None:
-        """Refuse frames where the map was learnt from ready features, and tell of frames of another size.
+    def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
+        """Refuse queries that do not fit the map, and tell of frames of another size that do.
 
         Args:
-            shape: of one query, (C,H,W) or (D,).
+            shape: of one query, (C,H,W) or (D,). dimension: D, how many features it gives.
             name: of the queries, for the message.
         """
         if self.learnt_from is None or len(shape) != 3:
@@ -264,16 +265,15 @@ class DejaVu(nn.Module):
                 f"{name} holds frames, but the map was learnt from ready features; "
                 f"expected features (Q, {self.map.dimension})"
             )
+        if dimension != self.map.dimension:
+            raise InputError(
+                f"{name}: frames of {_by(shape)} give {dimension} features; the map expects "
+                f"{self.map.dimension}, as frames of {_by(self.learnt_from)} give, into which ?width= and "
+                "?height= turn folders and videos"
+            )
         if shape[1:] != self.learnt_from[1:] and getattr(self.features, "resize", None) is None:
             log.warning(
                 "%s has frames of %s, the map was learnt from %s", name, _by(shape), _by(self.learnt_from)
-            )
-
-    def _check_dimension(self, features: Tensor, shape: tuple[int, ...], name: str) -> None:
-        if features.shape[1] != self.map.dimension and len(shape) == 3 and self.learnt_from:
-            raise InputError(
-                f"{name}: frames of {_by(shape)} give {features.shape[1]} features; the map expects "
-                f"{self.map.dimension}, as frames of {_by(self.learnt_from)} give"
             )
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -120,7 +120,7 @@ def test_what_evaluate_refuses(matches: Path, tmp_path: Path, capsys: pytest.Cap
     assert "cannot be interpolated" in fails(
         capsys, "evaluate", matches, "--truth", "0", "--interpolate", *out
     )
-    assert "required: truth" in fails(capsys, "evaluate", matches, *out)
+    assert "required: --truth" in fails(capsys, "evaluate", matches, *out)
     assert "both traverses" in fails(capsys, "evaluate", matches, "--truth", "utm", *out)
     (tmp_path / "truth.csv").write_text("query,place\n0,four\n")
     error = fails(capsys, "evaluate", matches, "--truth", tmp_path / "truth.csv", *out)
@@ -166,3 +166,133 @@ def test_a_command_that_is_ended_leaves_no_broken_file(pair: tuple[Path, Path], 
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_what_is_taken_for_the_truth_is_told(
+    pair: tuple[Path, Path], matches: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("compare", pair[0], pair[0], "--out", tmp_path / "same")
+    told = "right within 5 frames of the truth (place = query, since both have as many frames)"
+    assert told in capsys.readouterr().out
+    assert told in (tmp_path / "same" / "index.html").read_text()
+    run("evaluate", matches, "--truth", "4", "--reference", pair[0], "--out", tmp_path / "offset")
+    assert "of the truth (place = query + 4)" in capsys.readouterr().out
+    assert report_of(tmp_path / "offset")["truth"] == "place = query + 4"
+
+
+def test_a_reference_tells_evaluate_where_the_map_ends(
+    pair: tuple[Path, Path], matches: Path, tmp_path: Path
+) -> None:
+    run("compare", *pair, "--truth", "20", "--out", tmp_path / "compare")
+    options = ("--truth", "20", "--out", tmp_path / "evaluate")
+    run("evaluate", tmp_path / "compare" / "matches.csv", "--reference", pair[0], *options)
+    both = [report_of(tmp_path / name) for name in ("compare", "evaluate")]
+    assert [report["with_answer"] for report in both] == [76, 76]
+    assert both[0]["recall_at_1"] == both[1]["recall_at_1"]
+    run("evaluate", matches, *options)
+    assert report_of(tmp_path / "evaluate")["places"] is None
+
+
+def test_the_threshold_that_is_named_accepts_right_places_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flights = ("sim:aerial?frames=256", "sim:aerial?frames=256&traverse=1")
+    run("compare", *flights, "--out", tmp_path / "first")
+    first = report_of(tmp_path / "first")
+    assert f"--threshold {first['threshold_of_full_precision']:.9g}" in capsys.readouterr().out
+    threshold = str(first["threshold_of_full_precision"])
+    run("compare", *flights, "--threshold", threshold, "--out", tmp_path / "second")
+    second = report_of(tmp_path / "second")
+    assert 0 < second["accepted"] == second["accepted_right"]
+    assert second["accepted"] == round(first["recall_at_100_precision"] * first["with_answer"])
+
+
+def test_a_curve_that_starts_late_is_marked(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Stored frames find themselves at distance 0, all of them: one threshold, and no area."""
+    run("compare", pair[0], pair[0], "--tolerance", "0", "--out", tmp_path / "itself")
+    out = capsys.readouterr().out
+    report = report_of(tmp_path / "itself")
+    assert report["uncompressed"]["recall_at_1"] == report["uncompressed"]["curve_starts_at_recall"] == 1
+    assert report["uncompressed"]["auc"] == 0
+    assert "0.000*" in out
+    assert "*: this curve starts at a recall above 0.1" in out
+    assert "every frame" not in out  # what stores the same frames stands there once
+
+
+def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i, image in enumerate(frames(16)):
+        Image.fromarray(image).save(folder / f"{i}.png")
+    assert "another folder" in fails(capsys, "compare", f"{folder}?step=1", folder, "--out", folder)
+    assert len(list(folder.iterdir())) == 16
+    run("compare", *pair, "--truth", "4", "--out", tmp_path / "out")
+    assert (tmp_path / "out" / "pr.png").exists()
+    run("compare", *pair, "--out", tmp_path / "out")
+    assert not (tmp_path / "out" / "pr.png").exists()
+    assert (tmp_path / "out" / "coverage.png").exists()
+
+
+def test_frames_of_other_sizes_are_told_before_learning_and_in_one_line(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "large.npy", frames(96, size=48))
+    error = fails(capsys, "compare", pair[0], tmp_path / "large.npy", "--out", tmp_path / "out")
+    assert "324 features a frame of 1 x 32 x 32" in error
+    assert "900 features a frame of 1 x 48 x 48" in error
+    run("learn", pair[0], "--map", tmp_path / "map.safetensors")
+    capsys.readouterr()
+    options = ("--out", tmp_path / "m.csv")
+    error = fails(capsys, "localize", tmp_path / "map.safetensors", tmp_path / "large.npy", *options)
+    assert "frames of 1 x 48 x 48 give 900 features; the map expects 324" in error
+    run("info", tmp_path / "map.safetensors")
+    assert "learnt from frames of 1 x 32 x 32" in capsys.readouterr().out
+
+
+def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -> None:
+    config = ("--config", str(Path(__file__).parents[1] / "configs" / "paper.yaml"))
+    window = ("--periods.window", "64")
+    for name, options in {"before": (*window, *config), "after": (*config, *window)}.items():
+        run("learn", "sim:aerial?frames=64", "--map", tmp_path / f"{name}.safetensors", *options)
+        model = DejaVu.load(tmp_path / f"{name}.safetensors")
+        assert (model.periods.window, model.periods.peaks) == (64, "bins")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ("compare a b --tolerance 5.0 --out x", "--tolerance is 5.0; expected a whole number"),
+        ("compare a b --threshold high --out x", "--threshold: expected a number"),
+        ("learn a --map b --preprocess.contrast high", "--preprocess.contrast: expected 'patch', 'clahe'"),
+        ("learn a --map b --preprocess.grid 2,2", "--preprocess.grid is 2,2; expected a list such as"),
+        ("learn a --map b --reduction avg", "--reduction is avg; expected 'mean', 'sum'"),
+        ("learn a --map b --periods.windw 3", "--periods: Option 'windw' is not accepted"),
+        ("learn a", "required: --map"),
+        ("localize a", "required: source, --out"),
+        ("evaluate", "required: matches, --truth, --out"),
+    ],
+)
+def test_mistakes_are_told_plainly(arguments: str, told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert told in fails(capsys, *arguments.split())
+
+
+def test_a_map_without_layers_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "flat.npy", np.full((40, 16, 16), 99, np.uint8))
+    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "map.safetensors")
+    run("localize", tmp_path / "map.safetensors", tmp_path / "flat.npy", "--out", tmp_path / "m.csv")
+    assert "the map holds no layers: no place can be reported" in capsys.readouterr().out
+
+
+def test_options_that_do_nothing_for_ready_features_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    np.save(tmp_path / "features.npy", np.random.default_rng(0).normal(size=(64, 8)).astype(np.float32))
+    arguments = (tmp_path / "features.npy", "--map", tmp_path / "map.safetensors")
+    run("learn", *arguments)
+    assert "ready features" not in caplog.text
+    run("learn", *arguments, "--preprocess.channel", "R-B")
+    assert "these are ready features: channel and contrast are left as they are" in caplog.text

@@ -40,8 +40,9 @@ def assert_told(table: dict[str, list[str]], report: dict[str, Any], entries: di
         entry = report[key] if key else report
         told, measured = [float(cell) for cell in table[name][:4]], [entry[k] for k in KEYS]
         # another machine rounds otherwise; recall at 100 % precision hangs on single frames
-        assert told[:2] == pytest.approx(measured[:2], abs=0.02), name
-        assert told[2:] == pytest.approx(measured[2:], abs=0.1), name
+        assert told[:2] == pytest.approx(measured[:2], rel=0.05, abs=0.003), name
+        assert told[2] == pytest.approx(measured[2], abs=0.1), name
+        assert told[3] == pytest.approx(measured[3], rel=0.05, abs=0.003), name
 
 
 def test_the_dashes_of_the_motorway_are_found(

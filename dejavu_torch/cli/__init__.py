@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     parser = build_parser()
     try:
-        parsed = parser.parse_args(given)
+        parsed = parser.parse_args(_config_first(given))
         if parsed.command is None:
             parser.print_help()
             raise SystemExit(2)
@@ -58,6 +58,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("dejavu: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _config_first(given: list[str]) -> list[str]:
+    """The command line with its config files ahead of the options, which then have the last word."""
+    taken = {i for i, word in enumerate(given) if word.startswith("--config=")}
+    for i, word in enumerate(given[:-1]):
+        if word == "--config":
+            taken |= {i, i + 1}
+    config = [given[i] for i in sorted(taken)]
+    return (
+        given[:1] + config + [word for i, word in enumerate(given) if i and i not in taken]
+        if given
+        else given
+    )
 
 
 def fail(message: str) -> NoReturn:

@@ -16,6 +16,7 @@ from dejavu_torch.experiments.evaluate import evaluate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
+from dejavu_torch.types import InputError
 
 
 def run_demo(out: Path, seed: int, model: DejaVu, command: str) -> None:
@@ -43,6 +44,8 @@ def run_localize(map: Path, source: str, out: Path, threshold: float | None, fea
     model.threshold = model.threshold if threshold is None else threshold
     if model.threshold is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
+    if not model.map.plan:
+        print("the map holds no layers: no place can be reported")
     queries, accepted = write_matches(out, model.matches(open_source(source), progress=True))
     print(f"{queries} queries, {accepted} accepted; written to {out}")
 
@@ -60,7 +63,7 @@ def run_compare(
 ) -> None:
     """Learn, localize and judge; report beside baselines and null control."""
     pair = open_source(reference), open_source(query)
-    make_output_folder(out)
+    _make_report_folder(out, reference, query)
     result = compare(*pair, truth, model, tolerance, leave_out, interpolate=interpolate, progress=True)
     _publish(result, out, f"{query} found on {reference}", command)
 
@@ -77,7 +80,7 @@ def run_evaluate(
 ) -> None:
     """Judge the matches in a csv, whatever found them."""
     pair = [None if source is None else open_source(source) for source in (reference, query)]
-    make_output_folder(out)
+    _make_report_folder(out, reference, query)
     result = evaluate(matches, truth, tolerance, interpolate, *pair)
     write_report(out, result.report, result.pictures, f"{matches} judged by {truth}", command)
     _print_scores(result.report, out)
@@ -87,6 +90,9 @@ def run_info(map: Path, features: Any) -> None:
     """Tell what is in a map."""
     model = DejaVu.load(map, features)
     _print_plan(model)
+    if model.learnt_from is not None:
+        kind = "frames of " if len(model.learnt_from) == 3 else "ready features, "
+        print(f"learnt from {kind}{' x '.join(str(n) for n in model.learnt_from)}")
     for part in (model.preprocess, model.features, model.periods, model.matcher):
         print(f"{type(part).__name__}: {part.extra_repr()}")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
@@ -94,8 +100,18 @@ def run_info(map: Path, features: Any) -> None:
 
 def run_bench(what: str, out: Path) -> None:
     """Time this package beside what a user would pick instead."""
-    print(text_table(bench.bench_table(bench.run_bench(what, out))))
+    rows = bench.run_bench(what, out)
+    print(text_table(bench.bench_table(rows)))
+    if any("No module" in (row.skipped or "") for row in rows):
+        print("what is skipped comes with pip install '.[bench]'")
     print(f"x ours: seconds / those of the fastest dejavu; written to {out / 'bench.json'}")
+
+
+def _make_report_folder(out: Path, *sources: str | None) -> None:
+    """Make the folder of a report, which must not be where images lie."""
+    if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
+        raise InputError(f"{out} holds the images; expected another folder for the report")
+    make_output_folder(out)
 
 
 def _print_plan(model: DejaVu) -> None:

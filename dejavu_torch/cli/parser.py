@@ -35,6 +35,16 @@ PARTS = {
 }
 
 
+REQUIRED = {"learn.map": "--map", "out": "--out", "truth": "--truth"}
+TYPES = {
+    "int": "a whole number",
+    "float": "a number",
+    "tuple": "a list such as '[90,160]'",
+    "bool": "true or false",
+}
+LONGEST = 300  # characters of an error
+
+
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
     """Help without the list of every class that is installed."""
 
@@ -56,10 +66,31 @@ class Parser(jsonargparse.ArgumentParser):
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         # of a union's complaints the first is the one about what the user wrote
         union = re.search(r"Errors:\n\s*- (.*?)(?=\n\s*- |\n  Given|\Z)", message, re.DOTALL)
-        key, _, rest = message.partition(":")
-        if key.endswith("required"):
-            message = f"{key}: {re.sub(r'[a-z]+[.]', '', rest).strip()}"
-        raise UsageError(f"{key}: {union[1]}" if union else message) from ex
+        complaint = f"{message.partition(':')[0]}: {union[1]}" if union else message
+        raise UsageError(_plainly(complaint)) from ex
+
+
+def _plainly(message: str) -> str:
+    """jsonargparse's complaint as a user would put it: options by their names, types in words."""
+    head, _, names = message.partition("required: ")
+    if names:
+        needed = [name if name in REQUIRED else name.rpartition(".")[2] for name in names.split(", ")]
+        return f"{head}required: {', '.join(REQUIRED.get(name, name) for name in needed)}"
+    text, keys = " ".join(message.split()), []
+    while key := re.match(r'(?:Parser )?[Kk]ey "([\w.]+)": ', text):
+        keys.append(key[1])
+        text = text[key.end() :]
+    name = f"--{'.'.join(keys)}"
+    if keys and text.startswith("--"):  # told of a part by the part's own parser
+        return f"{name}.{text[2:]}"
+    wrong = re.match(r"Expected an? (.*?)(?:\. Got value: (.*))?$", text)
+    if keys and wrong:
+        choices = re.search(r"Literal\[(.*)\]", wrong[1])
+        kind = choices[1] if choices else re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", wrong[1])
+        seen = f" is {wrong[2][:80]}; expected " if wrong[2] else ": expected "
+        return f"{name}{seen}{TYPES.get(kind, kind)}"
+    told = f"{name}: {text}" if keys else message
+    return told if len(told) < LONGEST else f"{told[:LONGEST]} ..."
 
 
 def build_parser() -> Parser:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from dejavu_torch.types import InputError, Traverse
 
@@ -19,15 +20,26 @@ SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", "
 class ImageFolder(Traverse):
     """The images of a folder, sorted by name; numbers in names count as numbers (9 before 10).
 
-    Grey images give one channel, all others three.
+    Grey images give one channel, all others three; a camera held upright is turned as its image says.
+
+    Args:
+        path: the folder.
+        width, height: pixels to resize each image to as it is read, antialiased; 0 keeps the image's
+            own, or its aspect ratio where only the other is given.
+        step: every step-th image, from the first.
 
     Raises:
-        InputError: no such folder, or no images in it; while reading, an image that cannot be read or
-            that has another size than the first.
+        InputError: width, height or step out of range; no such folder, or no images in it; while
+            reading, an image that cannot be read or that has another size than the first.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, width: int = 0, height: int = 0, step: int = 1) -> None:
         folder = Path(path)
+        if width < 0 or height < 0 or step < 1:
+            raise InputError(
+                f"{path}: width={width}, height={height}, step={step}; "
+                "expected width and height of at least 0, and step of at least 1"
+            )
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
         files = [
@@ -36,8 +48,12 @@ class ImageFolder(Traverse):
             if file.suffix.lower() in SUFFIXES and file.is_file() and file.name[0] != "."
         ]
         if not files:
-            raise InputError(f"{folder} holds no images; expected files such as .png or .jpg")
-        self.files = sorted(files, key=lambda file: _natural(file.name))
+            inner = next(
+                (f"; it has folders such as {file.name}" for file in folder.iterdir() if file.is_dir()), ""
+            )
+            raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
+        self.files = sorted(files, key=lambda file: _natural(file.name))[::step]
+        self.width, self.height = width, height
         self.name = str(folder)
         self.length = len(self.files)
 
@@ -46,7 +62,7 @@ class ImageFolder(Traverse):
         for start in range(0, len(self.files), size):
             frames = []
             for file in self.files[start : start + size]:
-                frame = read_image(file)
+                frame = self._resized(read_image(file))
                 first = frame if first is None else first
                 if frame.shape != first.shape:
                     raise InputError(
@@ -54,6 +70,15 @@ class ImageFolder(Traverse):
                     )
                 frames.append(frame)
             yield torch.stack(frames)
+
+    def _resized(self, frame: Tensor) -> Tensor:
+        h, w = frame.shape[1:]
+        width = self.width or (max(1, round(w * self.height / h)) if self.height else w)
+        height = self.height or (max(1, round(h * self.width / w)) if self.width else h)
+        if (height, width) == (h, w):
+            return frame
+        small = interpolate(frame[None], (height, width), mode="bilinear", antialias=True)[0]
+        return small.clamp(0, 1)
 
 
 def read_image(path: Path) -> Tensor:
@@ -63,7 +88,8 @@ def read_image(path: Path) -> Tensor:
         InputError: the file cannot be read as an image.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(path) as opened:
+            image = ImageOps.exif_transpose(opened)
             if image.mode.startswith(("I", "F")):  # 16-bit grey, or floats that are in [0, 1] already
                 scale = 65535 if image.mode.startswith("I") else 1
                 pixels = np.asarray(image, dtype=np.float32)[..., None] / scale

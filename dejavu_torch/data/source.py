@@ -18,7 +18,7 @@ from dejavu_torch.types import InputError, Traverse
 
 SIMULATORS: dict[str, Callable[..., Traverse]] = {"aerial": AerialRoad}
 EXPECTED = (
-    "a folder of images, an .npy file of frames or features, a video such as clip.mp4?width=160, "
+    "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, "
     "sim:aerial?seed=0&traverse=0&frames=3072, or strip:IMAGE?width=96"
 )
 
@@ -27,9 +27,9 @@ def open_source(source: str | Path) -> Traverse:
     """Open what a command was given to read.
 
     Args:
-        source: a folder of images (sorted by name); an `.npy` file of frames (N,H,W) or (N,H,W,3)
-            uint8, or of features (N,D) float; a video file, `clip.mp4` or
-            `clip.mp4?width=160&height=90&step=2`; `sim:NAME?seed=0&traverse=0&frames=3072`; or
+        source: a folder of images (sorted by name), `photos` or `photos?width=160&height=90&step=2`; a
+            video file, `clip.mp4` or with the same options; an `.npy` file of frames (N,H,W) or
+            (N,H,W,3) uint8, or of features (N,D) float; `sim:NAME?seed=0&traverse=0&frames=3072`; or
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window slid along one long image.
 
     Raises:
@@ -49,19 +49,20 @@ def open_source(source: str | Path) -> Traverse:
     if text.startswith("strip:"):
         name, _, query = text.removeprefix("strip:").partition("?")
         return read_strip(Path(name), **_arguments(text, query, read_strip))
-    path = Path(text)
-    if path.is_dir():
-        return ImageFolder(path)
-    name, _, query = text.rpartition("?")
-    if not path.exists() and Path(name).suffix.lower() in VIDEO_SUFFIXES:
-        return Video(Path(name), **_arguments(text, query, Video))
+    path, query = Path(text), ""
+    if not path.exists() and "?" in text:
+        name, _, query = text.rpartition("?")
+        path = Path(name)
     if not path.exists():
-        raise InputError(f"{path} is not there; expected {EXPECTED}")
-    if path.suffix.lower() == ".npy":
-        return read_array(path)
-    if path.suffix.lower() in VIDEO_SUFFIXES:
-        return Video(path)
-    if path.suffix.lower() in SUFFIXES:
+        raise InputError(f"{text} is not there; expected {EXPECTED}")
+    if path.is_dir():
+        return ImageFolder(path, **_arguments(text, query, ImageFolder))
+    suffix = path.suffix.lower()
+    if suffix in VIDEO_SUFFIXES:
+        return Video(path, **_arguments(text, query, Video))
+    if suffix == ".npy":
+        return read_array(path, **_arguments(text, query, read_array))
+    if suffix in SUFFIXES:
         raise InputError(f"{path} is a single image; expected {EXPECTED}")
     raise InputError(f"{path} is none of the kinds that can be read; expected {EXPECTED}")
 
@@ -76,7 +77,7 @@ def _arguments(text: str, query: str, function: Callable[..., Any]) -> dict[str,
     given: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
         if name not in parameters:
-            raise InputError(f"{text}: unknown {name!r}; expected {', '.join(parameters)}")
+            raise InputError(f"{text}: unknown {name!r}; expected {', '.join(parameters) or 'no options'}")
         default = parameters[name].default
         kind = int if default is inspect.Parameter.empty or isinstance(default, bool) else type(default)
         try:

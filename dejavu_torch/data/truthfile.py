@@ -77,6 +77,27 @@ def find_truth(
     return _answered(as_truth(right), f"within {radius:g} m of {reference.name}")
 
 
+def describe_truth(truth: str | None, interpolate: bool = False, positions: bool = False) -> str:
+    """What `find_truth` takes for the truth, in words.
+
+    Args:
+        positions: whether both traverses carry their positions.
+
+    Example:
+        >>> describe_truth("12"), describe_truth(None)
+        ('place = query + 12', 'place = query, since both have as many frames')
+    """
+    if truth is None:
+        carried = "the positions that both traverses carry"
+        return carried if positions else "place = query, since both have as many frames"
+    offset, radius = _offset(truth), _radius(truth)
+    if offset is not None:
+        return "place = query" + (f" {'-' if offset < 0 else '+'} {abs(offset)}" if offset else "")
+    if radius is not None:
+        return f"within {radius:g} m by the coordinates in image names"
+    return f"{truth}, interpolated" if interpolate else truth
+
+
 def read_truth(truth: str, places: int | None, queries: int | Tensor, interpolate: bool = False) -> Truth:
     """The truth that a text means.
 
@@ -84,7 +105,8 @@ def read_truth(truth: str, places: int | None, queries: int | Tensor, interpolat
         truth: one of
 
             - an integer offset: place = query + offset;
-            - a `.csv` of `query,place[,place...]`, with or without a header: every listed place is right.
+            - a `.csv` of `query,place[,place...]`, with or without such a header: every listed place is
+              right, so no other columns.
               A query listed without a place, or with -1, has no right answer; a query not listed is not
               known, and is left out of the scores;
             - an `.npz` with the boolean matrices (places, queries) `GThard` and/or `GTsoft`, as the visual

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -117,13 +116,22 @@ def _table_rows(path: Path) -> list[tuple[int, list[str]]]:
     """Number and cells of each line that is not blank, without the header."""
     text = read_text(path, "lines of query,place").replace('"', "")
     # where semicolons separate, a comma may be a decimal one: it stays in its cell and is refused
-    separator = r"[;\s]+" if ";" in text else r"[,\s]+"
-    lines = [(number, line.lstrip().rstrip(",; \t")) for number, line in enumerate(text.split("\n"), 1)]
-    rows = [(number, re.split(separator, line)) for number, line in lines if line]
+    separator = next((sign for sign in ";\t," if sign in text), None)
+    rows = []
+    for number, line in enumerate(text.split("\n"), 1):
+        cells = [cell.strip() for cell in line.strip(" ").split(separator)]
+        while cells and not cells[-1]:
+            del cells[-1]
+        if cells:
+            rows.append((number, cells))
     if rows and all(as_number(cell) is None for cell in rows[0][1]):
         number, names = rows.pop(0)
-        if "query" in [name.lower() for name in names[1:]]:
-            raise InputError(f"{path}, line {number}: columns {','.join(names)}; expected query,place")
+        first, *others = [name.lower() for name in names]
+        # another column, such as a distance, would count as a right place
+        if first != "query" or any(name and not name.startswith("place") for name in others):
+            raise InputError(
+                f"{path}, line {number}: columns {','.join(names)}; expected query,place[,place...]"
+            )
     return rows
 
 

@@ -93,7 +93,7 @@ def describe(certificate: Certificate) -> str:
         lcm = _number(chunk.common_period) if chunk.common_period < 10**9 else "over 1e9"
         layers = f"{len(chunk.periods)} layer{'s' * (len(chunk.periods) > 1)}"
         line = f"frames {chunk.start}-{chunk.stop - 1}: {layers}, periods {shown}" + (
-            f" and {more} smaller layers" if more else ""
+            f" and {more} smaller layer{'s' * (more > 1)}" if more else ""
         )
         line += f"; lcm {lcm} frames"
         if chunk.shared_factors:

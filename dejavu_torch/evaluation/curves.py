@@ -85,6 +85,24 @@ def recall_at_full_precision(curve: PRCurve) -> float:
     return float(perfect.max()) if len(perfect) else 0.0
 
 
+def threshold_of_full_precision(curve: PRCurve) -> float | None:
+    """The threshold that accepts as many as possible while every report is right; None where none does.
+
+    It lies half way from the last score that does to the first that does not.
+
+    Example:
+        >>> scores, right = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([True, True, False])
+        >>> threshold_of_full_precision(pr_curve(scores, right, torch.ones(3, dtype=torch.bool)))
+        2.5
+    """
+    perfect = (curve.precision == 1).nonzero().flatten()
+    if len(perfect) == 0:
+        return None
+    last = float(curve.threshold[perfect[-1]])
+    beyond = curve.threshold[perfect[-1] + 1 :]
+    return (last + float(beyond[0])) / 2 if len(beyond) else last * (1 + 1e-6) + 1e-12
+
+
 def curve_of(
     match: Match, truth: Tensor | Truth, tolerance: int, recall: Literal["all", "reported"] = "all"
 ) -> PRCurve:

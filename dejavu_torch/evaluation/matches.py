@@ -25,9 +25,10 @@ def write_matches(path: Path, matches: Iterable[Match]) -> tuple[int, int]:
         writer = csv.writer(file)
         writer.writerow(["query", "place", "score", "accepted"])
         for match in matches:
+            digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
             rows = zip(match.index.tolist(), match.score.tolist(), match.accepted.tolist(), strict=True)
             for place, score, good in rows:
-                writer.writerow([total, place, f"{score:.9g}", int(good)])
+                writer.writerow([total, place, f"{score:.{digits}g}", int(good)])
                 total += 1
                 accepted += good
     return total, accepted

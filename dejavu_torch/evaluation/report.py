@@ -14,19 +14,27 @@ from dejavu_torch.data.files import whole_file
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import Picture
 
+PICTURES = ("pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations")
+LATE = 0.1  # recall at which a curve starts late
+
 
 class Contender(NamedTuple):
-    """Scores of one way to store the route, and what it stores; k where it stores every k-th frame."""
+    """Scores of one way to store the route, and what it stores.
+
+    k: where it stores every k-th frame. starts: the recall at which its curve starts, which is that of
+    all the queries that share the best score.
+    """
 
     name: str
     scores: Scores | None
     bytes: int | None = None
     k: int | None = None
+    starts: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The nested entry of report.json."""
         scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
-        extra = {"bytes": self.bytes, "k": self.k}
+        extra = {"bytes": self.bytes, "k": self.k, "curve_starts_at_recall": self.starts}
         return scores | {name: value for name, value in extra.items() if value is not None}
 
 
@@ -72,6 +80,8 @@ def write_report(
         shown.append(_picture(picture, buffer.getvalue()))
         with whole_file(folder / f"{name}.png") as temporary:
             temporary.write_bytes(buffer.getvalue())
+    for name in set(PICTURES) - set(pictures):  # of an earlier report
+        (folder / f"{name}.png").unlink(missing_ok=True)
     with whole_file(folder / "index.html") as temporary:
         temporary.write_text(_page(report, "".join(shown), title, command, plan), encoding="utf-8")
     with whole_file(folder / "report.json") as temporary:
@@ -92,13 +102,24 @@ def score_table(report: Report) -> list[list[str]]:
     """The scores as rows of text, the header first; bytes only where the number of frames is known."""
     frames = report.facts.get("frames")
     rows = [["", *_COLUMNS.values(), *(["bytes", "per place"] if frames else [])]]
-    for contender in (report.ours, *report.contenders.values()):
+    for contender in shown(report):
         s, size = contender.scores, contender.bytes
         row = [contender.name, *(f"{getattr(s, field):.3f}" if s else "" for field in _COLUMNS)]
+        if (contender.starts or 0) > LATE:
+            row[1] += "*"
         if frames:
             row += [f"{size}", f"{size / frames:.1f}"] if size else ["", ""]
         rows.append(row)
     return rows
+
+
+def shown(report: Report) -> list[Contender]:
+    """What a table lists: ours, and the others without those that store the same frames as one before."""
+    kept: list[Contender] = []
+    for contender in report.contenders.values():
+        if contender.k is None or contender.k not in [other.k for other in kept]:
+            kept.append(contender)
+    return [report.ours, *kept]
 
 
 def text_table(rows: list[list[str]]) -> str:
@@ -118,6 +139,7 @@ def summary(report: Report) -> str:
     facts = report.facts
     places = f" on {facts['frames']} places" if "frames" in facts else ""
     right = f"right within {facts['tolerance']} frames"
+    right += f" of the truth ({facts['truth']})" if facts.get("truth") else ""
     scored = right if report.ours.scores else "no truth was given, so nothing is scored"
     told = [f"{facts['queries']} queries{places}; {scored}"]
     if facts.get("unknown"):
@@ -128,6 +150,15 @@ def summary(report: Report) -> str:
         told.append(
             f"Of {facts['judged']} judged {facts['accepted']} are accepted, {facts['accepted_right']} rightly"
         )
+    if facts.get("threshold_of_full_precision") is not None:
+        told.append(
+            f"Here --threshold {facts['threshold_of_full_precision']:.9g} would accept right places only"
+        )
+    if any((contender.starts or 0) > LATE for contender in shown(report)):
+        told.append(
+            f"*: this curve starts at a recall above {LATE}, since many queries share the best score; what "
+            "lies before is no area"
+        )
     if "seconds_learn" in facts:
         told.append(
             f"Learning took {facts['seconds_learn']:.1f} s, localizing {facts['seconds_localize']:.1f} s"
@@ -137,7 +168,7 @@ def summary(report: Report) -> str:
 
 _NOTE = """
 R@100P: recall at 100 % precision; P@100R: precision when every query reports; rep.: the second definition of
-recall. A curve starts at its first threshold: matches that all have one score enclose no area.
+recall, *_reported. A curve starts at its first threshold: matches that all have one score enclose no area.
 """
 
 _NULL_NOTE = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,18 +11,26 @@ import torch
 
 import dejavu_torch
 from dejavu_torch.data.truth import as_truth, counted
-from dejavu_torch.data.truthfile import check_truth_text, find_truth
+from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
 from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
-from dejavu_torch.evaluation.curves import RECALL_DEFINITION, judge, tally
+from dejavu_torch.evaluation.curves import (
+    RECALL_DEFINITION,
+    curve_of,
+    judge,
+    tally,
+    threshold_of_full_precision,
+)
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Contender, Report
 from dejavu_torch.experiments.pictures import draw_pictures
-from dejavu_torch.features.extract import frame_shape
+from dejavu_torch.features.extract import feature_batches, frame_shape
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
 from dejavu_torch.types import InputError, Match, Traverse, Truth
+
+log = logging.getLogger("dejavu_torch")
 
 
 class Comparison(NamedTuple):
@@ -68,13 +77,18 @@ def compare(
         known = find_truth(truth, reference, query, reference.length, query.length or 0, interpolate)
     elif truth is not None:
         check_truth_text(truth, interpolate)
+    if reference.name == query.name:
+        log.warning(
+            "%s is matched with itself, every frame with its own; judge on a second traverse", query.name
+        )
     model = DejaVu() if model is None else model
+    _check_sizes(model, reference, query)
     began = time.perf_counter()
     stored = model.extract_all(reference, "learning" if progress else None)
     model.learn_features(stored, frame_shape(reference))
     learnt = time.perf_counter()
-    model.check_queries(frame_shape(query), query.name)
     seen = model.extract_all(query, "localizing" if progress else None)
+    model.check_queries(frame_shape(query), seen.shape[1], query.name)
     match = model.localize(seen)
     localized = time.perf_counter()
 
@@ -89,7 +103,7 @@ def compare(
     everything, strided, sparse = nearest_frames(stored, seen, (1, k, coarsest), metric, progress)
     found = {
         "uncompressed": (f"all {len(stored)} frames", everything, 1),
-        "stride": (f"{_every(k)} (the map's bytes)", strided, k),
+        "stride": (f"{_every(k)} (at least the map's bytes)", strided, k),
         "stride_coarsest": (f"{_every(coarsest)} (2 x tolerance)", sparse, coarsest),
         "null": (
             "null: all learnt shuffled",
@@ -109,8 +123,11 @@ def compare(
     def contender(
         name: str, match: Match, truth: Truth | None, bytes: int | None, k: int | None
     ) -> Contender:
-        judged = truth is not None and bool(counted(match.index, truth, tolerance).any())
-        return Contender(name, judge(match, truth, tolerance) if truth and judged else None, bytes, k)
+        if truth is None or not counted(match.index, truth, tolerance).any():
+            return Contender(name, None, bytes, k)
+        recall = curve_of(match, truth, tolerance).recall
+        starts = float(recall[0]) if len(recall) else None
+        return Contender(name, judge(match, truth, tolerance), bytes, k, starts)
 
     contenders = {}
     for key, (name, other, stride) in found.items():
@@ -153,11 +170,25 @@ def compare(
         "torch": torch.__version__,
     }
     if known is not None:
+        positions = reference.place is not None and query.place is not None
         facts |= tally(match, known, tolerance)
+        facts["truth"] = describe_truth(truth, interpolate, positions)
+        facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
     ours = contender("this map", match, known, size, None)
     pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, found)
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     return Comparison(Report(ours, contenders, facts), match, model, pictures)
+
+
+def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
+    """Refuse, before the long work, traverses whose frames do not give as many features."""
+    told, counts = [], []
+    for traverse in (reference, query):
+        counts.append(next(feature_batches(traverse, model.pipeline, 1)).shape[1])
+        size = " x ".join(map(str, frame_shape(traverse)))
+        told.append(f"{traverse.name} gives {counts[-1]} features a frame of {size}")
+    if counts[0] != counts[1]:
+        raise InputError(f"{' and '.join(told)}; expected as many, as ?width= and ?height= behind both make")
 
 
 def _plain(period: object) -> int | float:

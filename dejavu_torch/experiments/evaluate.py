@@ -10,8 +10,14 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.truthfile import check_truth_text, find_truth
-from dejavu_torch.evaluation.curves import RECALL_DEFINITION, curve_of, judge, tally
+from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
+from dejavu_torch.evaluation.curves import (
+    RECALL_DEFINITION,
+    curve_of,
+    judge,
+    tally,
+    threshold_of_full_precision,
+)
 from dejavu_torch.evaluation.matches import read_matches
 from dejavu_torch.evaluation.plots import Picture, plot_coverage, plot_curves
 from dejavu_torch.evaluation.report import Contender, Report
@@ -44,7 +50,7 @@ def evaluate(
         tolerance: frames within which a place is right, inclusive.
         interpolate: see `read_truth`.
         reference, query: the traverses, where the truth lies in them; a reference also tells how many
-            places there are.
+            places there are: without it, an offset gives every query a right place.
 
     Raises:
         InputError: matches or truth that cannot be read, do not fit each other, or leave nothing to judge.
@@ -61,22 +67,24 @@ def evaluate(
     if known is None:
         raise InputError("there is no truth; expected one, or two traverses that carry their positions")
     counts = tally(match, known, tolerance)
+    curve = curve_of(match, known, tolerance)
     facts = counts | {
         "accepted_precision": counts["accepted_right"] / counts["accepted"] if counts["accepted"] else None,
         "tolerance": tolerance,
         "recall_definition": RECALL_DEFINITION,
         "matches": str(matches),
-        "truth": truth,
+        "places": places,
+        "truth": describe_truth(truth, interpolate, positions=True),
+        "threshold_of_full_precision": threshold_of_full_precision(curve),
         "version": dejavu_torch.__version__,
         "torch": torch.__version__,
     }
-    ours = Contender(matches.name, judge(match, known, tolerance))
+    starts = float(curve.recall[0]) if len(curve.recall) else None
+    ours = Contender(matches.name, judge(match, known, tolerance), starts=starts)
     seen = 1 + max(int(table.max()) for table in (match.index, known.right))
     pictures = {
         "pr": Picture(
-            plot_curves(
-                {matches.name: curve_of(match, known, tolerance)}, f"right within {tolerance} frames"
-            ),
+            plot_curves({matches.name: curve}, f"right within {tolerance} frames"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises.",

@@ -56,7 +56,11 @@ def draw_pictures(
     plan, places = model.map.plan, model.map.places
     curves = {}
     if truth is not None:
-        others = [(name, other) for key, (name, other, _) in found.items() if key != "leave_out"]
+        others, strides = [], []
+        for key, (name, other, stride) in found.items():
+            if key != "leave_out" and (stride is None or stride not in strides):
+                others.append((name, other))
+                strides.append(stride)
         curves = {  # leave_out has other queries
             name: curve_of(one, truth, tolerance)
             for name, one in [("this map", match), *others]
@@ -72,8 +76,9 @@ def draw_pictures(
         pictures["auc"] = Picture(
             plot_auc({name: area(curve) for name, curve in curves.items()}),
             "area under each curve",
-            "The curves above in one number each, 1 at best: this map, baselines that store frames, and "
-            "nulls, in which nothing repeats.",
+            "The curves above in one number each: this map, baselines that store frames, and nulls, in which "
+            "nothing repeats. A curve starts where the queries of the best score report; what lies to the "
+            "left of it is no area.",
         )
     pictures["coverage"] = Picture(
         plot_coverage(match, truth, tolerance, places),
@@ -200,15 +205,17 @@ def draw_activations(
         scores = [layer_distances(model, one, j)[0, plan[j].place_phases].cpu() for j in chosen]
         fused = model.matcher(one.to(model.map.size.device), model.map)[0, start:stop].cpu()
     strip = slit_scan(reference, start, stop)
+    covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
     told = (
         f" Right: within {tolerance} frames, for a layer in phase. Elsewhere: queries from other chunks, the "
-        "layer's phase counted on; near chance where its period ends with the chunk."
+        "layer's phase counted on; near chance where its period ends with the chunk. All layers fused choose "
+        "from the whole route."
     )
     picture = Picture(
         plot_activations(layers, scores, fused, query, places, strip, rates),
-        "two layers and their fusion",
-        "How much one query differs from each place of a chunk: a layer alone fits one place a period, "
-        "together they fit one." + (told if rates else ""),
+        "two layers, and all layers fused",
+        "How much one query differs from each place of a chunk: a layer alone fits one place a period, all "
+        f"{covering} of the chunk together one." + (told if rates else ""),
         {} if rates is None else rates.as_json(),
     )
     return {"activations": picture}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
@@ -9,6 +10,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from dejavu_torch.types import InputError, Traverse
+
+BATCH_NUMBERS = 2**26  # in the frames of a batch, 256 MB
 
 
 def feature_batches(
@@ -23,6 +26,7 @@ def feature_batches(
     Args:
         traverse: frames (B,C,H,W), or ready features (B,D), which pass as they are.
         module: (B,C,H,W) -> (B,D). Runs in eval mode; its own mode is restored.
+        batch_size: frames in memory at a time; fewer where they are large.
         progress: text of a progress bar on stderr, shown on a terminal only; None is no bar.
 
     Shape: yields (B,D) float.
@@ -37,7 +41,8 @@ def feature_batches(
     )
     try:
         module.eval()
-        for batch in traverse.batches(batch_size):
+        room = BATCH_NUMBERS // max(1, math.prod(frame_shape(traverse)))
+        for batch in traverse.batches(max(1, min(batch_size, room))):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
             if features.dtype in (torch.float16, torch.bfloat16):  # too coarse to add up and to transform

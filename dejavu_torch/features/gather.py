@@ -20,8 +20,9 @@ def gather(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor:
 
     Args:
         batches: each (B,D), one number type.
-        in_memory: bytes kept in memory. More spill to a temporary file, which the tensor then maps: rows
-            are read when they are used. The file has no name and goes with the tensor or the process.
+        in_memory: about how many bytes to keep in memory. More spill to a temporary file, which the
+            tensor then maps: rows are read when they are used. The file has no name and goes with the
+            tensor or the process.
 
     Shape: (B,D), ... -> (N,D); on the CPU where it spilled.
 

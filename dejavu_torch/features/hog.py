@@ -171,7 +171,16 @@ def hog(
 
 
 class HOG(nn.Module):
-    """`hog` as a module; the arguments are those of the function.
+    """Histograms of oriented gradients: `hog` as a module.
+
+    Args:
+        orientations: unsigned orientation bins in 180 degrees.
+        cell: side of a square cell, pixels.
+        block: side of a square block, cells; blocks overlap.
+        resize: (height, width) in pixels to resize to first; None keeps the size.
+        bins: "hard": a pixel votes for one bin (as skimage); "linear": for the two nearest, the
+            trainable form.
+        gradient: "central" differences, or "sobel".
 
     Shape: (B,C,H,W) -> (B,D).
     """

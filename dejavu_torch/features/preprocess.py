@@ -182,10 +182,13 @@ class Preprocess(nn.Module):
     """`select_channel`, then `normalise_patches` ("patch") or `equalise` ("clahe"), as one module.
 
     Args:
-        channel: see `select_channel`; None keeps the frames' channels.
-        contrast: "patch", "clahe", or None, which keeps the contrast.
-        patch: pixels, for "patch".
-        clip_limit, grid: for "clahe".
+        channel: "grey", "R", "G", "B", or a difference such as "R-B"; None keeps the frames' channels.
+        contrast: "patch" normalises each pixel by the patch around it, "clahe" equalises the
+            histograms of tiles; None keeps the contrast.
+        patch: side of the patch for "patch", pixels, odd.
+        clip_limit: for "clahe": a grey level counts at most this many times as often as in a flat
+            histogram; 0 is no limit.
+        grid: (rows, columns) of tiles for "clahe".
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) where `channel` is None.
 

@@ -188,3 +188,30 @@ def test_a_damaged_image_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
         except InputError as error:
             assert str(path) in str(error)  # noqa: PT017
             assert "\n" not in str(error)  # noqa: PT017
+
+
+def test_images_are_resized_as_they_are_read(tmp_path: Path) -> None:
+    for i in range(3):
+        Image.fromarray(np.full((40, 60, 3), 40 * i + 20, np.uint8)).save(tmp_path / f"{i}.png")
+    for size, shape in (((30, 0), (20, 30)), ((0, 10), (10, 15)), ((12, 8), (8, 12)), ((0, 0), (40, 60))):
+        frames = all_of(ImageFolder(tmp_path, *size))
+        assert tuple(frames.shape) == (3, 3, *shape)
+        assert frames.mean((1, 2, 3)).mul(255).tolist() == pytest.approx([20, 60, 100], abs=1e-3)
+    assert all_of(ImageFolder(tmp_path, step=2)).mean((1, 2, 3)).mul(255).tolist() == pytest.approx([20, 100])
+    with refused("width=-1", "expected width and height of at least 0"):
+        ImageFolder(tmp_path, width=-1)
+
+
+def test_a_camera_held_upright_is_turned(tmp_path: Path) -> None:
+    picture = Image.fromarray(np.arange(12, dtype=np.uint8).reshape(3, 4) * 20)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # turn a quarter clockwise to see it upright
+    picture.save(tmp_path / "a.png", exif=exif)
+    expected = np.rot90(np.asarray(picture), -1) / 255
+    assert np.allclose(all_of(ImageFolder(tmp_path))[0, 0].numpy(), expected)
+
+
+def test_a_folder_of_folders_is_told(tmp_path: Path) -> None:
+    (tmp_path / "day").mkdir()
+    with refused("holds no images", "it has folders such as day"):
+        ImageFolder(tmp_path)

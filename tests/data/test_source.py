@@ -103,7 +103,7 @@ def test_a_source_gives_the_same_frames_whatever_the_batch() -> None:
     ("source", "words"),
     [
         ("nowhere.mp4", ["nowhere.mp4 is not there", "expected a folder", "clip.mp4?width=160"]),
-        ("nowhere.mp4?width=3", ["nowhere.mp4 is not there", "expected a video file"]),
+        ("nowhere.mp4?width=3", ["nowhere.mp4?width=3 is not there", "or a video"]),
         ("nowhere.png?width=3", ["nowhere.png?width=3 is not there", "expected a folder"]),
         ("nowhere", ["nowhere", "not there", "folder of images", ".npy", "sim:aerial"]),
         ("sim:moon?seed=1", ["'moon'", "expected aerial"]),
@@ -144,3 +144,19 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path, name: str) -> None:
 def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
     with refused(str(tmp_path), "no images"):
         open_source(tmp_path)
+
+
+def test_a_folder_takes_the_options_of_a_video(tmp_path: Path) -> None:
+    for i in range(4):
+        Image.new("RGB", (60, 40), (i, i, i)).save(tmp_path / f"{i}.png")
+    source = open_source(f"{tmp_path}?width=30&step=2")
+    assert source.length == 2
+    assert tuple(torch.cat(list(source.batches(8))).shape) == (2, 3, 20, 30)
+    with refused("unknown 'wide'", "expected width, height, step"):
+        open_source(f"{tmp_path}?wide=30")
+
+
+def test_an_array_takes_no_options(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((4, 8, 8), np.uint8))
+    with refused("unknown 'width'", "expected no options"):
+        open_source(f"{tmp_path / 'a.npy'}?width=4")

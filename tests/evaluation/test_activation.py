@@ -32,6 +32,12 @@ def test_rates_in_closed_form() -> None:
     }
 
 
+def test_the_chunk_ends_before_its_stop() -> None:
+    truth = as_truth(torch.tensor([[39], [40]]))
+    rates = activation_rates([layer(10, 10)], [torch.tensor([9, 5])], torch.tensor([39, 0]), truth, 0, 80)
+    assert rates.layers[0][:2] == (1.0, 0.0)
+
+
 def test_a_layer_that_covers_the_route_has_no_outside() -> None:
     truth = as_truth(torch.tensor([[3], [13]]))
     rates = activation_rates([layer(10, 10)], [torch.tensor([3, 3])], torch.tensor([3, 3]), truth, 0, 40)

@@ -22,6 +22,7 @@ from dejavu_torch.evaluation.curves import (
     pr_curve,
     recall_at_full_precision,
     tally,
+    threshold_of_full_precision,
 )
 from dejavu_torch.types import InputError, Match, PRCurve, Truth
 
@@ -346,3 +347,13 @@ def test_a_truth_whose_parts_do_not_fit_is_refused(known: tuple[int, ...], soft:
         judge(match_of([0, 1]), Truth(torch.zeros(2, 1).long(), *parts), 5)
     with refused("the truth is (3, 1)", "(2, R)"):
         judge(match_of([0, 1]), Truth(torch.zeros(3, 1).long(), *parts), 5)
+
+
+def test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more() -> None:
+    score, every = torch.tensor([3.0, 1.0, 2.0, 4.0]), torch.ones(4, dtype=torch.bool)
+    for right, count in (([1, 1, 1, 1], 4), ([0, 1, 1, 1], 2), ([0, 1, 0, 0], 1)):
+        curve = pr_curve(score, torch.tensor(right, dtype=torch.bool), every)
+        threshold = threshold_of_full_precision(curve)
+        assert threshold is not None
+        assert int((score < threshold).sum()) == count
+    assert threshold_of_full_precision(pr_curve(score, ~every, every)) is None

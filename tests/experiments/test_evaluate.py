@@ -72,7 +72,7 @@ def test_facts_by_hand(tmp_path: Path) -> None:
     assert {name: facts[name] for name in expected} == expected
     assert (facts["accepted_right"], facts["accepted_precision"]) == (2, pytest.approx(2 / 3))
     assert (facts["tolerance"], facts["recall_definition"]) == (3, RECALL_DEFINITION)
-    assert (facts["matches"], facts["truth"]) == (str(path), "0")
+    assert (facts["matches"], facts["truth"]) == (str(path), "place = query")
     assert {"version", "torch"} <= facts.keys()
     # the tolerance is inclusive, and decides over query 1
     assert evaluate(path, "0", tolerance=2).report.facts["accepted_right"] == 1
@@ -168,7 +168,8 @@ def test_report_of_an_evaluation(tmp_path: Path) -> None:
     page = (out / "index.html").read_text()
     for text in (
         "matches &lt;judged&gt;",
-        "5 queries; right within 3 frames. 4 of the queries are in the truth. ",
+        "5 queries; right within 3 frames of the truth (",
+        "truth.csv). 4 of the queries are in the truth. ",
         "Of 4 judged 3 are accepted, 2 rightly.",
         "<pre>dejavu evaluate matches.csv",
         "precision and recall</h2>",

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, InputError, Traverse
+from dejavu_torch.features import extract
 from dejavu_torch.features.extract import feature_batches, features_of, frame_shape
 
 
@@ -149,3 +150,11 @@ def test_frame_shape() -> None:
 def test_coarse_floats_become_float32() -> None:
     features = torch.rand(4, 3).bfloat16()
     assert next(feature_batches(Listed(features), HOG())).dtype == torch.float32
+
+
+def test_batches_of_large_frames_are_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extract, "BATCH_NUMBERS", 3 * 16 * 16 + 1)
+    frames = torch.rand(7, 1, 16, 16)
+    batches = list(feature_batches(ArrayTraverse(frames), HOG(), 64))
+    assert [len(batch) for batch in batches] == [3, 3, 1]
+    torch.testing.assert_close(torch.cat(batches), HOG()(frames))

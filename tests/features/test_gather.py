@@ -52,6 +52,11 @@ def test_memory_holds_no_more_than_its_share(tmp_path: Path, monkeypatch: pytest
     assert torch.equal(spilled[::4, 0], torch.arange(100.0))
 
 
+def test_batches_that_do_not_lie_in_a_row_spill_as_they_read() -> None:
+    features = torch.randn(5, 12).T
+    assert torch.equal(gather(features.split(5), in_memory=0), features)
+
+
 def test_a_full_disk_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     class Full:
         def flush(self) -> None: ...

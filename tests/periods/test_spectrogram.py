@@ -6,7 +6,6 @@ import logging
 import math
 from fractions import Fraction
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -351,11 +350,21 @@ def test_the_plan_does_not_depend_on_how_many_features_are_in_hand(
     assert finder.plan(features) == whole
 
 
-def test_planning_holds_less_than_the_features(
-    largest_tensor: type[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_planning_transforms_few_features_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = []
+    power = spectrogram._power
+
+    def watched(chunk: Tensor) -> Tensor:
+        sizes.append(chunk.numel())
+        return power(chunk)
+
     monkeypatch.setattr(spectrogram, "NUMBERS_AT_ONCE", 1024)
-    features = torch.randn(2048, 64)
-    with largest_tensor() as seen:
-        SpectrogramAnalysis(window=128, min_period=4).plan(features)
-    assert seen.numel <= 128 * 64  # one chunk, of eleven features at a time in what is made of it
+    monkeypatch.setattr(spectrogram, "_power", watched)
+    SpectrogramAnalysis(window=128).plan(torch.randn(2048, 64))
+    assert sizes == [1024] * (2048 * 64 // 1024)
+
+
+def test_a_feature_without_candidates_passes_no_test_for_noise() -> None:
+    """All its power lies in bin 1, where no period is sought."""
+    features = torch.stack([wave(256, 1), torch.randn(256, dtype=torch.float64)], 1)
+    assert SpectrogramAnalysis(window=256, min_period=100, false_alarm=1e-6).plan(features) == ()
