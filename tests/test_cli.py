@@ -222,7 +222,9 @@ def test_negative_offset_is_a_truth(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "r" / "report.json").read_text())["tolerance"] == 0
 
 
-@pytest.mark.parametrize("command", ["demo", "learn", "localize", "compare", "evaluate", "bench", "info"])
+@pytest.mark.parametrize(
+    "command", ["demo", "learn", "localize", "compare", "evaluate", "reproduce", "bench", "info"]
+)
 def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         run(command, "--help")

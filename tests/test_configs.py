@@ -8,6 +8,7 @@ import yaml
 from dejavu_torch import DejaVu
 from dejavu_torch.cli.parser import MODEL, build_parser
 from dejavu_torch.database.mapfile import recipe_of
+from dejavu_torch.experiments.reproduce import paper_model
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -57,3 +58,7 @@ def test_convention_3_paper_yaml_is_the_letter() -> None:
     assert recipe_of(model.periods).init_args == letter
     assert model.matcher.reduction == "sum"
     assert model.matcher.metric == "l1"
+
+
+def test_reproduce_uses_the_papers_letter() -> None:
+    assert settings(paper_model()) == settings(model_of("paper.yaml"))

@@ -21,6 +21,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "localize": commands.run_localize,
     "compare": commands.run_compare,
     "evaluate": commands.run_evaluate,
+    "reproduce": commands.run_reproduce,
     "bench": commands.run_bench,
     "info": commands.run_info,
 }
@@ -42,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         chosen.pop("config", None)
         if parsed.command in ("demo", "learn", "compare"):
             chosen["model"] = DejaVu(**{name: chosen.pop(name) for name in MODEL})
-        if parsed.command in ("demo", "compare", "evaluate"):
+        if parsed.command in ("demo", "compare", "evaluate", "reproduce"):
             chosen["command"] = shlex.join(["dejavu", *given])
         COMMANDS[parsed.command](**chosen)
     except UsageError as error:

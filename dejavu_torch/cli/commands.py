@@ -9,10 +9,18 @@ from dejavu_torch.data.files import check_output_file, make_output_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.certificate import describe
 from dejavu_torch.evaluation.matches import write_matches
-from dejavu_torch.evaluation.report import Report, score_table, summary, text_table, write_report
+from dejavu_torch.evaluation.report import (
+    Report,
+    score_table,
+    summary,
+    text_table,
+    write_index,
+    write_report,
+)
 from dejavu_torch.experiments import bench
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.evaluate import evaluate
+from dejavu_torch.experiments.reproduce import PUBLISHED, lengths_picture, reproduce, section_five
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
@@ -84,6 +92,25 @@ def run_evaluate(
     result = evaluate(matches, truth, tolerance, interpolate, *pair)
     write_report(out, result.report, result.pictures, f"{matches} judged by {truth}", command)
     _print_scores(result.report, out)
+
+
+def run_reproduce(dataset: str, out: Path, seed: int, tolerance: int, command: str) -> None:
+    """The paper's datasets, beside the paper's own numbers."""
+    make_output_folder(out)
+    names = list(PUBLISHED) if dataset == "all" else [dataset]
+    reports: dict[str, Report] = {}
+    for name in names:
+        result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
+        make_output_folder(out / name)
+        title, plan = f"dejavu reproduce: {name}", describe(result.model.certificate)
+        write_report(out / name, result.report, result.pictures, title, command, plan)
+        write_matches(out / name / "matches.csv", [result.match])
+        reports[name] = result.report
+    rows = section_five(reports)
+    pages = {name: f"{name}/index.html" for name in names}
+    write_index(out, rows, lengths_picture(reports), pages, "the paper's experiments", command)
+    print(text_table(rows))
+    print(f"right within {tolerance} frames; report: {out / 'index.html'}")
 
 
 def run_info(map: Path, features: Any) -> None:

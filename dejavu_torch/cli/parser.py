@@ -11,6 +11,7 @@ import torch
 
 from dejavu_torch import __version__
 from dejavu_torch.experiments.bench import BENCHES
+from dejavu_torch.experiments.reproduce import PUBLISHED
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
 
@@ -149,6 +150,15 @@ def build_parser() -> Parser:
             "--interpolate", action="store_true", help="fill in a csv that lists some queries only"
         )
         sub.add_argument("--out", type=Path, required=True, help="folder for report and pictures")
+
+    reproduce = command("reproduce", "the paper's datasets, simulated, beside the paper's own numbers")
+    choices = [*PUBLISHED, "all"]
+    reproduce.add_argument("dataset", choices=choices, nargs="?", default="all", help="which of them")
+    reproduce.add_argument("--out", type=Path, required=True, help="folder for the reports")
+    reproduce.add_argument("--seed", type=int, default=0, help="which routes")
+    reproduce.add_argument(
+        "--tolerance", type=int, default=5, help="right within this many frames, inclusive"
+    )
 
     bench = command("bench", "time this package beside what a user would pick instead")
     bench.add_argument("what", choices=list(BENCHES), nargs="?", default="matcher", help="HOG, L1 distances")

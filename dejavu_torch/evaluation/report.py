@@ -14,7 +14,10 @@ from dejavu_torch.data.files import whole_file
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import Picture
 
-PICTURES = ("pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations")
+PICTURES = (
+    *("frames", "pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"),
+    *("autocorrelogram", "layers"),
+)
 LATE = 0.1  # recall at which a curve starts late
 
 
@@ -166,6 +169,31 @@ def summary(report: Report) -> str:
     return ". ".join(told) + "."
 
 
+def write_index(
+    folder: Path, rows: list[list[str]], picture: Picture, pages: Mapping[str, str], title: str, command: str
+) -> None:
+    """Write index.html over several reports, with one table and one picture, and links to their pages.
+
+    Args:
+        rows: of the table, the header first. pages: what each link says -> where it leads.
+    """
+    head, *body = rows
+    table = _row("th", head) + "".join(_row("td", row) for row in body)
+    buffer = io.BytesIO()
+    picture.plot[0].savefig(buffer, format="png")
+    links = "".join(
+        f'<li><a href="{html.escape(to)}">{html.escape(what)}</a></li>' for what, to in pages.items()
+    )
+    text = f"""{_top(title)}<ul>{links}</ul>
+<div class="wide"><table>{table}</table></div>
+<p class="note">{_NOTE}</p>
+{_picture(picture, buffer.getvalue())}
+<h2>made by</h2><pre>{html.escape(command)}</pre></html>
+"""
+    with whole_file(folder / "index.html") as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 _NOTE = """
 R@100P: recall at 100 % precision; P@100R: precision when every query reports; rep.: the second definition of
 recall, *_reported. A curve starts at its first threshold: matches that all have one score enclose no area.
@@ -182,7 +210,7 @@ body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
 div.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 td,th{padding:.25rem .5rem;font-size:.9rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
-td:first-child,th:first-child{text-align:left}tr.ours{background:#eaf2fb;font-weight:600}
+td:first-child,th:first-child{text-align:left;white-space:normal;min-width:8rem}tr.ours{background:#eaf2fb;font-weight:600}
 img{max-width:100%;height:auto}pre{background:#f6f6f6;padding:.7rem;white-space:pre-wrap;font-size:.85rem}
 p.note,figcaption{color:#555;font-size:.9rem}figure{margin:0}
 """
@@ -195,16 +223,20 @@ def _page(report: Report, pictures: str, title: str, command: str, plan: str | N
         _row("td", row, " class=ours" if j == 0 else "") for j, row in enumerate(rows)
     )
     note = _NOTE + (_NULL_NOTE if "null" in report.contenders else "")
-    return f"""<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width,initial-scale=1"><title>{html.escape(title)}</title>
-<style>{_STYLE}</style><h1>{html.escape(title)}</h1>
-<p>{html.escape(summary(report))}</p>
+    return f"""{_top(title)}<p>{html.escape(summary(report))}</p>
 <div class="wide"><table>{table}</table></div>
 <p class="note">recall = {html.escape(facts["recall_definition"])}. {note}</p>
 {"" if plan is None else f"<h2>the map</h2><pre>{html.escape(plan)}</pre>"}
 {pictures}
 <h2>made by</h2><pre>{html.escape(command)}
 dejavu_torch {html.escape(str(facts["version"]))}, torch {html.escape(str(facts["torch"]))}</pre></html>
+"""
+
+
+def _top(title: str) -> str:
+    return f"""<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width,initial-scale=1"><title>{html.escape(title)}</title>
+<style>{_STYLE}</style><h1>{html.escape(title)}</h1>
 """
 
 

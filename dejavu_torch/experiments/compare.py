@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 import dejavu_torch
 from dejavu_torch.data.truth import as_truth, counted
@@ -34,12 +35,19 @@ log = logging.getLogger("dejavu_torch")
 
 
 class Comparison(NamedTuple):
-    """A comparison's figures, matches and pictures; `model` holds the map."""
+    """A comparison's figures, matches and pictures.
+
+    model holds the map; stored (N,D) and seen (Q,D) are the features of reference and query; truth is
+    None where there is none.
+    """
 
     report: Report
     match: Match
     model: DejaVu
     pictures: Mapping[str, Picture]
+    stored: Tensor
+    seen: Tensor
+    truth: Truth | None
 
 
 def compare(
@@ -177,7 +185,7 @@ def compare(
     ours = contender("this map", match, known, size, None)
     pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, found)
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
-    return Comparison(Report(ours, contenders, facts), match, model, pictures)
+    return Comparison(Report(ours, contenders, facts), match, model, pictures, stored, seen, known)
 
 
 def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:

@@ -1,0 +1,237 @@
+"""The paper's experiments on simulated routes, beside the paper's own numbers (section V)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.controls import leave_out_match, same_settings
+from dejavu_torch.evaluation.curves import curve_of, judge
+from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.report import Contender, Report
+from dejavu_torch.evaluation.route_plots import (
+    Length,
+    plot_autocorrelogram,
+    plot_frames,
+    plot_layers,
+    plot_lengths,
+)
+from dejavu_torch.experiments.compare import Comparison, compare
+from dejavu_torch.experiments.pictures import best_explained, frames_between, leading_layers
+from dejavu_torch.model import DejaVu
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.types import InputError, Traverse, Truth
+
+LENGTHS = (256, 512, 1024, 2048)
+EXAMPLES = 4  # places of which frames are shown
+
+
+class Published(NamedTuple):
+    """A row of the paper's section V; recall is TP / (TP + FN), None where it tells no number."""
+
+    recall_at_100_precision_reported: float
+    precision_at_100_recall: float | None
+    auc_reported: float
+
+
+PUBLISHED = {"aerial": Published(0.2064, 0.959, 0.9813)}
+
+
+def paper_model() -> DejaVu:
+    """The paper's letter: the settings of configs/paper.yaml."""
+    periods = SpectrogramAnalysis(min_period=8, peaks="bins", false_alarm=None, short="refuse")
+    return DejaVu(periods=periods, reduction="sum")
+
+
+def reproduce(
+    dataset: str,
+    model: DejaVu | None = None,
+    tolerance: int = 5,
+    seed: int = 0,
+    frames: int | None = None,
+    lengths: Sequence[int] = LENGTHS,
+    progress: bool = False,
+) -> Comparison:
+    """One of the paper's datasets: a second traverse, and the database queried with itself.
+
+    Args:
+        dataset: a key of `PUBLISHED`.
+        model: settings; None is `paper_model()`.
+        tolerance: frames within which a place is right, inclusive.
+        seed: of the simulated route. frames: its length, None is the simulator's own.
+        lengths: of chunks, frames, to compare.
+        progress: show progress bars on a terminal.
+
+    Returns:
+        The comparison of the second traverse. Its report has two more entries: `ideal`, the paper's
+        conditions, in which the database itself is queried and every frame stands in its own templates;
+        and `ideal_leave_out`, where all frames within the tolerance of the query are left out of every
+        mean. The fact `chunk_lengths` tells recall and bytes for each of `lengths`.
+
+    Raises:
+        InputError: an unknown dataset, or bad input of any of the stages.
+    """
+    if dataset not in PUBLISHED:
+        raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(PUBLISHED)}")
+    address = f"sim:{dataset}?seed={seed}" + (f"&frames={frames}" if frames else "")
+    reference, query = open_source(address), open_source(f"{address}&traverse=1")
+    result = compare(
+        reference,
+        query,
+        model=paper_model() if model is None else model,
+        tolerance=tolerance,
+        progress=progress,
+    )
+    model, stored = result.model, result.stored
+    itself = torch.arange(len(stored))[:, None]
+    matches = {
+        "ideal": ("ideal: the database itself", model.localize(stored)),
+        "ideal_leave_out": (
+            f"ideal, +-{tolerance} frames left out",
+            leave_out_match(model, stored, tolerance),
+        ),
+    }
+    contenders = dict(result.report.contenders)
+    for key, (name, match) in matches.items():
+        recall = curve_of(match, itself, tolerance).recall
+        starts = float(recall[0]) if len(recall) else None
+        contenders[key] = Contender(name, judge(match, itself, tolerance), starts=starts)
+    found = chunk_lengths(model, stored, result.seen, result.truth, tolerance, lengths)
+    facts = {
+        **result.report.facts,
+        "published": PUBLISHED[dataset]._asdict(),
+        "chunk_lengths": [row._asdict() for row in found],
+    }
+    pictures = {
+        **_frames(reference, query),
+        **result.pictures,
+        **_map_pictures(model, stored),
+    }
+    return result._replace(report=Report(result.report.ours, contenders, facts), pictures=pictures)
+
+
+def chunk_lengths(
+    model: DejaVu,
+    stored: Tensor,
+    seen: Tensor,
+    truth: Truth | None,
+    tolerance: int,
+    lengths: Sequence[int] = LENGTHS,
+) -> list[Length]:
+    """Recall and storage of maps whose chunks have other lengths (section VI).
+
+    Args:
+        model: the other settings. stored: (N,D), seen: (Q,D) features of reference and query.
+        lengths: in frames; those longer than the reference are left out.
+    """
+    rows: list[Length] = []
+    if truth is None or not isinstance(model.periods, SpectrogramAnalysis):
+        return rows
+    kept = {name: getattr(model.periods, name) for name in SETTINGS}
+    for window in lengths:
+        if window <= len(stored):
+            other = same_settings(model)
+            other.periods = SpectrogramAnalysis(window, **kept)
+            other.learn_features(stored, model.learnt_from)
+            scores = judge(other.localize(seen), truth, tolerance)
+            size = other.map_bytes
+            rows.append(Length(window, scores.recall_at_1, scores.auc, size, size / len(stored)))
+    return rows
+
+
+SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "similar", "short")
+
+
+def section_five(reports: Mapping[str, Report]) -> list[list[str]]:
+    """The table of section V, the paper's numbers beside ours, as rows of text, the header first."""
+    rows = [["", "R@100P rep.", "P@100R", "AUC rep.", "AUC", "recall@1", "bytes per place"]]
+    for dataset, report in reports.items():
+        paper = Published(**report.facts["published"])
+        rows.append(
+            [f"{dataset}: the paper, its own footage", *(_text(value) for value in paper), "", "", ""]
+        )
+        own = report.ours._replace(name="a second traverse")
+        ideal = [report.contenders[key] for key in ("ideal", "ideal_leave_out")]
+        others = [c for key, c in report.contenders.items() if key not in ("ideal", "ideal_leave_out")]
+        for contender in (*ideal, own, *others):
+            s = contender.scores
+            told = (
+                [
+                    s.recall_at_100_precision_reported,
+                    s.precision_at_100_recall,
+                    s.auc_reported,
+                    s.auc,
+                    s.recall_at_1,
+                ]
+                if s
+                else [None] * 5
+            )
+            size = contender.bytes and f"{contender.bytes / report.facts['frames']:.0f}"
+            rows.append([f"{dataset}: {contender.name}", *(_text(value) for value in told), size or ""])
+    return rows
+
+
+def lengths_picture(reports: Mapping[str, Report]) -> Picture:
+    """Recall and bytes over the length of the chunks, a line a dataset."""
+    rows = {
+        name: [Length(**row) for row in report.facts["chunk_lengths"]] for name, report in reports.items()
+    }
+    return Picture(
+        plot_lengths(rows),
+        "how long should a chunk be?",
+        "Recall on the second traverse, and bytes per place, of maps whose chunks have other lengths. The "
+        "paper's is 1024 frames.",
+    )
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
+
+
+def _frames(reference: Traverse, query: Traverse) -> dict[str, Picture]:
+    """Frames of both traverses at the same places, where both know their places."""
+    if reference.place is None or query.place is None:
+        return {}
+    last = min(float(reference.place.max()), float(query.place.max()))
+    places = [int(last * (k + 0.5) / EXAMPLES) for k in range(EXAMPLES)]
+    both = []
+    for traverse, where in ((reference, reference.place), (query, query.place)):
+        nearest = [int((where - place).abs().argmin()) for place in places]
+        both.append(torch.cat([next(frames_between(traverse, i, i + 1)) for i in nearest]))
+    return {
+        "frames": Picture(
+            plot_frames(both[0], both[1], places),
+            "the route",
+            "The same places on the reference and on the second traverse.",
+        )
+    }
+
+
+def _map_pictures(model: DejaVu, stored: Tensor) -> dict[str, Picture]:
+    """The autocorrelogram of one feature, and the phases of the layers of one chunk."""
+    leading = leading_layers(model.map.plan)
+    if not leading:
+        return {}
+    layer = model.map.plan[leading[0]]
+    chosen = best_explained(stored, layer, model.map.blocks()[leading[0]].detach().cpu())
+    feature = layer.features[chosen]
+    chunk = [p for p in model.map.plan if (p.start, p.stop) == (layer.start, layer.stop)]
+    kept = [float(p.period) for p in chunk if feature in p.features]
+    return {
+        "autocorrelogram": Picture(
+            plot_autocorrelogram(stored[layer.start : layer.stop, feature].cpu(), kept, feature),
+            "a feature against itself",
+            "How alike a feature is to itself so many frames later: where it repeats, it is high at every "
+            "multiple of its period.",
+        ),
+        "layers": Picture(
+            plot_layers(chunk),
+            "layers and their phases",
+            "One chunk of the map: a row a layer, the colour its phase. A column of phases names a place; "
+            "the next place where all are the same is the least common multiple of the periods away.",
+        ),
+    }

@@ -1,0 +1,107 @@
+"""The paper's experiments, on a shorter route."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import partial
+from pathlib import Path
+
+import pytest
+from helpers import refused
+
+from dejavu_torch.cli import commands, main
+from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.experiments.compare import Comparison, compare
+from dejavu_torch.experiments.reproduce import PUBLISHED, Published, paper_model, reproduce, section_five
+from dejavu_torch.model import DejaVu
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+
+FRAMES, LENGTHS = 1024, (512, 1024, 2048)
+
+
+@pytest.fixture(scope="module")
+def aerial() -> Comparison:
+    return reproduce("aerial", frames=FRAMES, lengths=LENGTHS)
+
+
+def test_the_second_traverse_stands_at_top_level(aerial: Comparison) -> None:
+    pair = [open_source(f"sim:aerial?frames={FRAMES}&traverse={traverse}") for traverse in (0, 1)]
+    alone = compare(pair[0], pair[1], model=paper_model()).report.as_json()
+    report = aerial.report.as_json()
+    for key in ("auc", "recall_at_1", "map_bytes", "periods", "null", "uncompressed", "stride"):
+        assert report[key] == alone[key], key
+
+
+def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial: Comparison) -> None:
+    report = aerial.report.as_json()
+    assert report["ideal"]["recall_at_1"] > 0.99 > report["recall_at_1"]
+    assert report["ideal_leave_out"]["recall_at_1"] < 0.1
+    assert report["published"] == PUBLISHED["aerial"]._asdict()
+
+
+def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> None:
+    rows = aerial.report.facts["chunk_lengths"]
+    assert [row["window"] for row in rows] == [512, 1024]  # 2048 is longer than the route
+    assert (rows[1]["auc"], rows[1]["map_bytes"]) == (
+        aerial.report.as_json()["auc"],
+        aerial.report.facts["map_bytes"],
+    )
+    periods = SpectrogramAnalysis(512, min_period=8, peaks="bins", false_alarm=None, short="refuse")
+    other = DejaVu(periods=periods, reduction="sum").learn_features(aerial.stored)
+    scores = judge(other.localize(aerial.seen), aerial.truth, 5)
+    assert (rows[0]["auc"], rows[0]["recall_at_1"]) == (scores.auc, scores.recall_at_1)
+    assert rows[0]["bytes_per_place"] == rows[0]["map_bytes"] / FRAMES
+
+
+def test_section_five_sets_the_papers_numbers_beside_ours(aerial: Comparison) -> None:
+    head, paper, ideal, leave_out, own, *others = section_five({"aerial": aerial.report})
+    assert paper[1:4] == ["0.2064", "0.9590", "0.9813"]
+    assert "paper" in paper[0]
+    report = aerial.report.as_json()
+    for row, entry in ((ideal, report["ideal"]), (leave_out, report["ideal_leave_out"]), (own, report)):
+        keys = (
+            "recall_at_100_precision_reported",
+            "precision_at_100_recall",
+            "auc_reported",
+            "auc",
+            "recall_at_1",
+        )
+        assert row[1:6] == [f"{entry[key]:.4f}" for key in keys]
+    assert own[0] == "aerial: a second traverse"
+    assert len(others) == 5
+    assert {len(row) for row in (head, paper, ideal, own, *others)} == {len(head)}
+
+
+def test_every_picture_of_the_paper_is_there(aerial: Comparison) -> None:
+    assert {"frames", "autocorrelogram", "layers", "pr", "auc", "coverage", "chunks"} < set(aerial.pictures)
+    assert {"spectrogram", "templates", "features", "activations"} < set(aerial.pictures)
+
+
+def test_a_number_the_paper_does_not_tell_is_left_empty(aerial: Comparison) -> None:
+    report = aerial.report._replace(
+        facts={**aerial.report.facts, "published": Published(0.0032, None, 0.6998)._asdict()}
+    )
+    assert section_five({"x": report})[1][1:4] == ["0.0032", "", "0.6998"]
+
+
+def test_other_datasets_are_refused() -> None:
+    with refused("'moon'", "expected aerial"):
+        reproduce("moon")
+
+
+def test_the_command_writes_an_index_over_the_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(commands, "reproduce", partial(reproduce, frames=FRAMES, lengths=(1024,)))
+    main(["reproduce", "aerial", "--out", str(tmp_path / "out")])
+    assert "aerial: the paper, its own footage" in capsys.readouterr().out
+    page = (tmp_path / "out" / "index.html").read_text()
+    links = re.findall(r'href="([^"]+)"', page)
+    assert links == ["aerial/index.html"]
+    assert (tmp_path / "out" / links[0]).exists()
+    assert "<pre>dejavu reproduce aerial --out" in page
+    assert "0.9813" in page
+    report = json.loads((tmp_path / "out" / "aerial" / "report.json").read_text())
+    assert {"ideal", "ideal_leave_out", "chunk_lengths", "published", "auc", "null"} <= set(report)
