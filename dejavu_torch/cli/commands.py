@@ -20,7 +20,13 @@ from dejavu_torch.evaluation.report import (
 from dejavu_torch.experiments import bench
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.evaluate import evaluate
-from dejavu_torch.experiments.reproduce import PUBLISHED, lengths_picture, reproduce, section_five
+from dejavu_torch.experiments.reproduce import (
+    PUBLISHED,
+    boundary_lines,
+    lengths_picture,
+    reproduce,
+    section_five,
+)
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
@@ -106,10 +112,10 @@ def run_reproduce(dataset: str, out: Path, seed: int, tolerance: int, command: s
         write_report(out / name, result.report, result.pictures, title, command, plan)
         write_matches(out / name / "matches.csv", [result.match])
         reports[name] = result.report
-    rows = section_five(reports)
+    rows, notes = section_five(reports), boundary_lines(reports)
     pages = {name: f"{name}/index.html" for name in names}
-    write_index(out, rows, lengths_picture(reports), pages, "the paper's experiments", command)
-    print(text_table(rows))
+    write_index(out, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
+    print("\n".join([text_table(rows), *notes]))
     print(f"right within {tolerance} frames; report: {out / 'index.html'}")
 
 

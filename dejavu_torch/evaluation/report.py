@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -170,12 +170,19 @@ def summary(report: Report) -> str:
 
 
 def write_index(
-    folder: Path, rows: list[list[str]], picture: Picture, pages: Mapping[str, str], title: str, command: str
+    folder: Path,
+    rows: list[list[str]],
+    notes: Sequence[str],
+    picture: Picture,
+    pages: Mapping[str, str],
+    title: str,
+    command: str,
 ) -> None:
     """Write index.html over several reports, with one table and one picture, and links to their pages.
 
     Args:
-        rows: of the table, the header first. pages: what each link says -> where it leads.
+        rows: of the table, the header first. notes: lines beneath it.
+        pages: what each link says -> where it leads.
     """
     head, *body = rows
     table = _row("th", head) + "".join(_row("td", row) for row in body)
@@ -186,6 +193,7 @@ def write_index(
     )
     text = f"""{_top(title)}<ul>{links}</ul>
 <div class="wide"><table>{table}</table></div>
+{"".join(f"<p>{html.escape(note)}</p>" for note in notes)}
 <p class="note">{_NOTE}</p>
 {_picture(picture, buffer.getvalue())}
 <h2>made by</h2><pre>{html.escape(command)}</pre></html>

@@ -20,6 +20,7 @@ from dejavu_torch.evaluation.route_plots import (
     plot_layers,
     plot_lengths,
 )
+from dejavu_torch.experiments.boundaries import boundary_effect, known_boundaries
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.pictures import best_explained, frames_between, leading_layers
 from dejavu_torch.model import DejaVu
@@ -70,7 +71,9 @@ def reproduce(
         The comparison of the second traverse. Its report has two more entries: `ideal`, the paper's
         conditions, in which the database itself is queried and every frame stands in its own templates;
         and `ideal_leave_out`, where all frames within the tolerance of the query are left out of every
-        mean. The fact `chunk_lengths` tells recall and bytes for each of `lengths`.
+        mean. The fact `chunk_lengths` tells recall and bytes for each of `lengths`. Where the simulator
+        tells where structures start and stop, `boundaries` tells recall near to that and far from it
+        (`boundary_effect`), and the entry `known_boundaries` is a map whose chunks are cut there.
 
     Raises:
         InputError: an unknown dataset, or bad input of any of the stages.
@@ -106,6 +109,10 @@ def reproduce(
         "published": PUBLISHED[dataset]._asdict(),
         "chunk_lengths": [row._asdict() for row in found],
     }
+    cuts = structure_cuts(reference)
+    if cuts and result.truth is not None:
+        facts["boundaries"] = boundary_effect(result.match, result.truth, cuts, tolerance)._asdict()
+        contenders["known_boundaries"] = known_boundaries(result, cuts, tolerance)
     pictures = {
         **_frames(reference, query),
         **result.pictures,
@@ -144,6 +151,36 @@ def chunk_lengths(
 
 
 SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "similar", "short")
+
+
+def structure_cuts(reference: Traverse) -> list[int]:
+    """Reference frames at which something that repeats starts or stops, where the traverse tells.
+
+    A simulated railway has `structures`, (name, period, start, stop) in metres, and `distance`, (N,)
+    metres of each frame.
+    """
+    structures, distance = (getattr(reference, name, None) for name in ("structures", "distance"))
+    if structures is None or distance is None:
+        return []
+    metres = {float(edge) for _, _, start, stop in structures for edge in (start, stop)}
+    inside = [edge for edge in sorted(metres) if float(distance[0]) < edge < float(distance[-1])]
+    return sorted(
+        set(torch.searchsorted(distance.double(), torch.tensor(inside, dtype=torch.float64)).tolist())
+    )
+
+
+def boundary_lines(reports: Mapping[str, Report]) -> list[str]:
+    """What `boundary_effect` found, a line a dataset that has structures."""
+    lines = []
+    for dataset, report in reports.items():
+        told = report.facts.get("boundaries")
+        if told:
+            near, far = (_text(told[f"recall_at_1_{where}"]) or "unknown" for where in ("near", "far"))
+            lines.append(
+                f"{dataset}: recall@1 {near} within {told['near']} frames of a structure's start or stop "
+                f"({told['queries_near']} queries), {far} elsewhere ({told['queries_far']})"
+            )
+    return lines
 
 
 def section_five(reports: Mapping[str, Report]) -> list[list[str]]:

@@ -8,13 +8,24 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import refused
 
 from dejavu_torch.cli import commands, main
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.experiments.boundaries import BoundaryEffect
 from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.reproduce import PUBLISHED, Published, paper_model, reproduce, section_five
+from dejavu_torch.experiments.reproduce import (
+    PUBLISHED,
+    Published,
+    boundary_lines,
+    paper_model,
+    reproduce,
+    section_five,
+    structure_cuts,
+)
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 
@@ -105,3 +116,24 @@ def test_the_command_writes_an_index_over_the_reports(
     assert "0.9813" in page
     report = json.loads((tmp_path / "out" / "aerial" / "report.json").read_text())
     assert {"ideal", "ideal_leave_out", "chunk_lengths", "published", "auc", "null"} <= set(report)
+
+
+class Rails(ArrayTraverse):
+    """A traverse that tells where structures start and stop, at half a metre a frame."""
+
+    structures = (("lamps", 5.0, 0.0, 20.0), ("panels", 3.0, 12.2, 900.0))
+    distance = torch.arange(64, dtype=torch.float64) / 2
+
+
+def test_cuts_are_the_frames_at_which_a_structure_starts_or_stops() -> None:
+    assert structure_cuts(Rails(torch.rand(64, 3))) == [25, 40]  # 0 and 900 m are no cuts inside
+    assert structure_cuts(ArrayTraverse(torch.rand(64, 3))) == []
+
+
+def test_the_effect_of_boundaries_is_told(aerial: Comparison) -> None:
+    assert boundary_lines({"aerial": aerial.report}) == []
+    told = BoundaryEffect(128, 10, 20, 0.25, None)._asdict()
+    report = aerial.report._replace(facts={**aerial.report.facts, "boundaries": told})
+    (line,) = boundary_lines({"underground": report})
+    assert line.startswith("underground: recall@1 0.2500 within 128 frames")
+    assert line.endswith("(10 queries), unknown elsewhere (20)")

@@ -1,0 +1,107 @@
+"""What it costs that chunks do not end where what repeats starts and stops (section V, underground)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.truth import counted, is_right
+from dejavu_torch.evaluation.controls import same_settings
+from dejavu_torch.evaluation.curves import curve_of, judge
+from dejavu_torch.evaluation.report import Contender
+from dejavu_torch.experiments.compare import Comparison
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.types import InputError, Match, Truth
+
+
+class GivenChunks(SpectrogramAnalysis):
+    """The spectrogram analysis on chunks that are known beforehand.
+
+    Args:
+        cuts: the frames at which a chunk ends and the next begins, increasing.
+        settings: as SpectrogramAnalysis has them; window and hop mean nothing here.
+
+    Convention: a piece of fewer than two of the shortest periods joins the piece before it.
+    """
+
+    def __init__(self, cuts: Sequence[int], settings: Mapping[str, Any] | None = None) -> None:
+        super().__init__(**(settings or {}))
+        self.cuts = list(cuts)
+        self.settings = dict(settings or {})
+
+    def chunks(self, frames: int) -> list[tuple[int, int]]:
+        """The chunks [start, stop) of a traverse of `frames` frames."""
+        edges = [0]
+        for cut in [*self.cuts, frames]:
+            if edges[-1] + 2 * self.min_period <= cut <= frames - 2 * self.min_period or cut == frames:
+                edges.append(cut)
+        if frames < 2 * self.min_period:
+            raise InputError(
+                f"the traverse has {frames} frames; expected at least {2 * self.min_period}, two periods"
+            )
+        return list(pairwise(edges))
+
+
+class BoundaryEffect(NamedTuple):
+    """Recall@1 of queries near to where something starts or stops, and of the others.
+
+    near: frames within which a place counts as near. queries_near, queries_far: how many there are.
+    None where there are none.
+    """
+
+    near: int
+    queries_near: int
+    queries_far: int
+    recall_at_1_near: float | None
+    recall_at_1_far: float | None
+
+
+def boundary_effect(
+    match: Match, truth: Truth, cuts: Sequence[int], tolerance: int, near: int = 128
+) -> BoundaryEffect:
+    """Recall@1 near to the cuts and far from them.
+
+    Args:
+        cuts: reference frames at which something starts or stops, at least one.
+        near: frames.
+
+    Shape: match and truth of Q queries.
+    """
+    if not cuts:
+        raise InputError("there are no cuts; expected at least one frame at which something starts or stops")
+    answered = counted(match.index, truth, tolerance) & (truth.right >= 0).any(1)
+    right = is_right(match.index, truth.right, tolerance)
+    apart = (truth.right[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
+    close = torch.where(truth.right >= 0, apart, torch.iinfo(torch.int64).max).amin(1) <= near
+
+    def recall(which: Tensor) -> float | None:
+        return float(right[which].double().mean()) if which.any() else None
+
+    inside, outside = answered & close, answered & ~close
+    return BoundaryEffect(near, int(inside.sum()), int(outside.sum()), recall(inside), recall(outside))
+
+
+def known_boundaries(result: Comparison, cuts: Sequence[int], tolerance: int) -> Contender:
+    """The same settings with chunks that end at the cuts, judged as the comparison's own map is.
+
+    Raises:
+        InputError: a comparison without truth, or whose periods another finder found.
+    """
+    model = result.model
+    if result.truth is None or not isinstance(model.periods, SpectrogramAnalysis):
+        raise InputError(
+            "known boundaries need a truth and SpectrogramAnalysis; this comparison has not both"
+        )
+    names = ("min_period", "strongest", "peaks", "false_alarm", "similar")
+    other = same_settings(model)
+    other.periods = GivenChunks(cuts, {name: getattr(model.periods, name) for name in names})
+    other.learn_features(result.stored, model.learnt_from)
+    match = other.localize(result.seen)
+    recall = curve_of(match, result.truth, tolerance).recall
+    starts = float(recall[0]) if len(recall) else None
+    scores = judge(match, result.truth, tolerance)
+    return Contender("chunks cut where structures start and stop", scores, other.map_bytes, starts=starts)
