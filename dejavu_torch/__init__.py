@@ -14,6 +14,7 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     eq. 5  best place, eq. 6 acceptance          best_match          recognition.select
     IV-A   HOG features                          HOG, hog            features.hog
     IV-A   window slid along an aerial image     SlidingWindow       data.strip
+    IV-B   velocity from the ground              VelocityNormalizer  features.spacing, features.ground
     IV-A   (ours) channel, local contrast        Preprocess          features.preprocess
     IV-C   precision, recall, area               pr_curve, judge     evaluation.curves
 """

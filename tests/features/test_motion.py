@@ -1,0 +1,492 @@
+"""Velocity from the ground: drives over a known ground are the oracle, seen by a camera of our own."""
+
+from __future__ import annotations
+
+import logging
+import math
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import all_of, refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kornia.geometry.transform import get_perspective_transform
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, grid_sample
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.source import open_source
+from dejavu_torch.database.mapfile import build, recipe_of
+from dejavu_torch.features.ground import TRAPEZIUM, ground_patch, shift_between
+from dejavu_torch.features.spacing import EvenlySpaced, VelocityNormalizer
+from dejavu_torch.types import Traverse
+
+PATCH, AHEAD = 96, 200  # pixels of ground: the patch, and where the drive begins
+SLEEPER = 24
+
+
+@cache
+def ground(texture: float, sleepers: float, length: int = 2400, width: int = 160) -> Tensor:
+    """Ground around zero, (1,1,length,width): texture that never repeats, stripes that always do."""
+    noise = torch.randn(1, 1, length + 2, width + 2, generator=torch.Generator().manual_seed(3))
+    stripes = ((torch.arange(length) % SLEEPER) < 8).float().view(1, 1, -1, 1) - 1 / 3
+    return texture * conv2d(noise, torch.full((1, 1, 3, 3), 1 / 3)) + sleepers * stripes
+
+
+def drive(
+    position: Tensor,
+    texture: float = 0.12,
+    sleepers: float = 0.1,
+    blur: float = 0.0,
+    noise: float = 0.03,
+    exposure: bool = True,
+) -> Tensor:
+    """Frames (N,1,240,320) of a camera at each position, pixels of ground; sky above.
+
+    Args:
+        blur: share of the time from frame to frame during which the shutter is open.
+    """
+    height, width, over = 240, 320, 2
+    world = ground(texture, sleepers)
+    x = (torch.arange(width * over) - (over - 1) / 2) / over
+    y = ((torch.arange(height * over) - (over - 1) / 2) / over)[:, None]
+    seen = torch.tensor(TRAPEZIUM) * torch.tensor([width - 1, height - 1])
+    last = PATCH - 1.0
+    above = torch.tensor([[0.0, 0.0], [last, 0.0], [last, last], [0.0, last]])
+    view = get_perspective_transform(seen[None], above[None])[0]
+    point = torch.stack(torch.broadcast_tensors(x, y, torch.ones(())))[:, 144 * over :].flatten(1)
+    right, row, depth = view @ point
+    right, row = right / depth, row / depth
+    speed = position.diff(prepend=2 * position[:1] - position[1:2])
+    generator = torch.Generator().manual_seed(5)
+    frames = torch.full((len(position), 1, height, width), 0.8)
+    path = world.cumsum(2)  # its differences are the ground, smeared along the way
+
+    def seen_at(position: float, world: Tensor) -> Tensor:
+        rows = (AHEAD + position - row) / (world.shape[2] - 1)
+        columns = (right + (world.shape[3] - PATCH) / 2) / (world.shape[3] - 1)
+        grid = torch.stack([2 * columns - 1, 2 * rows - 1], -1).view(1, -1, width * over, 2)
+        return grid_sample(world, grid, align_corners=True)
+
+    for frame, here, smear in zip(frames, position.tolist(), (blur * speed).abs().tolist(), strict=True):
+        if smear > 1:
+            now = (seen_at(here, path) - seen_at(here - smear, path)) / smear
+        else:
+            now = seen_at(here, world)
+        frame[:, 144:] = avg_pool2d(now + 0.45, over)[0]
+    gain = 0.7 + 0.6 * torch.rand(len(frames), 1, 1, 1, generator=generator) if exposure else 1.0
+    return (frames * gain + noise * torch.randn(frames.shape, generator=generator)).clamp(0, 1)
+
+
+def travelled(*speeds: tuple[float, float, int]) -> Tensor:
+    """Positions of a drive whose speed goes from one value to another in so many steps, each."""
+    steps = torch.cat([torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in speeds])
+    return torch.cat([torch.zeros(1, dtype=torch.float64), steps.cumsum(0)])
+
+
+JOURNEY = travelled(
+    (2, 12, 12),
+    (12, 6, 6),
+    (0, 0, 6),
+    (1, 16, 12),
+    (16, 2, 8),
+    (0, 0, 4),
+    (-2, -9, 8),
+    (-9, -2, 4),
+    (3, 14, 20),
+)
+
+
+class Shown(Traverse):
+    """Frames with known places."""
+
+    def __init__(self, frames: Tensor, place: Tensor | None = None) -> None:
+        self.frames, self.place, self.length, self.name = frames, place, len(frames), "the drive"
+
+    def batches(self, size: int):  # type: ignore[no-untyped-def]
+        yield from self.frames.split(size)
+
+
+@cache
+def journey() -> Shown:
+    return Shown(drive(JOURNEY), JOURNEY)
+
+
+@cache
+def short() -> Shown:
+    """Twelve frames at 5 pixels of ground a frame."""
+    position = travelled((5, 5, 11))
+    return Shown(drive(position), position)
+
+
+# --- the patch
+
+
+def test_a_region_of_ground_becomes_even() -> None:
+    """Of a frame that shows how far ahead each pixel of ground is, the patch is a straight ramp."""
+    fractions = torch.tensor([[x * 319, y * 239] for x, y in TRAPEZIUM])
+    unit = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    view = get_perspective_transform(fractions[None], unit[None])[0]
+    y, x = torch.meshgrid(torch.arange(240.0), torch.arange(320.0), indexing="ij")
+    right, row, depth = torch.einsum("ij,jhw->ihw", view, torch.stack([x, y, torch.ones_like(x)]))
+    for ramp, axis in ((row / depth, 0), (right / depth, 1)):
+        patch = ground_patch(ramp.clamp(-1, 2)[None, None], size=(64, 48))[0, 0]
+        even = torch.linspace(0, 1, patch.shape[axis]).unsqueeze(1 - axis).expand(64, 48)
+        torch.testing.assert_close(patch[1:-1, 1:-1], even[1:-1, 1:-1], rtol=0, atol=0.003)
+
+
+def test_colours_become_grey() -> None:
+    frames = torch.rand(2, 3, 60, 80)
+    grey = (frames * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
+    torch.testing.assert_close(ground_patch(frames), ground_patch(grey))
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        (TRAPEZIUM[:3], ("3 corners", "four")),
+        ((*TRAPEZIUM[:3], (0.1, 0.2, 0.3)), ("4 corners", "(x, y)")),
+        ((*TRAPEZIUM[:3], (-0.05, 0.98)), ("(-0.05, 0.98)", "outside the frame", "0 to 1")),
+        ((*TRAPEZIUM[:3], (math.nan, 0.98)), ("nan", "outside the frame")),
+        ((*TRAPEZIUM[:3], (0.9, 0.8)), ("not convex", "far left, far right, near right, near left")),
+        (TRAPEZIUM[::-1], ("not convex",)),
+        (((0.2, 0.5), (0.8, 0.9), (0.8, 0.5), (0.2, 0.9)), ("not convex",)),
+    ],
+)
+def test_corners_that_are_no_region_are_refused(corners: tuple, words: tuple[str, ...]) -> None:
+    with refused(*words):
+        ground_patch(torch.rand(1, 1, 60, 80), corners)
+    with refused(*words):
+        VelocityNormalizer(corners)
+
+
+def test_patches_and_frames_of_wrong_size_are_refused() -> None:
+    with refused("(1, 96)", "at least 2"):
+        ground_patch(torch.rand(1, 1, 60, 80), size=(1, 96))
+    with refused("1 x 80", "at least 2 x 2"):
+        ground_patch(torch.rand(1, 1, 1, 80))
+    with refused("(31, 96)", "at least 32"):
+        VelocityNormalizer(size=(31, 96))
+    with refused("(40, 31)", "at least 32"):
+        shift_between(torch.rand(2, 1, 40, 31), torch.rand(2, 1, 40, 31))
+    two = torch.rand(2, 1, 64, 64)
+    for first, second in ((two, two[:1]), (two.expand(2, 3, 64, 64),) * 2, (two[:, 0],) * 2):
+        with refused(str(tuple(second.shape)), "the same (B,1,h,w)"):
+            shift_between(first, second)
+
+
+# --- the shift between two patches
+
+
+@settings(max_examples=15)
+@given(
+    shift=st.floats(-38, 38),
+    sway=st.integers(-3, 3),
+    gain=st.floats(0.7, 1.3),
+    offset=st.floats(-0.2, 0.2),
+    seed=st.integers(0, 99),
+)
+def test_a_known_shift(shift: float, sway: int, gain: float, offset: float, seed: int) -> None:
+    """Ground moved by a whole number of tenths of a pixel, with noise."""
+    fine = torch.randn(1, 1, 1900, 102, generator=torch.Generator().manual_seed(seed))
+    fine = conv2d(fine, torch.hann_window(31, periodic=False).view(1, 1, -1, 1)) / 31**0.5
+    tenths = round(10 * shift)
+    first, second = (fine[:, :, start : start + 960 : 10] for start in (450, 450 - tenths))
+    first, second = first[..., 3:99], second[..., 3 + sway : 99 + sway]
+    noisy = (patch + 0.1 * patch.std() * torch.randn_like(patch) for patch in (first, gain * second + offset))
+    found, confidence = shift_between(*noisy)
+    assert found.item() == pytest.approx(tenths / 10, abs=0.1)
+    assert confidence.item() > 0.6
+
+
+@pytest.mark.parametrize(("height", "width"), [(33, 32), (97, 71), (64, 128)])
+def test_patches_of_any_size(height: int, width: int) -> None:
+    world = torch.rand(3, 1, height + 9, width)
+    shift, confidence = shift_between(world[:, :, 9:], world[:, :, :-9])
+    torch.testing.assert_close(shift, torch.full((3,), 9.0), rtol=0, atol=0.1)
+    assert confidence.min() > 0.7
+
+
+def test_the_way_back_is_the_negative() -> None:
+    patches = ground_patch(journey().frames)
+    there, one = shift_between(patches[:-1], patches[1:])
+    back, other = shift_between(patches[1:], patches[:-1])
+    torch.testing.assert_close(there, -back, rtol=0, atol=0.1)
+    torch.testing.assert_close(one, other, rtol=0, atol=0.02)
+
+
+def test_confidence_tells_the_same_ground_from_another() -> None:
+    patches = ground_patch(journey().frames, size=(96, 96))
+    _, same = shift_between(patches[:-1], patches[1:])
+    unrelated = torch.rand(40, 2, 1, 96, 96)
+    _, other = shift_between(unrelated[:, 0], unrelated[:, 1])
+    assert same.min() > 0.6
+    assert other.max() < 0.4
+    for flat in (torch.zeros(1, 1, 96, 96), torch.full((1, 1, 96, 96), 0.7)):
+        for pair in ((patches[:1], flat), (flat, patches[:1]), (flat, 0.5 * flat)):
+            assert shift_between(*pair)[1].item() < 0.01
+
+
+@pytest.mark.parametrize("start", [0.0, 16.0])
+def test_of_equal_peaks_the_steady_ones(start: float) -> None:
+    """Sleepers with texture below the noise look the same a whole period further on."""
+    position = travelled((start, 16, 16), (16, 16, 20))
+    frames = drive(position, texture=0.02, sleepers=0.3)
+    patches = ground_patch(frames)
+    alone, _ = shift_between(patches[:-1], patches[1:])
+    followed, _ = VelocityNormalizer()(frames)
+    wrong = (alone - position.diff()).abs()
+    assert (wrong > 1).sum() >= 5
+    whole = wrong[wrong > 1] / SLEEPER  # periods
+    torch.testing.assert_close(whole, whole.round(), rtol=0, atol=0.02)
+    torch.testing.assert_close(followed.double(), position.diff(), rtol=0, atol=0.3)
+
+
+# --- a drive
+
+
+def path_error(distance: Tensor, position: Tensor) -> float:
+    """Error of the length of the path, as a share of it."""
+    true = position.diff().abs().sum()
+    return float((distance.diff().abs().sum() - true).abs() / true)
+
+
+def test_a_drive_with_stops_and_a_reversal() -> None:
+    measured = VelocityNormalizer().distances(journey())
+    assert measured.distance.dtype == torch.float64
+    assert path_error(measured.distance, JOURNEY) < 0.01
+    assert (measured.distance - JOURNEY).abs().max() < 0.01 * JOURNEY.diff().abs().sum()
+    stands = JOURNEY.diff() == 0
+    assert (measured.distance.diff()[stands] == 0).all()
+    assert measured.confidence.min() > 0.6
+
+
+def single_scale(first: Tensor, second: Tensor) -> Tensor:
+    """Plain phase correlation, what one would try first. (B,1,h,w), (B,1,h,w) -> (B,)"""
+    window = torch.hann_window(first.shape[2])[:, None] * torch.hann_window(first.shape[3])
+    one, other = (torch.fft.rfft2((patch - patch.mean((2, 3), True)) * window) for patch in (first, second))
+    both = one.conj() * other
+    peak = torch.fft.irfft2(both / both.abs().clamp(min=1e-9))[:, 0].flatten(1).argmax(1) // first.shape[3]
+    return torch.where(peak > first.shape[2] // 2, peak - first.shape[2], peak)
+
+
+@pytest.mark.parametrize("sleepers", [0.0, 0.1])
+def test_motion_blur(sleepers: float) -> None:
+    """The shutter stays open all the time: each frame is smeared by as much as the ground moves."""
+    position = travelled((20, 20, 30))
+    frames = drive(position, texture=0.05, sleepers=sleepers, blur=1.0)
+    assert path_error(VelocityNormalizer().distances(Shown(frames)).distance, position) < 0.02
+    patches = ground_patch(frames)
+    plain = single_scale(patches[:-1], patches[1:]).sum() / (position[-1] - position[0])
+    assert abs(plain - 1) > 0.48  # half the way or more is lost
+
+
+def test_frame_rate_changes_nothing() -> None:
+    slow, fast = travelled((10, 10, 20)), travelled((5, 5, 40))
+    ways = [VelocityNormalizer().distances(Shown(drive(at))).distance[-1] for at in (slow, fast)]
+    assert ways[0].item() == pytest.approx(ways[1].item(), rel=0.01)
+
+
+def test_frames_reversed_go_the_way_back() -> None:
+    there, back = (
+        VelocityNormalizer().distances(Shown(frames)).distance
+        for frames in (journey().frames, journey().frames.flip(0))
+    )
+    torch.testing.assert_close(back, there.flip(0) - there[-1], rtol=0, atol=1.0)
+
+
+@settings(max_examples=3)
+@given(size=st.integers(1, 90))
+def test_batches_do_not_matter(size: int) -> None:
+    whole = VelocityNormalizer().distances(journey(), 100)
+    parts = VelocityNormalizer().distances(journey(), size)
+    torch.testing.assert_close(parts.distance, whole.distance, rtol=0, atol=1e-3)
+    torch.testing.assert_close(parts.confidence, whole.confidence, rtol=0, atol=1e-4)
+
+
+def test_forward_gives_the_steps_as_measured() -> None:
+    frames = short().frames.expand(-1, 3, -1, -1)
+    shift, confidence = VelocityNormalizer()(frames)
+    torch.testing.assert_close(shift, torch.full((11,), 5.0), rtol=0, atol=0.1)
+    assert confidence.shape == (11,)
+
+
+def test_a_standing_camera_is_measured_within_the_dead_band() -> None:
+    shift, _ = VelocityNormalizer()(drive(torch.full((30,), 7.0, dtype=torch.float64)))
+    assert shift.abs().max() < 0.1
+
+
+def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixture) -> None:
+    position = travelled((4, 12, 20))
+    frames = drive(position)
+    frames[9] = 0  # two steps see nothing
+    with caplog.at_level(logging.WARNING, "dejavu_torch"):
+        measured = VelocityNormalizer().distances(Shown(frames))
+    assert "the drive: 2 of 20 steps show no common ground (the first: frames 8 and 9)" in caplog.text
+    assert len(caplog.records) == 1
+    assert (measured.confidence < 0.4).nonzero()[:, 0].tolist() == [8, 9]
+    assert path_error(measured.distance, position) < 0.01
+
+
+def test_a_cut_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    position = travelled((6, 6, 8), (900, 900, 1), (6, 6, 8))
+    with caplog.at_level(logging.WARNING, "dejavu_torch"):
+        way = VelocityNormalizer().distances(Shown(drive(position))).distance
+    assert "the drive: a cut between frames 8 and 9" in caplog.text
+    assert len(caplog.records) == 1
+    torch.testing.assert_close(way.diff(), torch.full((17,), 6.0).double(), rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize("lost", [0, 11])
+def test_steps_lost_at_an_end_get_the_nearest_velocity(lost: int) -> None:
+    frames = short().frames.clone()
+    frames[lost] = 0
+    way = VelocityNormalizer().distances(Shown(frames)).distance
+    torch.testing.assert_close(way.diff(), torch.full((11,), 5.0).double(), rtol=0, atol=0.1)
+
+
+# --- even spacing
+
+
+def test_places_are_evenly_spaced() -> None:
+    """What is shown lies within half a frame's motion of even steps along the true way."""
+    even = EvenlySpaced(journey(), VelocityNormalizer(step=8.0))
+    true = JOURNEY[even.frame]
+    furthest = JOURNEY.max()
+    assert even.length == len(even.frame) == len(all_of(even))
+    assert abs(even.length - (int(furthest / 8) + 1)) <= 1
+    assert (true - 8 * torch.arange(even.length)).abs().max() < 16 / 2 + 0.01 * furthest
+    assert (even.frame.diff() >= 0).all()
+    assert torch.equal(even.place, true)
+    assert torch.equal(all_of(even), journey().frames[even.frame])
+
+
+def test_going_back_and_forth_adds_no_places() -> None:
+    position = travelled((6, 6, 12), (-6, -6, 8), (6, 6, 16))
+    back_and_forth = EvenlySpaced(Shown(drive(position)), VelocityNormalizer(step=6.0))
+    plain = EvenlySpaced(Shown(drive(travelled((6, 6, 20)))), VelocityNormalizer(step=6.0))
+    assert abs(back_and_forth.length - plain.length) <= 1
+    shown = set(back_and_forth.frame.tolist())
+    assert not shown & set(range(14, 27))  # the way back, and again up to where it turned
+
+
+def test_a_blend_lies_between_its_neighbours() -> None:
+    even = EvenlySpaced(short(), VelocityNormalizer(step=2.0, blend=True))
+    place = even.place
+    assert place is not None
+    torch.testing.assert_close(place, 2.0 * torch.arange(even.length).double(), rtol=0, atol=0.5)
+    share = (place / 5).frac().float()
+    low = (place / 5).long().clamp(max=10)
+    mixed = short().frames[low].lerp(short().frames[low + 1], share.view(-1, 1, 1, 1))
+    torch.testing.assert_close(all_of(even), mixed, rtol=0, atol=1e-4)
+
+
+def test_the_median_step_of_moving_frames_is_the_default() -> None:
+    position = travelled((5, 5, 11), (0, 0, 30))
+    even = EvenlySpaced(Shown(drive(position)), VelocityNormalizer())
+    assert abs(even.length - 12) <= 1
+    assert even.distance[1].item() == pytest.approx(5, abs=0.05)
+    assert even.place is None
+
+
+def test_a_camera_that_looks_back() -> None:
+    frames = short().frames.flip(0)
+    even = EvenlySpaced(Shown(frames), VelocityNormalizer(step=5.0))
+    assert abs(even.length - 12) <= 1
+    assert even.frame[0] == 0
+
+
+@pytest.mark.parametrize("blend", [False, True])
+@pytest.mark.parametrize("step", [1.5, 14.0])
+def test_any_batch_size_any_number_of_times(blend: bool, step: float) -> None:
+    even = EvenlySpaced(short(), VelocityNormalizer(step=step, blend=blend))
+    frames = all_of(even, 100)
+    for size in (1, 2, 5, 12):
+        batches = list(even.batches(size))
+        assert max(len(batch) for batch in batches) <= size
+        assert torch.equal(torch.cat(batches), frames)
+    assert even.name == "the drive"
+
+
+def test_few_frames_are_in_memory(largest_tensor: type) -> None:
+    traverse = journey()
+    with largest_tensor() as seen:
+        even = EvenlySpaced(traverse, VelocityNormalizer(step=8.0, blend=True), batch_size=4)
+        for _ in even.batches(4):
+            pass
+    assert seen.numel < traverse.frames.numel() / 8
+
+
+# --- what is refused
+
+
+def test_footage_without_motion_is_refused() -> None:
+    still = Shown(short().frames[:1].expand(6, -1, -1, -1))
+    with refused("the drive stands still in all of its 6 frames", "expected motion"):
+        EvenlySpaced(still, VelocityNormalizer())
+    with refused("pixels of ground", "at least one step, 1000"):
+        EvenlySpaced(short(), VelocityNormalizer(step=1000.0))
+
+
+def test_footage_without_ground_is_refused() -> None:
+    with refused("none of 4 steps", "expected corners on the ground"):
+        VelocityNormalizer().distances(Shown(torch.zeros(5, 1, 60, 80)))
+
+
+def test_one_frame_is_refused() -> None:
+    with refused("the drive has 1 frame;", "at least 2"):
+        EvenlySpaced(Shown(short().frames[:1]), VelocityNormalizer())
+    with refused("there are 1 frames", "at least 2"):
+        VelocityNormalizer()(short().frames[:1])
+
+
+def test_ready_features_are_refused() -> None:
+    with refused("features", "(5, 7)", "expected frames (B,C,H,W)"):
+        EvenlySpaced(ArrayTraverse(torch.rand(5, 7)), VelocityNormalizer())
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ({"step": 0.0}, ("step is 0.0", "above 0")),
+        ({"step": math.inf}, ("step is inf",)),
+        ({"least": 1.5}, ("least is 1.5", "0 to 1")),
+        ({"still": -0.1}, ("still is -0.1", "at least 0")),
+    ],
+)
+def test_settings_out_of_range_are_refused(choice: dict, words: tuple[str, ...]) -> None:
+    with refused(*words):
+        VelocityNormalizer(**choice)
+
+
+def test_a_recipe_builds_the_same_module() -> None:
+    module = VelocityNormalizer(size=(64, 48), step=3.0, blend=True)
+    assert repr(build(recipe_of(module), VelocityNormalizer)) == repr(module)
+
+
+# --- real footage
+
+
+def test_a_car_on_a_motorway(data_dir: Path) -> None:
+    """Nearly constant speed over the nine seconds, every step believed."""
+    car = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
+    measured = VelocityNormalizer().distances(car)
+    speed = measured.distance.diff()
+    assert (measured.confidence > 0.6).all()
+    assert speed.std() < 0.1 * speed.mean()
+    over_a_second = speed.unfold(0, 25, 1).mean(1)
+    assert over_a_second.max() < 1.1 * over_a_second.min()
+
+
+def test_a_small_car_that_sways(data_dir: Path) -> None:
+    """Coarse frames of a road almost without texture: a wide region sees it drive on, lap after lap."""
+    car = open_source(f"{data_dir}/rc_car_laps/frames")
+    wide = ((0.2, 0.5), (0.8, 0.5), (1.0, 0.95), (0.0, 0.95))
+    measured = VelocityNormalizer(wide, (48, 48)).distances(car)
+    assert (measured.confidence > 0.4).double().mean() > 0.95
+    laps = torch.stack(
+        [measured.distance[b] - measured.distance[a] for a, b in ((194, 590), (590, 982), (982, 1356))]
+    )
+    assert laps.min() > 0.75 * laps.max()
