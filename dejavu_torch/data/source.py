@@ -11,15 +11,20 @@ from urllib.parse import parse_qsl
 from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.folder import SUFFIXES, ImageFolder
 from dejavu_torch.data.simulate.aerial import AerialRoad
+from dejavu_torch.data.simulate.railway import Outdoor, Underground
 from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.video import SUFFIXES as VIDEO_SUFFIXES
 from dejavu_torch.data.video import Video
 from dejavu_torch.types import InputError, Traverse
 
-SIMULATORS: dict[str, Callable[..., Traverse]] = {"aerial": AerialRoad}
+SIMULATORS: dict[str, Callable[..., Traverse]] = {
+    "aerial": AerialRoad,
+    "outdoor": Outdoor,
+    "underground": Underground,
+}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, "
-    "sim:aerial?seed=0&traverse=0&frames=3072, or strip:IMAGE?width=96"
+    "sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, sim:underground, or strip:IMAGE?width=96"
 )
 
 
@@ -29,8 +34,9 @@ def open_source(source: str | Path) -> Traverse:
     Args:
         source: a folder of images (sorted by name), `photos` or `photos?width=160&height=90&step=2`; a
             video file, `clip.mp4` or with the same options; an `.npy` file of frames (N,H,W) or
-            (N,H,W,3) uint8, or of features (N,D) float; `sim:NAME?seed=0&traverse=0&frames=3072`; or
-            `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window slid along one long image.
+            (N,H,W,3) uint8, or of features (N,D) float; `sim:NAME?seed=0&traverse=0&frames=3072`,
+            NAME being aerial, outdoor or underground; or `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`,
+            a window slid along one long image.
 
     Raises:
         InputError: missing, empty, or nothing that can be read.

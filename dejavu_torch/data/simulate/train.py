@@ -1,0 +1,176 @@
+"""A camera on the front of a train: its ride, its sway and its light, whatever the railway."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterator
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.data.simulate.draw import Light, Painter
+from dejavu_torch.data.simulate.motion import reference_place, ride
+from dejavu_torch.data.simulate.paint import Random
+from dejavu_torch.data.simulate.scenery import Structure, World
+from dejavu_torch.data.simulate.sheets import View
+from dejavu_torch.types import InputError, Traverse
+
+TRAVERSES = 9  # the highest number of a traverse
+EXPOSURE = 0.4  # part of a frame's time during which the shutter is open
+
+
+class Railway(Traverse):
+    """What both railways share: the ride, the camera and its light.
+
+    Attributes:
+        distance: (N,) float64, metres along the track of each frame.
+        place: (N,) float64, the same in units of reference frames; where the reference stands still,
+            the first frame of the stop, and past its last frame, that one.
+        structures: what repeats, each with its name, period, start and stop in metres.
+    """
+
+    kind: ClassVar[str]
+    route: ClassVar[float]  # metres
+    length: int
+    place: Tensor
+
+    def __init__(
+        self,
+        seed: int,
+        traverse: int,
+        frames: int,
+        height: int,
+        width: int,
+        speed: float,
+        usual_speed: float,
+        noise: float,
+        shake: float,
+    ) -> None:
+        query = []
+        for key, value, low, high, usual in (
+            ("seed", seed, 0, 2**63 - 1, None),
+            ("traverse", traverse, 0, TRAVERSES, None),
+            ("height", height, 16, 512, 64),
+            ("width", width, 16, 1024, 128),
+            ("speed", speed, 5, 40, usual_speed),
+            ("noise", noise, 0, 1, 0.02),
+            ("shake", shake, 0, 3, 1.0),
+            ("frames", frames, 0, 2**63 - 1, 0),
+        ):
+            if not low <= value <= high:
+                raise InputError(f"sim:{self.kind} has {key}={value}; expected {low} <= {key} <= {high}")
+            if value != usual:
+                query.append(f"{key}={value}")
+        self.name = f"sim:{self.kind}?" + "&".join(query)
+        self.seed, self.traverse, self.noise, self.shake = seed, traverse, noise, shake
+        self.size = height, width
+        reference = self._ride(0, speed)
+        distance = reference if traverse == 0 else self._ride(traverse, speed)
+        if frames > len(distance):
+            raise InputError(
+                f"sim:{self.kind} has frames={frames}; expected at most the {len(distance)} of its route"
+            )
+        self.length = frames or len(distance)
+        self.distance = distance[: self.length]
+        place = (
+            torch.arange(len(distance)).double() if traverse == 0 else reference_place(reference, distance)
+        )
+        self.place = place[: self.length]
+        self._step = distance.diff(append=distance[-1:])[: self.length] * EXPOSURE
+        self._paths = self._wander(len(distance))
+
+    def _ride(self, traverse: int, speed: float) -> Tensor:
+        """Metres of each frame of a traverse over the whole route."""
+        random, route = Random(self.kind, "ride", self.seed, traverse), self.route
+        cruise = speed * (random.uniform(0.85, 1.2) if traverse else 1.0)
+        slow = []
+        for k in range(2):
+            start = route * (k + random.uniform(0.2, 0.7)) / 2
+            slow.append((start, start + random.uniform(60, 150), cruise * random.uniform(0.45, 0.7)))
+        first = random.uniform(0.15, 0.4)
+        stops = [(route * at, random.uniform(2.5, 5.0)) for at in (first, first + random.uniform(0.25, 0.5))]
+        return ride(route, cruise, tuple(slow), tuple(stops[: 1 + traverse % 2]))
+
+    def _wander(self, frames: int) -> dict[str, Tensor]:
+        """The camera's sway and the light's drift, each (N,) within [-1, 1]."""
+        random = Random(self.kind, "camera", self.seed, self.traverse)
+        slow = {name: random.wander(frames) for name in ("gain", "warm", "gamma")}
+        i = torch.arange(frames, dtype=torch.float64)
+        for name in ("aside", "lift", "pitch", "yaw", "roll"):
+            quick = [torch.sin(i * random.uniform(0.1, 0.5) + random.uniform(0, 6.3)) for _ in range(3)]
+            slow[name] = (random.wander(frames) + torch.stack(quick).mean(0)) / 2
+        return slow
+
+    @property
+    def structures(self) -> tuple[Structure, ...]:
+        return self._world.structures
+
+    @cached_property
+    @abstractmethod
+    def _world(self) -> World:
+        """The railway with this traverse's visitors."""
+
+    @abstractmethod
+    def _light(self, world: World, random: Random) -> Light: ...
+
+    @abstractmethod
+    def _sky(self, view: View, random: Random) -> Tensor:
+        """What lies behind everything, (3,P)."""
+
+    @property
+    def _looks(self) -> tuple[float, float, float]:
+        """Gain, gamma and warmth of a traverse's camera."""
+        random = Random(self.kind, "looks", self.seed, self.traverse)
+        other = [random.pick(values) for values in ((0.72, 0.82, 1.18), (0.85, 1.18), (-0.09, 0.09))]
+        return (other[0], other[1], other[2]) if self.traverse else (1.0, 1.0, 0.0)
+
+    @cached_property
+    def _painter(self) -> tuple[Painter, Tensor, int]:
+        margin = math.ceil(0.05 * max(self.size))
+        view = View(*self.size, margin)
+        random = Random(self.kind, "light", self.seed, self.traverse)
+        light = self._light(self._world, random)
+        return Painter(view, list(self._world.sheets.values()), light), self._sky(view, random), margin
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        """Yield the frames in order, at most `size` at a time. Shape: (B,3,H,W) float32 in [0,1]."""
+        if size < 1:
+            raise InputError(f"a batch holds {size} frames; expected at least 1")
+        for start in range(0, self.length, size):
+            yield self._frames(torch.arange(start, min(start + size, self.length)))
+
+    def _frames(self, at: Tensor) -> Tensor:
+        painter, sky, margin = self._painter
+        path = {name: curve[at] for name, curve in self._paths.items()}
+        swing = self.shake * (1.0 if self.traverse else 0.5)
+        sway = swing * torch.stack([0.06 * path["aside"], 0.04 * path["lift"]], 1)
+        seen = painter.draw(self.distance[at], self._step[at], sway, sky)
+        seen = self._turned(seen, swing, path, margin)
+        gain, gamma, warm = self._looks
+        warmth = warm + 0.02 * path["warm"]
+        balance = torch.stack([1 + warmth, torch.ones_like(warmth), 1 - warmth], 1)
+        level = gain * (1 + 0.06 * path["gain"])
+        seen = (seen * (balance * level[:, None]).float()[:, :, None, None]).clamp(0, 1)
+        seen = seen ** (gamma + 0.03 * path["gamma"]).float()[:, None, None, None]
+        for frame, i in zip(seen, at.tolist(), strict=True):
+            frame += self.noise * Random(self.kind, "noise", self.seed, self.traverse, i).normal(
+                3, *self.size
+            )
+        return seen.clamp_(0, 1)
+
+    def _turned(self, seen: Tensor, swing: float, path: dict[str, Tensor], margin: int) -> Tensor:
+        """Cut the frames out of their margin, shifted by pitch and yaw and turned by roll."""
+        height, width = self.size
+        roll = math.radians(0.5) * swing * path["roll"]
+        reach = 0.012 * width * swing  # pixels
+        c, s = roll.cos()[:, None, None], roll.sin()[:, None, None]
+        down = (torch.arange(height).double() + 0.5 - height / 2)[:, None]
+        across = torch.arange(width).double() + 0.5 - width / 2
+        x = c * across - s * down + (reach * path["yaw"])[:, None, None]
+        y = s * across + c * down + (0.7 * reach * path["pitch"])[:, None, None]
+        grid = torch.stack([2 * x / (width + 2 * margin), 2 * y / (height + 2 * margin)], -1).float()
+        return F.grid_sample(seen, grid, padding_mode="border", align_corners=False)

@@ -1,0 +1,392 @@
+"""The railways: what repeats and where, how the train moves, and what two traverses share."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from helpers import all_of, refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch.data.simulate.draw import Painter
+from dejavu_torch.data.simulate.motion import FPS, reference_place, ride
+from dejavu_torch.data.simulate.railway import Outdoor, Underground
+from dejavu_torch.data.simulate.scenery import STATION, Structure
+from dejavu_torch.data.simulate.sheets import Thing, View
+from dejavu_torch.data.simulate.train import Railway
+from dejavu_torch.data.source import open_source
+from dejavu_torch.data.truth import position_truth
+from dejavu_torch.types import InputError
+
+KINDS = [Outdoor, Underground]
+both = pytest.mark.parametrize("kind", KINDS)
+
+
+@cache
+def ride_of(kind: type[Railway], traverse: int = 0) -> Railway:
+    """A whole ride on the railway of seed 3, built once."""
+    return kind(seed=3, traverse=traverse)  # type: ignore[call-arg]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget() -> Iterator[None]:
+    yield
+    ride_of.cache_clear()
+
+
+def frames_at(train: Railway, index: Tensor) -> Tensor:
+    """These frames, read one at a time as a batch of one would."""
+    return torch.cat([train._frames(part) for part in index.split(32)])
+
+
+def at_metres(train: Railway, metres: Tensor) -> Tensor:
+    """The first frame at or after each distance."""
+    index = torch.searchsorted(train.distance, metres.double()).clamp(max=train.length - 1)
+    return frames_at(train, index)
+
+
+def outlines(frames: Tensor) -> Tensor:
+    """Strength of the edges, blurred, each frame with mean 0 and norm 1, (N,D)."""
+    grey = F.avg_pool2d(frames.mean(1, keepdim=True), 2)
+    edges = (grey[..., 1:, 1:] - grey[..., :-1, 1:]).abs() + (grey[..., 1:, 1:] - grey[..., 1:, :-1]).abs()
+    flat = F.avg_pool2d(edges / edges.mean((1, 2, 3), keepdim=True), 3, 2).flatten(1)
+    return F.normalize(flat - flat.mean(1, keepdim=True), dim=1)
+
+
+@both
+def test_frames_have_the_promised_shape_and_range(kind: type[Railway]) -> None:
+    for traverse in (0, 1):
+        frames = at_metres(ride_of(kind, traverse), torch.linspace(0, 1900, 8))
+        assert frames.shape == (8, 3, 64, 128)
+        assert frames.dtype == torch.float32
+        assert frames.min() >= 0
+        assert frames.max() <= 1
+        assert frames.std() > 0.05
+
+
+@both
+@pytest.mark.parametrize("traverse", [0, 1])
+def test_frames_do_not_depend_on_the_batch_size(kind: type[Railway], traverse: int) -> None:
+    train, parts = ride_of(kind, traverse), []
+    for batch in (1, 4, 10):
+        read = train.batches(batch)
+        parts.append(torch.cat([next(read) for _ in range(-(-10 // batch))])[:10])
+    assert all(torch.equal(part, parts[0]) for part in parts)
+    moving = torch.arange(1000, 1007)
+    whole = train._frames(moving)
+    assert torch.equal(torch.cat([train._frames(part) for part in moving.split(3)]), whole)
+
+
+@both
+def test_batches_hold_at_most_size_frames(kind: type[Railway]) -> None:
+    small = kind(frames=11, height=16, width=16)  # type: ignore[call-arg]
+    assert [tuple(part.shape) for part in small.batches(8)] == [(8, 3, 16, 16), (3, 3, 16, 16)]
+
+
+@both
+def test_the_same_arguments_give_the_same_frames_and_others_do_not(kind: type[Railway]) -> None:
+    first = next(ride_of(kind, 1).batches(4))
+    assert torch.equal(all_of(kind(seed=3, traverse=1, frames=4)), first)  # type: ignore[call-arg]
+    for other in ({"seed": 2, "traverse": 1}, {"seed": 3, "traverse": 2}):
+        assert not torch.allclose(all_of(kind(frames=4, **other)), first, atol=0.1)  # type: ignore[arg-type]
+
+
+@both
+def test_a_cut_route_is_the_beginning_of_the_whole(kind: type[Railway]) -> None:
+    for traverse in (0, 1):
+        whole, part = ride_of(kind, traverse), kind(seed=3, traverse=traverse, frames=33)  # type: ignore[call-arg]
+        assert torch.equal(part.distance, whole.distance[:33])
+        assert torch.equal(part.place, whole.place[:33])
+    assert torch.equal(next(whole.batches(8)), next(part.batches(8)))
+
+
+@both
+def test_the_whole_route_has_a_workable_number_of_frames(kind: type[Railway]) -> None:
+    for seed in range(3):
+        for traverse in (0, 1):
+            train = kind(seed=seed, traverse=traverse)  # type: ignore[call-arg]
+            assert 3000 < train.length < 8000
+            assert train.distance[0] == 0
+            assert 0 <= train.route - train.distance[-1] < 1
+
+
+@both
+def test_the_train_obeys_its_limits_and_stands_at_its_stops(kind: type[Railway]) -> None:
+    for traverse in (0, 1):
+        step = kind(seed=4, traverse=traverse).distance.diff()  # type: ignore[call-arg]
+        assert step.min() >= 0
+        speed = step * FPS
+        assert speed.max() < 40
+        still = (step == 0).float()
+        assert 2.0 * FPS < still.sum() < 12 * FPS
+        assert (still.diff() == 1).sum() == 1 + traverse  # stops
+        top = speed.max()
+        assert ((speed - top).abs() < 1e-6).float().mean() > 0.15  # cruising
+        assert ((speed > 0.4 * top) & (speed < 0.75 * top)).float().mean() > 0.03  # slow sections
+
+
+def test_a_ride_keeps_to_its_plan() -> None:
+    distance = ride(1000.0, 10.0, ((400, 500, 5.0),), ((700, 4.0),), acceleration=1.0)
+    assert distance[0] == 0
+    assert (distance == 700).sum() in (100, 101)  # 4 s
+    within = distance[(distance > 410) & (distance < 490)]
+    assert torch.allclose(within.diff(), torch.tensor(5.0 / FPS, dtype=torch.float64))
+    cruise = distance[(distance > 100) & (distance < 300)]
+    assert torch.allclose(cruise.diff(), torch.tensor(10.0 / FPS, dtype=torch.float64))
+    # s = t^2 / 2 at 1 m/s^2
+    t = torch.arange(len(distance)).double()[100:240] / FPS
+    assert torch.allclose(distance[100:240], t**2 / 2, atol=0.05)
+
+
+@given(
+    steps=st.lists(st.sampled_from([0.0, 0.0, 0.25, 1.0]), min_size=1, max_size=20),
+    queries=st.lists(st.integers(0, 80), min_size=1, max_size=20),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_reference_place_by_hand(steps: list[float], queries: list[int]) -> None:
+    reference = [0.0]
+    for step in steps:
+        reference.append(reference[-1] + step)
+    asked = [min(q / 4 + 0.125 * (q % 2), reference[-1]) for q in queries]
+    expected = []
+    for d in asked:
+        if d in reference:
+            expected.append(float(reference.index(d)))
+        else:
+            after = next(i for i, r in enumerate(reference) if r > d)
+            low, high = reference[after - 1], reference[after]
+            expected.append(after - 1 + (d - low) / (high - low))
+    if reference[-1] > 0:
+        tensors = (torch.tensor(values, dtype=torch.float64) for values in (reference, asked))
+        assert reference_place(*tensors).tolist() == pytest.approx(expected)
+
+
+@both
+def test_a_place_is_the_reference_frame_at_the_same_distance(kind: type[Railway]) -> None:
+    reference, other = ride_of(kind), ride_of(kind, 1)
+    assert torch.equal(reference.place, torch.arange(reference.length).double())
+    low = reference.distance[other.place.floor().long()]
+    high = reference.distance[other.place.ceil().long()]
+    assert (low <= other.distance + 1e-9).all()
+    within = other.distance <= reference.distance[-1]  # the route ends within the last frame's step
+    assert (other.distance <= high + 1e-9)[within].all()
+    assert (other.place[~within] == reference.length - 1).all()
+    found = position_truth(reference.place, other.place)[:, 0]
+    assert (found >= 0).all()
+    assert (reference.distance[found] - other.distance).abs().max() < reference.distance.diff().max()
+    assert abs(reference.length - other.length) > 20
+
+
+@both
+def test_a_standing_train_sees_one_picture(kind: type[Railway]) -> None:
+    train = kind(seed=3, noise=0.0, shake=0.0)  # type: ignore[call-arg]
+    step = train.distance.diff()
+    first = int((step == 0).nonzero()[5])
+    stand, drive = (
+        frames_at(train, torch.arange(first, first + 4)),
+        frames_at(train, torch.arange(first + 200, first + 204)),
+    )
+    assert stand.diff(dim=0).abs().max() < 0.02  # the light drifts slowly
+    assert drive.diff(dim=0).abs().max() > 0.1
+
+
+def brightness(train: Railway, metres: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """These pixels of a 64 x 128 frame with the camera still at each of these distances, (n,R*C)."""
+    view = View(64, 128)
+    keep = (rows[:, None] * 128 + columns).flatten()
+    view.up, view.right, view.shape = view.up[keep], view.right[keep], (len(rows), len(columns))
+    painter = Painter(view, train._painter[0].sheets, train._painter[0].light)
+    parts = []
+    for part in metres.double().split(512):
+        still, sky = torch.zeros(len(part)), torch.zeros(3, len(keep))
+        parts.append(painter.draw(part, still, torch.zeros(len(part), 2).double(), sky).mean(1).flatten(1))
+    return torch.cat(parts)
+
+
+def likeness(signal: Tensor, lags: range) -> Tensor:
+    """Autocorrelation at these lags."""
+    signal = signal - F.avg_pool1d(signal[None, None], 301, 1, 150, count_include_pad=False)[0, 0]
+    return torch.stack([torch.corrcoef(torch.stack([signal[lag:], signal[:-lag]]))[0, 1] for lag in lags])
+
+
+@pytest.mark.parametrize(("kind", "period"), [(Outdoor, 0.6), (Underground, 0.75)])
+def test_sleepers_repeat_with_their_period(kind: type[Railway], period: float) -> None:
+    train, step = ride_of(kind), 0.025
+    assert ("sleeper", period) in [(s.name, s.period) for s in train.structures]
+    between = torch.tensor([62]), torch.tensor([64])  # the rails
+    signal = brightness(train, 100 + step * torch.arange(2400), *between)[:, 0]
+    alike = likeness(signal, range(8, 40))  # short of twice the period
+    assert abs((8 + int(alike.argmax())) * step - period) <= step
+    assert alike.max() > 0.3
+
+
+def test_lamps_repeat_with_their_period() -> None:
+    train, step = ride_of(Underground), 0.25
+    lamps = max((s for s in train.structures if s.name == "lamp"), key=lambda s: s.stop - s.start)
+    assert lamps.stop - lamps.start > 200
+    metres = lamps.start + step * torch.arange(int((lamps.stop - lamps.start - 30) / step))
+    bright = brightness(train, metres, torch.arange(0, 12, 2), torch.arange(32, 96, 4)).amax(1)
+    alike = likeness(bright, range(28, 90))
+    assert abs((28 + int(alike.argmax())) * step - lamps.period) <= step
+
+
+@both
+def test_structures_start_and_stop_where_they_say(kind: type[Railway]) -> None:
+    names = {Outdoor: ("fence post", "fence", 30), Underground: ("rib", "ceiling", 30)}
+    name, sheet, size = names[kind][0], names[kind][1], names[kind][2]
+    train = ride_of(kind)
+    stretches = [s for s in train.structures if s.name == name]
+    assert len({s.period for s in stretches}) > 1
+    things = [t for t in train._world.sheets[sheet].things if t.length in (0.12, 0.35)]
+    s = torch.arange(0, train.route, 0.05)
+    half, slope = torch.full_like(s, 0.01), torch.zeros_like(s)
+    seen = torch.stack([thing.cover(s, half, slope) for thing in things]).amax(0) > 0.5
+    starts = s[1:][seen[1:] & ~seen[:-1]]
+    expected = torch.cat([stretch.at for stretch in stretches])
+    expected = expected[(expected > 0.1) & (expected < train.route - 0.1)].sort().values
+    assert size < len(expected)
+    assert len(starts) == len(expected)
+    assert (starts - expected).abs().max() < 0.1
+    for stretch in stretches:
+        assert stretch.at[0] == stretch.start
+        assert stretch.stop - stretch.period - 1e-6 <= stretch.at[-1] < stretch.stop
+
+
+@both
+def test_stretches_do_not_fall_on_a_grid_of_1024_frames(kind: type[Railway]) -> None:
+    train = ride_of(kind)
+    edges = torch.tensor([s.start for s in train.structures if 10 < s.start < train.route])
+    frames = torch.searchsorted(train.distance, edges.double())
+    off = (frames.double() / 1024 - (frames.double() / 1024).round()).abs() * 1024
+    assert len(edges) > 8
+    assert (off > 30).float().mean() > 0.8
+
+
+def test_stations_are_bright_and_their_structures_stay_within() -> None:
+    train = ride_of(Underground)
+    starts = torch.tensor(train._world.stations, dtype=torch.float64)
+    light = at_metres(train, torch.cat([starts + 60, starts - 60])).mean((1, 2, 3))
+    station, tunnel = light.chunk(2)  # stains and ribs make a tunnel darker here and there
+    assert station.min() > tunnel.max()
+    assert station.mean() > 1.25 * tunnel.mean()
+    for structure in train.structures:
+        inside = (structure.start >= starts) & (structure.stop <= starts + STATION + 0.01)
+        if structure.name in ("station light", "column"):
+            assert inside.any(), structure
+        elif structure.name != "sleeper":
+            apart = (structure.stop <= starts) | (structure.start >= starts + STATION - 0.01)
+            assert apart.all(), structure
+
+
+@both
+def test_two_traverses_see_the_same_place_in_another_light(kind: type[Railway]) -> None:
+    metres = torch.linspace(60, 1900, 24)
+    first, second = (at_metres(ride_of(kind, t), metres) for t in (0, 1))
+    assert (first.mean((2, 3)) - second.mean((2, 3))).abs().mean() > 0.03
+    alike = outlines(first) @ outlines(second).T
+    same = alike.diag()
+    others = (alike.sum(1) - same) / (len(metres) - 1)
+    assert (same > others).float().mean() > 0.9
+    assert same.mean() > others.mean() + 0.1
+
+
+@both
+def test_visitors_are_met_by_one_traverse_only(kind: type[Railway]) -> None:
+    worlds = [ride_of(kind, t)._world.sheets["people"].things for t in (0, 1)]
+    ends = [[(thing.first, thing.last) for thing in things] for things in worlds]
+    shared = [pair for pair in ends[0] if pair in ends[1]]
+    assert 0 < len(shared) < len(ends[0])
+
+
+@both
+def test_noise_and_shake_do_as_they_say(kind: type[Railway]) -> None:
+    quiet = all_of(kind(seed=3, frames=4, noise=0.0, traverse=1))  # type: ignore[call-arg]
+    loud = next(ride_of(kind, 1).batches(4))
+    middle = (quiet > 0.2) & (quiet < 0.8)
+    assert (loud - quiet)[middle].std() == pytest.approx(0.02, rel=0.05)
+    steady = all_of(kind(seed=3, frames=4, noise=0.0, shake=0.0, traverse=1))  # type: ignore[call-arg]
+    assert (quiet - steady).abs().max() > 0.05
+
+
+@given(
+    gap=st.floats(0.5, 40),
+    length=st.floats(0.05, 3),
+    depth=st.floats(0, 0.5),
+    slope=st.floats(1, 20),
+    half=st.floats(0.05, 5),
+    count=st.integers(1, 6),
+)
+@settings(max_examples=60, deadline=None)
+def test_cover_is_the_hidden_part_of_an_interval(
+    gap: float, length: float, depth: float, slope: float, half: float, count: int
+) -> None:
+    at = 10 + gap * torch.arange(count).double()
+    thing = Thing(0, 1, "ffffff", at, length, depth)
+    s = torch.linspace(0, 60, 25)
+    seen = thing.cover(s, torch.full_like(s, half), torch.full_like(s, slope))
+    fine = (s[:, None] + half * torch.linspace(-1, 1, 4001)).numpy()
+    behind = fine[..., None] - at.numpy()
+    extent = min(length + depth * slope, gap if count > 1 else np.inf)
+    hidden = ((behind >= 0) & (behind <= extent)).any(-1).mean(-1)
+    assert np.abs(seen.numpy() - hidden).max() < 0.01
+
+
+def test_a_structure_stands_from_its_start_and_short_of_its_stop() -> None:
+    assert Structure("post", 2.5, 1.0, 8.5).at.tolist() == [1.0, 3.5, 6.0]
+    assert Structure("post", 2.5, 1.0, 8.6).at.tolist() == [1.0, 3.5, 6.0, 8.5]
+    assert Structure("post", 2.5, 1.0, 1.1).at.tolist() == [1.0]
+
+
+def test_they_open_by_name() -> None:
+    assert open_source("sim:outdoor?frames=40&traverse=1").length == 40
+    train = open_source("sim:underground?seed=2&frames=7&height=32&width=40")
+    assert isinstance(train, Underground)
+    assert next(train.batches(7)).shape == (7, 3, 32, 40)
+    assert train.name == "sim:underground?seed=2&traverse=0&height=32&width=40&frames=7"
+    again = open_source(train.name)
+    assert torch.equal(all_of(again), all_of(train))
+    assert Outdoor().name == "sim:outdoor?seed=0&traverse=0"
+    assert Outdoor(frames=0).length == Outdoor().length
+
+
+@both
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"frames": -1}, ["frames=-1", "expected 0 <= frames"]),
+        ({"frames": 10**6}, ["frames=1000000", "expected at most the", "of its route"]),
+        ({"seed": -1}, ["seed=-1", "expected 0 <= seed"]),
+        ({"traverse": -1}, ["traverse=-1", "expected 0 <= traverse <= 9"]),
+        ({"traverse": 10}, ["traverse=10", "expected 0 <= traverse <= 9"]),
+        ({"height": 8}, ["height=8", "expected 16 <= height <= 512"]),
+        ({"width": 4000}, ["width=4000", "expected 16 <= width <= 1024"]),
+        ({"speed": 0.0}, ["speed=0.0", "expected 5 <= speed <= 40"]),
+        ({"noise": float("nan")}, ["noise=nan", "expected 0 <= noise <= 1"]),
+        ({"shake": -1.0}, ["shake=-1.0", "expected 0 <= shake <= 3"]),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(
+    kind: type[Railway], arguments: dict[str, float], words: list[str]
+) -> None:
+    with refused(f"sim:{kind.kind} has", *words):
+        kind(**arguments)  # type: ignore[arg-type]
+
+
+def test_an_empty_batch_is_refused() -> None:
+    with pytest.raises(InputError, match="0 frames; expected at least 1"):
+        next(Outdoor(frames=3).batches(0))
+
+
+@both
+def test_global_random_states_are_left_alone(kind: type[Railway]) -> None:
+    before = torch.get_rng_state(), random.getstate()
+    all_of(kind(frames=3, traverse=1, height=16, width=16))  # type: ignore[call-arg]
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert random.getstate() == before[1]
