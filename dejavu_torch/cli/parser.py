@@ -138,7 +138,9 @@ def build_parser() -> Parser:
     evaluate_ = command("evaluate", "judge a matches.csv by a truth: scores, curve, coverage")
     evaluate_.add_argument("matches", type=Path, help="csv of query,place,score[,accepted]")
     evaluate_.add_argument(
-        "--reference", type=str | None, help=f"where places are named by it (utm): {SOURCE}"
+        "--reference",
+        type=str | None,
+        help=f"tells how many places there are, and coordinates for utm: {SOURCE}",
     )
     evaluate_.add_argument("--query", type=str | None, help="as --reference, of the queries")
     for sub in (compare_, evaluate_):

@@ -10,9 +10,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torch import Tensor
+
 from dejavu_torch.data.files import whole_file
-from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.evaluation.curves import Scores, curve_of, judge
 from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.types import Match, Truth
 
 PICTURES = (
     *("frames", "pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"),
@@ -39,6 +42,20 @@ class Contender(NamedTuple):
         scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
         extra = {"bytes": self.bytes, "k": self.k, "curve_starts_at_recall": self.starts}
         return scores | {name: value for name, value in extra.items() if value is not None}
+
+
+def contend(
+    name: str,
+    match: Match,
+    truth: Tensor | Truth,
+    tolerance: int,
+    bytes: int | None = None,
+    k: int | None = None,
+) -> Contender:
+    """Judge matches as one contender; see `judge`."""
+    recall = curve_of(match, truth, tolerance).recall
+    starts = float(recall[0]) if len(recall) else None
+    return Contender(name, judge(match, truth, tolerance), bytes, k, starts)
 
 
 class Report(NamedTuple):

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from dejavu_torch.data.truth import counted, is_right
 from dejavu_torch.evaluation.controls import same_settings
-from dejavu_torch.evaluation.curves import curve_of, judge
-from dejavu_torch.evaluation.report import Contender
+from dejavu_torch.evaluation.report import Contender, contend
 from dejavu_torch.experiments.compare import Comparison
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import InputError, Match, Truth
@@ -100,8 +99,5 @@ def known_boundaries(result: Comparison, cuts: Sequence[int], tolerance: int) ->
     other = same_settings(model)
     other.periods = GivenChunks(cuts, {name: getattr(model.periods, name) for name in names})
     other.learn_features(result.stored, model.learnt_from)
-    match = other.localize(result.seen)
-    recall = curve_of(match, result.truth, tolerance).recall
-    starts = float(recall[0]) if len(recall) else None
-    scores = judge(match, result.truth, tolerance)
-    return Contender("chunks cut where structures start and stop", scores, other.map_bytes, starts=starts)
+    name, match = "chunks cut where structures start and stop", other.localize(result.seen)
+    return contend(name, match, result.truth, tolerance, other.map_bytes)

@@ -18,12 +18,11 @@ from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     curve_of,
-    judge,
     tally,
     threshold_of_full_precision,
 )
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.report import Contender, Report
+from dejavu_torch.evaluation.report import Contender, Report, contend
 from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
 from dejavu_torch.model import DejaVu
@@ -133,9 +132,7 @@ def compare(
     ) -> Contender:
         if truth is None or not counted(match.index, truth, tolerance).any():
             return Contender(name, None, bytes, k)
-        recall = curve_of(match, truth, tolerance).recall
-        starts = float(recall[0]) if len(recall) else None
-        return Contender(name, judge(match, truth, tolerance), bytes, k, starts)
+        return contend(name, match, truth, tolerance, bytes, k)
 
     contenders = {}
     for key, (name, other, stride) in found.items():

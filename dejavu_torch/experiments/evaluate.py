@@ -14,13 +14,12 @@ from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_t
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     curve_of,
-    judge,
     tally,
     threshold_of_full_precision,
 )
 from dejavu_torch.evaluation.matches import read_matches
 from dejavu_torch.evaluation.plots import Picture, plot_coverage, plot_curves
-from dejavu_torch.evaluation.report import Contender, Report
+from dejavu_torch.evaluation.report import Report, contend
 from dejavu_torch.types import InputError, Match, Traverse, Truth
 
 
@@ -79,8 +78,7 @@ def evaluate(
         "version": dejavu_torch.__version__,
         "torch": torch.__version__,
     }
-    starts = float(curve.recall[0]) if len(curve.recall) else None
-    ours = Contender(matches.name, judge(match, known, tolerance), starts=starts)
+    ours = contend(matches.name, match, known, tolerance)
     seen = 1 + max(int(table.max()) for table in (match.index, known.right))
     pictures = {
         "pr": Picture(

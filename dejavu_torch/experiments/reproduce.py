@@ -10,9 +10,9 @@ from torch import Tensor
 
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.controls import leave_out_match, same_settings
-from dejavu_torch.evaluation.curves import curve_of, judge
+from dejavu_torch.evaluation.curves import judge
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.report import Contender, Report
+from dejavu_torch.evaluation.report import Report, contend
 from dejavu_torch.evaluation.route_plots import (
     Length,
     plot_autocorrelogram,
@@ -100,9 +100,7 @@ def reproduce(
     }
     contenders = dict(result.report.contenders)
     for key, (name, match) in matches.items():
-        recall = curve_of(match, itself, tolerance).recall
-        starts = float(recall[0]) if len(recall) else None
-        contenders[key] = Contender(name, judge(match, itself, tolerance), starts=starts)
+        contenders[key] = contend(name, match, itself, tolerance)
     found = chunk_lengths(model, stored, result.seen, result.truth, tolerance, lengths)
     facts = {
         **result.report.facts,
@@ -138,7 +136,8 @@ def chunk_lengths(
     rows: list[Length] = []
     if truth is None or not isinstance(model.periods, SpectrogramAnalysis):
         return rows
-    kept = {name: getattr(model.periods, name) for name in SETTINGS}
+    names = ("min_period", "strongest", "peaks", "false_alarm", "similar", "short")
+    kept = {name: getattr(model.periods, name) for name in names}
     for window in lengths:
         if window <= len(stored):
             other = same_settings(model)
@@ -148,9 +147,6 @@ def chunk_lengths(
             size = other.map_bytes
             rows.append(Length(window, scores.recall_at_1, scores.auc, size, size / len(stored)))
     return rows
-
-
-SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "similar", "short")
 
 
 def structure_cuts(reference: Traverse) -> list[int]:
