@@ -75,13 +75,10 @@ def _paint(
     place = where.float()
     paint, alpha = torch.zeros(len(s), 3, len(rays.pixels)), torch.zeros(len(s), 1, len(rays.pixels))
     if sheet.texture is not None:
-        down = (rays.tall / sheet.cell[0]).log2().round().clamp(0, 6).long()
-        along = (rays.wide / sheet.cell[1]).log2().round().clamp(0, 6).long()
-        for pair in torch.stack([down, along], 1).unique(dim=0).tolist():
-            here = ((down == pair[0]) & (along == pair[1])).nonzero().flatten()
-            image = sheet.level(*pair)
-            u = where[:, here] / (sheet.cell[1] * 2 ** pair[1])
-            v = across[:, here] / (sheet.cell[0] * 2 ** pair[0])
+        for down, along, here in rays.detail:
+            image = sheet.level(down, along)
+            u = where[:, here] / (sheet.cell[1] * 2**along)
+            v = across[:, here] / (sheet.cell[0] * 2**down)
             grid = torch.stack([(2 * u / image.shape[2] - 1).float(), 2 * v / image.shape[1] - 1], -1)
             texels = F.grid_sample(
                 image.expand(len(s), -1, -1, -1), grid[:, None], padding_mode="border", align_corners=False

@@ -6,6 +6,7 @@ import torch
 
 from dejavu_torch.data.simulate.paint import Random
 from dejavu_torch.data.simulate.scenery import (
+    FOOT,
     RAIL,
     STATION,
     Structure,
@@ -18,12 +19,12 @@ from dejavu_torch.data.simulate.scenery import (
     scattered,
     solid,
     stretches,
+    waiting,
 )
 from dejavu_torch.data.simulate.sheets import FAR, Sheet, Thing
 
 TRACKS = [0.0, 4.0]
 HALF = 13.0  # metres of fine ground on either side
-FOOT = RAIL - 0.2  # where the ground lies
 
 
 def _side(x: float, height: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -161,13 +162,7 @@ def _waymarks(sheets: dict[str, Sheet], random: Random, end: float, stations: tu
 def outdoor_visitors(world: World, random: Random, route: float, sunny: bool) -> None:
     """What one traverse alone meets: people, a train on the other track, and shadows in the sun."""
     sheets = world.sheets
-    for start in world.stations:
-        for _ in range(2):
-            at = scattered(random, start + 3, start + STATION - 10, (4, 40))
-            coat = random.pick(("1f2a44", "7a1f22", "d8d2c4", "2f3a2c", "b0762a"))
-            sheets["people"].add(
-                Thing(1.1, 2.5, coat, at, 0.4, 0.5), Thing(2.5, 2.8, "c99a7a", at, 0.2, 0.25)
-            )
+    waiting(world, random, 2, 1.1, 2.5)
     at = torch.tensor([random.uniform(0.15, 0.8) * route]).double()
     body = random.pick(("c9352c", "2f5fa8", "e0e2e4"))
     sheets["train"].add(

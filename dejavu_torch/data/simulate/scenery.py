@@ -1,6 +1,7 @@
 """What stands where along the two railways: textures, and structures with their periods.
 
-Cross-sections are in metres from the camera, which looks along the middle of its track.
+Cross-sections are in metres from the camera, which looks along the middle of its track: x to the right,
+y up. These figures are frozen: results are judged on them.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from torch import Tensor
 from dejavu_torch.data.simulate.paint import Random
 from dejavu_torch.data.simulate.sheets import FAR, Sheet, Thing
 
-RAIL = -2.4  # height of the rails below the camera
+RAIL = -2.4  # where the top of the rails would be: platforms are measured from here
+FOOT = RAIL - 0.2  # the track bed, flat, with sleepers and rails painted on it
+GAUGE = 1.5  # from the middle of one rail to that of the other
 STATION = 150.0  # metres of platform
 
 
@@ -94,7 +97,7 @@ def mottled(random: Random, colour: str, rows: int, columns: int, rough: float, 
 
 def place_on(image: Tensor, colour: Tensor, cover: Tensor) -> Tensor:
     """Blend colour (3,..) over an image (3,V,S) where cover (V,S) is 1."""
-    return image + cover * (colour - image)
+    return (colour - image).mul_(cover).add_(image)
 
 
 def ground(
@@ -172,9 +175,24 @@ def rails(sheet: Sheet, tracks: list[float], route: float, left: float) -> None:
     """Two rails per track on a ground sheet whose first edge lies at x = left."""
     start, length = torch.tensor([-FAR]), route + 3 * FAR
     for track in tracks:
-        for side in (-0.75, 0.75):
+        for side in (-GAUGE / 2, GAUGE / 2):
             x = track + side - left
             sheet.add(
                 Thing(x - 0.09, x + 0.09, "3d2f28", start, length),
                 Thing(x - 0.035, x + 0.035, "c3c6cc", start, length),
+            )
+
+
+def waiting(world: World, random: Random, groups: int, foot: float, neck: float) -> None:
+    """Groups of people, each in coats of one colour, along every platform.
+
+    Args:
+        foot, neck: where a coat begins and ends, metres from the lower edge of the sheet of people.
+    """
+    for start in world.stations:
+        for _ in range(groups):
+            at = scattered(random, start + 3, start + STATION - 10, (4, 40))
+            coat = random.pick(("1f2a44", "7a1f22", "d8d2c4", "2f3a2c", "b0762a"))
+            world.sheets["people"].add(
+                Thing(foot, neck, coat, at, 0.4, 0.5), Thing(neck, neck + 0.3, "c99a7a", at, 0.2, 0.25)
             )

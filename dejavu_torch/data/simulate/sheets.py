@@ -15,6 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 FAR = 240.0  # metres ahead beyond which everything is haze
+FOCAL = 0.55  # focal length, of the frame's width: 85 degrees across
+HORIZON = 0.38  # how far down the frame the horizon lies, of its height
 
 
 class View:
@@ -23,15 +25,29 @@ class View:
     Args:
         height, width: of the image in pixels.
         margin: rows and columns beyond it on every side.
+
+    Attributes:
+        up, right: (P,) metres that each pixel's ray rises and goes aside per metre ahead.
+
+    Convention: square pixels; a point (x, y, ahead) is seen `FOCAL * width * x / ahead` pixels right of the
+        frame's middle and `FOCAL * width * y / ahead` above the horizon, `HORIZON * height` below its top.
     """
 
     def __init__(self, height: int, width: int, margin: int = 0) -> None:
+        self.size = height, width
         self.shape = height + 2 * margin, width + 2 * margin
-        self.pixel = 1 / (0.55 * width)  # tangent of one pixel
+        self.pixel = 1 / (FOCAL * width)  # tangent of one pixel
         down, across = (torch.arange(n) + 0.5 - margin for n in self.shape)
-        up = (0.38 * height - down) * self.pixel  # the horizon lies above the middle
+        up = (HORIZON * height - down) * self.pixel
         right = (across - 0.5 * width) * self.pixel
         self.up, self.right = (t.flatten() for t in torch.meshgrid(up, right, indexing="ij"))
+
+    def project(self, x: float, y: float, ahead: float) -> tuple[float, float]:
+        """Where a point is seen: (0, 0) the centre of the top left pixel, (1, 1) of the bottom right one."""
+        height, width = self.size
+        across = 0.5 * width + x / ahead / self.pixel
+        down = HORIZON * height - y / ahead / self.pixel
+        return (across - 0.5) / (width - 1), (down - 0.5) / (height - 1)
 
 
 class Thing:
@@ -106,6 +122,7 @@ class Rays(NamedTuple):
     slope: Tensor  # metres ahead per metre towards the camera's path
     wide: Tensor  # pixel's extent along the track, metres
     tall: Tensor  # and across
+    detail: list[tuple[int, int, Tensor]]  # each level of the texture, with the rays that see that one
 
 
 class Sheet:
@@ -149,7 +166,18 @@ class Sheet:
         pixels = seen.nonzero().flatten()
         slope = ahead / self.distance
         every = ahead, across, skew, slope, tall * slope, tall
-        return Rays(pixels, *(values[pixels] for values in every))
+        ahead, across, skew, slope, wide, tall = (values[pixels] for values in every)
+        return Rays(pixels, ahead, across, skew, slope, wide, tall, self._detail(wide, tall))
+
+    def _detail(self, wide: Tensor, tall: Tensor) -> list[tuple[int, int, Tensor]]:
+        """The levels whose texels are as large as the pixels, and which rays each serves."""
+        if self.texture is None:
+            return []
+        across, along = (
+            (a / b).log2().round().clamp(0, 6) for a, b in zip((tall, wide), self.cell, strict=True)
+        )
+        pairs, which = torch.stack([across, along], 1).long().unique(dim=0, return_inverse=True)
+        return [(*pair, (which == k).nonzero().flatten()) for k, pair in enumerate(pairs.tolist())]
 
     def level(self, down: int, along: int) -> Tensor:
         """The texture averaged over 2^down x 2^along cells."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral, Real
 from typing import ClassVar
 
 import torch
@@ -15,73 +17,114 @@ from torch import Tensor
 from dejavu_torch.data.simulate.draw import Light, Painter
 from dejavu_torch.data.simulate.motion import reference_place, ride
 from dejavu_torch.data.simulate.paint import Random
-from dejavu_torch.data.simulate.scenery import Structure, World
+from dejavu_torch.data.simulate.scenery import FOOT, Structure, World
 from dejavu_torch.data.simulate.sheets import View
 from dejavu_torch.types import InputError, Traverse
 
-TRAVERSES = 9  # the highest number of a traverse
 EXPOSURE = 0.4  # part of a frame's time during which the shutter is open
+LEFT, RIGHT, AHEAD = 1.4, 2.4, 12.0  # metres: a strip of ground beside the sleepers, and how far it goes
+LIMITS: dict[str, tuple[float, float]] = {
+    "seed": (0, math.inf),
+    "traverse": (0, 9),
+    "frames": (0, math.inf),
+    "height": (16, 512),
+    "width": (16, 1024),
+    "speed": (5, 40),
+    "noise": (0, 1),
+    "shake": (0, 3),
+}
+SLIM, FLAT = 0.5, 4  # width over height, the least and the most
 
 
+@dataclass(eq=False)
 class Railway(Traverse):
     """What both railways share: the ride, the camera and its light.
+
+    The camera takes 25 frames a second, 2.6 m above the track bed and 2.4 m above the level of the rails,
+    with square pixels, a focal length of 0.55 frame widths and its horizon at 0.38 of the frame's height;
+    the shutter is open for 0.4 of a frame's time. The rails lie 1.5 m apart. The train speeds up and brakes
+    by 0.9 m/s^2, crawls twice and stops once, on odd traverses twice.
 
     Attributes:
         distance: (N,) float64, metres along the track of each frame.
         place: (N,) float64, the same in units of reference frames; where the reference stands still,
             the first frame of the stop, and past its last frame, that one.
         structures: what repeats, each with its name, period, start and stop in metres.
+        size: height and width of a frame in pixels.
+        ground: (x, y) of the corners of a strip of ground: far left, far right, near right, near left, in
+            fractions of the frame, (0, 0) the centre of its top left pixel and (1, 1) of its bottom right
+            one. 1.4 to 2.4 m to the right, beside the sleepers, of which the train may pass about one a
+            frame; from just above the bottom row (where that does not show it all, from where it is seen) to
+            12 m ahead; sway and roll are left out.
+        ground_span: metres along the track from that strip's near edge to its far one.
+
+    Convention: all of these figures, and those of the scenery, are frozen: results are judged on these
+        routes.
+
+    Raises:
+        InputError: an argument that is no number or out of its range, a frame less than half or over 4 times
+            as wide as high, or more frames than the route has.
     """
+
+    seed: int = 0
+    traverse: int = 0
+    frames: int = 0
+    height: int = 64
+    width: int = 128
+    speed: float = 17.0
+    noise: float = 0.02
+    shake: float = 1.0
 
     kind: ClassVar[str]
     route: ClassVar[float]  # metres
-    length: int
-    place: Tensor
+    length: int = field(init=False, repr=False)
+    place: Tensor = field(init=False, repr=False)
 
-    def __init__(
-        self,
-        seed: int,
-        traverse: int,
-        frames: int,
-        height: int,
-        width: int,
-        speed: float,
-        usual_speed: float,
-        noise: float,
-        shake: float,
-    ) -> None:
-        query = []
-        for key, value, low, high, usual in (
-            ("seed", seed, 0, 2**63 - 1, None),
-            ("traverse", traverse, 0, TRAVERSES, None),
-            ("height", height, 16, 512, 64),
-            ("width", width, 16, 1024, 128),
-            ("speed", speed, 5, 40, usual_speed),
-            ("noise", noise, 0, 1, 0.02),
-            ("shake", shake, 0, 3, 1.0),
-            ("frames", frames, 0, 2**63 - 1, 0),
-        ):
-            if not low <= value <= high:
-                raise InputError(f"sim:{self.kind} has {key}={value}; expected {low} <= {key} <= {high}")
-            if value != usual:
-                query.append(f"{key}={value}")
-        self.name = f"sim:{self.kind}?" + "&".join(query)
-        self.seed, self.traverse, self.noise, self.shake = seed, traverse, noise, shake
-        self.size = height, width
-        reference = self._ride(0, speed)
-        distance = reference if traverse == 0 else self._ride(traverse, speed)
-        if frames > len(distance):
+    def __post_init__(self) -> None:
+        self.name = f"sim:{self.kind}?" + "&".join(self._checked())
+        reference = self._ride(0, self.speed)
+        distance = self._ride(self.traverse, self.speed) if self.traverse else reference
+        if self.frames > len(distance):
             raise InputError(
-                f"sim:{self.kind} has frames={frames}; expected at most the {len(distance)} of its route"
+                f"sim:{self.kind} has frames={self.frames}; expected at most the {len(distance)} of its route"
             )
-        self.length = frames or len(distance)
+        self.size = self.height, self.width
+        self.length = self.frames or len(distance)
         self.distance = distance[: self.length]
-        place = (
-            torch.arange(len(distance)).double() if traverse == 0 else reference_place(reference, distance)
-        )
-        self.place = place[: self.length]
+        if self.traverse:
+            self.place = reference_place(reference, self.distance)
+        else:
+            self.place = torch.arange(self.length).double()
         self._step = distance.diff(append=distance[-1:])[: self.length] * EXPOSURE
         self._paths = self._wander(len(distance))
+        view = View(*self.size)
+        # a little above the bottom row, and where all of it is in sight
+        near = 1.05 * max(FOOT / float(view.up.min()), RIGHT / float(view.right.max()))
+        corners = (LEFT, AHEAD), (RIGHT, AHEAD), (RIGHT, near), (LEFT, near)
+        self.ground = tuple(view.project(x, FOOT, ahead) for x, ahead in corners)
+        self.ground_span = AHEAD - near
+
+    def _checked(self) -> list[str]:
+        """Refuse arguments out of their range, and return those that an address needs."""
+        address = []
+        for key, (low, high) in LIMITS.items():
+            value, usual = getattr(self, key), getattr(type(self), key)
+            whole = isinstance(usual, int)
+            fits = isinstance(value, Integral if whole else Real)
+            if not (fits and low <= value <= high):
+                span = f"{low} <= {key} <= {high}" if high < math.inf else f"{key} >= {low}"
+                wanted = f"{span}, a whole number" if whole else span
+                raise InputError(f"sim:{self.kind} has {key}={value}; expected {wanted}")
+            value = type(usual)(value)
+            setattr(self, key, value)
+            if key in ("seed", "traverse") or value != usual:
+                address.append(f"{key}={value}")
+        if not SLIM <= self.width / self.height <= FLAT:
+            raise InputError(
+                f"sim:{self.kind} has height={self.height} and width={self.width}; "
+                f"expected a width of {SLIM} to {FLAT} times the height"
+            )
+        return address
 
     def _ride(self, traverse: int, speed: float) -> Tensor:
         """Metres of each frame of a traverse over the whole route."""
@@ -157,9 +200,8 @@ class Railway(Traverse):
         seen = (seen * (balance * level[:, None]).float()[:, :, None, None]).clamp(0, 1)
         seen = seen ** (gamma + 0.03 * path["gamma"]).float()[:, None, None, None]
         for frame, i in zip(seen, at.tolist(), strict=True):
-            frame += self.noise * Random(self.kind, "noise", self.seed, self.traverse, i).normal(
-                3, *self.size
-            )
+            random = Random(self.kind, "noise", self.seed, self.traverse, i)
+            frame += self.noise * random.normal(3, *self.size)
         return seen.clamp_(0, 1)
 
     def _turned(self, seen: Tensor, swing: float, path: dict[str, Tensor], margin: int) -> Tensor:

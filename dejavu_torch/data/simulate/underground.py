@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dejavu_torch.data.simulate.paint import Random
 from dejavu_torch.data.simulate.scenery import (
+    FOOT,
     RAIL,
     STATION,
     Structure,
@@ -17,10 +18,11 @@ from dejavu_torch.data.simulate.scenery import (
     scattered,
     solid,
     stretches,
+    waiting,
 )
 from dejavu_torch.data.simulate.sheets import FAR, Sheet, Thing
 
-HALF, FOOT = 2.5, RAIL - 0.2  # metres from the middle to the wall; height of the floor
+HALF = 2.5  # metres from the middle to the wall
 SPRING, CROWN, FLAT = 0.8, 2.1, 1.1  # heights where the arch begins and ends; half its flat top
 EDGE, STEP, BACK = -1.6, RAIL + 1.0, -7.5  # a platform's edge, height and back wall
 ROOF = 3.2  # height of a station's ceiling
@@ -192,19 +194,12 @@ def _station(sheets: dict[str, Sheet], start: float, random: Random) -> None:
     sheets["signs"].add(Thing(0.4, 3.0, band, at, 0.15, 0.5))
 
 
-def underground_visitors(world: World, random: Random) -> None:
+def underground_visitors(world: World, random: Random, route: float) -> None:
     """What one traverse alone meets: people who wait, tools left at the wall."""
-    sheets = world.sheets
-    for start in world.stations:
-        for _ in range(3):
-            at = scattered(random, start + 3, start + STATION - 10, (4, 40))
-            coat = random.pick(("1f2a44", "7a1f22", "d8d2c4", "2f3a2c", "b0762a"))
-            sheets["people"].add(
-                Thing(0, 1.45, coat, at, 0.4, 0.5), Thing(1.45, 1.75, "c99a7a", at, 0.2, 0.25)
-            )
+    waiting(world, random, 3, 0.0, 1.45)
     for side in ("left", "right"):
-        at = scattered(random, 60, 4000, (250, 700))
-        sheets[f"wall {side}"].add(Thing(0, 0.9, "c8641e", at, 1.2, 0.35))
+        at = scattered(random, 60, route, (250, 700))
+        world.sheets[f"wall {side}"].add(Thing(0, 0.9, "c8641e", at, 1.2, 0.35))
 
 
 def ambient_light(world: World, route: float, tunnel: float, station: float) -> Tensor:
