@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -18,12 +19,15 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
+log = logging.getLogger("dejavu_torch")
+
 SUFFIXES = {
     *(".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts"),
     *(".wmv", ".flv", ".ogv", ".mjpeg"),
 }
 EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"
 BOXES = {b"ftyp", b"free", b"skip", b"wide", b"moov", b"moof", b"mdat", b"mfra", b"sidx", b"styp", b"uuid"}
+UNEVEN = 1.5  # longest interval over the median one; rounded to ticks of half a frame or less it is less
 
 
 class Video(Traverse):
@@ -37,6 +41,9 @@ class Video(Traverse):
 
     Shape: frames (B,3,H,W), RGB also where the video is grey, upright where the file says how the
         camera was turned.
+
+    Convention: where the time from frame to frame varies (dropped frames, a variable frame rate), one line of
+        warning tells so when the file was first read to its end.
 
     Raises:
         InputError: width, height or step out of range; no video, or one that is cut off; while
@@ -137,7 +144,22 @@ class Video(Traverse):
         seconds = [float("nan" if stamp is None else stamp * base) for stamp in stamps]
         times = torch.tensor(seconds, dtype=torch.float64)
         # packets come in decoding order; .avi stores no other, so its decoded frames carry a wrong one
-        self._times = (times.sort().values if avi or not decode else times)[:: self.step]
+        times = times.sort().values if avi or not decode else times
+        if self._times is None:
+            self._tell_uneven(times.diff())
+        self._times = times[:: self.step]
+
+    def _tell_uneven(self, intervals: Tensor) -> None:
+        """Tell of intervals (N-1,) in seconds that vary by more than the rounding of timestamps."""
+        if not len(intervals) or not (intervals >= 0).all():
+            return
+        middle, longest = float(intervals.median()), float(intervals.max())
+        if longest > UNEVEN * middle + 1e-6:
+            log.warning(
+                "%s: the frame rate varies, %.0f to %.0f ms from frame to frame (median %.0f): periods in "
+                "frames then mean nothing; frames at even steps along the ground mend it",
+                *(self.name, 1e3 * float(intervals.min()), 1e3 * longest, 1e3 * middle),
+            )
 
     def _pixels(self, frame: VideoFrame) -> np.ndarray:
         """One frame, upright and resized, (H,W,3) uint8."""

@@ -51,6 +51,12 @@ def check_size(size: tuple[int, int], least: int) -> None:
         )
 
 
+def length_seen(corners: Corners, height: int, width: int) -> float:
+    """From the middle of the far edge to that of the near one, in pixels of a frame: mostly its rows."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
+    return math.hypot((cx + dx - ax - bx) / 2 * (width - 1), (cy + dy - ay - by) / 2 * (height - 1))
+
+
 def _text(corners: Corners) -> str:
     return " ".join(f"({x:g}, {y:g})" for x, y in corners)
 
@@ -111,7 +117,8 @@ def shift_between(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     Convention: shift > 0 is forward: the ground comes nearer, what is in row r of the first is in row
         r + shift of the second. |shift| is at most about 0.42 h, sway at most 3 columns. The confidence is
         the mean coherence of the two, each frequency counted by its coherence: 1 for the same picture, mostly
-        0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of 96 x 96), 0 for flat ones.
+        0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of 96 x 96), 0 for flat ones
+        and those that are not finite.
 
     Raises:
         InputError: patches that are not two equal (B,1,h,w), or smaller than 32 x 32.
@@ -184,7 +191,7 @@ def shift_peaks(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         score = _agreement(one, other, shift, near, SIDEWAYS, BAND)
         best, at = score.max(1)
         shift = shift + near[at] + step * _vertex(score, at)
-    return shift.view(count, PEAKS), best.view(count, PEAKS).clamp(0, 1)
+    return shift.view(count, PEAKS), best.view(count, PEAKS).nan_to_num(0).clamp(0, 1)
 
 
 def _agreement(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway: int, band: float) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from fractions import Fraction
 from pathlib import Path
 
@@ -51,20 +52,21 @@ def clip(
     bframes: int | None = None,
     turn: int | None = None,
     options: dict[str, str] | None = None,
+    base: Fraction = Fraction(1, 25),
 ) -> Path:
-    """Write frames at 25 per second, or at the given multiples of 1/25 s."""
+    """Write frames at 25 per second, or at the given multiples of the time base."""
     with av.open(str(path), "w", options=options or {}) as container:
         stream = container.add_stream(codec, rate=25)
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt, stream.bit_rate = pixels, 4_000_000
-        stream.codec_context.time_base = Fraction(1, 25)
+        stream.codec_context.time_base = base
         if bframes is not None:
             stream.codec_context.max_b_frames = bframes
         if turn is not None:
             stream.set_display_rotation(turn)
         for i, pixel in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(pixel, "rgb24")
-            frame.pts, frame.time_base = i if ticks is None else ticks[i], Fraction(1, 25)
+            frame.pts, frame.time_base = i if ticks is None else ticks[i], base
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path
@@ -120,6 +122,58 @@ def test_times_of_a_variable_frame_rate(tmp_path: Path, name: str, step: int) ->
     video = Video(path, step=step)
     assert numbers(all_of(video)) == list(range(0, 11, step))
     assert torch.equal(video.times, expected)
+
+
+@pytest.mark.parametrize("kind", ["h264.mp4", "h264.mkv", "ffv1.mkv", "mpeg4.mp4", "h264.ts"])
+@pytest.mark.parametrize("first", ["frames", "times"])
+def test_a_frame_rate_that_varies_is_told_once(
+    tmp_path: Path, kind: str, first: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = clip(tmp_path / kind, pictures(12), ticks=[0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 13, 14], **KINDS[kind])
+    with caplog.at_level(logging.WARNING, "dejavu_torch"):
+        video = Video(path, step=2)
+        for _ in (1, 2):
+            if first == "frames":
+                all_of(video)
+            assert len(video.times) == 6
+    (message,) = caplog.messages
+    assert message.startswith(f"{path}: the frame rate varies, 40 to 120 ms from frame to frame (median 40)")
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("rate", "ticks"),
+    [
+        (Fraction(30000, 1001), 1000),
+        (Fraction(30000, 1001), 90000),
+        (Fraction(60000, 1001), 1000),
+        (Fraction(24000, 1001), 1000),
+        (Fraction(240), 1000),
+        (Fraction(480), 1000),
+    ],
+)
+def test_rounded_timestamps_are_no_varying_rate(
+    tmp_path: Path, rate: Fraction, ticks: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    base = Fraction(1, ticks)
+    stamps = [round(i / rate / base) for i in range(40)]
+    video = Video(clip(tmp_path / "a.mkv", pictures(40), ticks=stamps, base=base))
+    with caplog.at_level(logging.WARNING, "dejavu_torch"):
+        all_of(video)
+    assert len(set(video.times.diff().mul(1e6).round().tolist())) == 2  # they are rounded
+    assert caplog.messages == []
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_steady_rate_is_not_remarked_on(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = clip(tmp_path / name, pictures(30), **KINDS[name])
+    with caplog.at_level(logging.WARNING, "dejavu_torch"):
+        all_of(Video(path))
+        assert len(Video(path).times) == 30
+        assert len(all_of(Video(clip(tmp_path / "one.mkv", pictures(1))))) == 1
+    assert caplog.messages == []
 
 
 @pytest.mark.parametrize("hidden", [4, 17])

@@ -19,8 +19,10 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.mapfile import build, recipe_of
-from dejavu_torch.features.ground import TRAPEZIUM, ground_patch, shift_between
-from dejavu_torch.features.spacing import EvenlySpaced, VelocityNormalizer
+from dejavu_torch.features.ground import TRAPEZIUM, ground_patch, length_seen, shift_between
+from dejavu_torch.features.mend import mended
+from dejavu_torch.features.spacing import EvenlySpaced
+from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.types import Traverse
 
 PATCH, AHEAD = 96, 200  # pixels of ground: the patch, and where the drive begins
@@ -324,8 +326,9 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixtur
     frames[9] = 0  # two steps see nothing
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
         measured = VelocityNormalizer().distances(Shown(frames))
-    assert "the drive: 2 of 20 steps show no common ground (the first: frames 8 and 9)" in caplog.text
-    assert len(caplog.records) == 1
+    assert caplog.messages == [
+        "the drive: no common ground in frames 8 to 10 (2 of 20 steps): the velocity there is interpolated"
+    ]
     assert (measured.confidence < 0.4).nonzero()[:, 0].tolist() == [8, 9]
     assert path_error(measured.distance, position) < 0.01
 
@@ -334,9 +337,104 @@ def test_a_cut_is_told(caplog: pytest.LogCaptureFixture) -> None:
     position = travelled((6, 6, 8), (900, 900, 1), (6, 6, 8))
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
         way = VelocityNormalizer().distances(Shown(drive(position))).distance
-    assert "the drive: a cut between frames 8 and 9" in caplog.text
-    assert len(caplog.records) == 1
+    assert caplog.messages == ["the drive: a cut after frame 8: the velocity there is interpolated"]
     torch.testing.assert_close(way.diff(), torch.full((17,), 6.0).double(), rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("lost", "told"),
+    [
+        ([10, 57, 90], "3 cuts, after frames 10, 57, 90:"),
+        ([0, 2, 4, 6, 8, 10, 12, 99], "8 cuts, after frames 0, 2, 4, 6, 8, 10 and 2 more:"),
+        ([20, 21, 22], "no common ground in frames 20 to 23 (3 of 100 steps):"),
+        (
+            [5, 40, 41, 60, 98, 99],
+            "2 cuts, after frames 5, 60; no common ground in frames 40 to 42, 98 to 100 ",
+        ),
+        (
+            [i for i in range(28) if i % 4 < 2],
+            "0 to 2, 4 to 6, 8 to 10, 12 to 14, 16 to 18, 20 to 22 and 1 more",
+        ),
+    ],
+)
+def test_cuts_and_stretches_without_ground_are_named(
+    lost: list[int], told: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    believed = torch.ones(100, dtype=torch.bool)
+    believed[lost] = False
+    speed = torch.full((100,), 3.0, dtype=torch.float64)
+    shift = mended(torch.where(believed, speed, 77.0), believed, "clip.mp4")
+    assert torch.equal(shift, speed)
+    (message,) = caplog.messages
+    assert message.startswith("clip.mp4: ")
+    assert told in message
+    assert "\n" not in message
+
+
+def test_interpolated_between_the_neighbours() -> None:
+    shift = torch.tensor([9.0, 2.0, 9.0, 9.0, 5.0, 9.0], dtype=torch.float64)
+    believed = torch.tensor([False, True, False, False, True, False])
+    assert mended(shift, believed, "clip.mp4").tolist() == [2, 2, 3, 4, 5, 5]
+
+
+def test_a_frame_that_is_not_finite_is_a_drop_out() -> None:
+    frames = short().frames.clone()
+    frames[6] = math.nan
+    measured = VelocityNormalizer().distances(Shown(frames))
+    assert measured.confidence[5:7].tolist() == [0, 0]
+    torch.testing.assert_close(measured.distance.diff(), torch.full((11,), 5.0).double(), rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "size", "told"),
+    [
+        (
+            64,
+            128,
+            (96, 96),
+            "the patch has 96 rows, its region only 16 in frames of 64 x 128 pixels: slow motion",
+        ),
+        (64, 128, (96, 96), "size=(32, 96) would do"),
+        (120, 160, (96, 48), "size=(61, 48) would do"),
+        (60, 80, (96, 96), "larger frames, or a larger region, would do"),
+        (120, 160, (61, 96), ""),
+        (240, 320, (96, 96), ""),
+    ],
+)
+def test_a_patch_finer_than_the_frames_is_told(
+    height: int, width: int, size: tuple[int, int], told: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = torch.rand(1, 1, height, width).expand(4, -1, -1, -1)
+    VelocityNormalizer(size=size).distances(Shown(frames), batch_size=2)
+    assert len(caplog.messages) == bool(told)
+    assert told in caplog.text
+
+
+def test_the_rows_of_a_camera_to_the_side_run_along_the_frame() -> None:
+    sideways = ((0.1, 0.2), (0.1, 0.9), (0.9, 0.9), (0.9, 0.2))
+    assert length_seen(TRAPEZIUM, 101, 999) == pytest.approx(26)
+    assert length_seen(sideways, 999, 101) == pytest.approx(80)
+
+
+def test_slow_motion_is_better_seen_by_the_size_that_is_told() -> None:
+    """What the warning says, as it is."""
+    position = travelled((1, 1, 20))
+    frames = avg_pool2d(drive(position, noise=0.0, exposure=False), 2)
+    far = [VelocityNormalizer(size=(n, n))(frames)[0].sum() * PATCH / n / 20 for n in (96, 61)]
+    assert far[0] < 0.85
+    assert far[1] > 0.9
+
+
+@pytest.mark.parametrize("flow", ["lk", "dis"])
+def test_a_drive_by_optical_flow(flow: str) -> None:
+    pytest.importorskip("cv2")
+    measured = VelocityNormalizer(flow=flow).distances(journey())
+    assert path_error(measured.distance, JOURNEY) < 0.002
+    assert measured.confidence.min() > 0.6
+    assert (measured.distance.diff()[JOURNEY.diff() == 0] == 0).all()
+    position = travelled((20, 20, 12))
+    smeared = drive(position, texture=0.05, blur=1.0)
+    assert path_error(VelocityNormalizer(flow=flow).distances(Shown(smeared)).distance, position) < 0.01
 
 
 @pytest.mark.parametrize("lost", [0, 11])
@@ -462,7 +560,7 @@ def test_settings_out_of_range_are_refused(choice: dict, words: tuple[str, ...])
 
 
 def test_a_recipe_builds_the_same_module() -> None:
-    module = VelocityNormalizer(size=(64, 48), step=3.0, blend=True)
+    module = VelocityNormalizer(size=(64, 48), step=3.0, blend=True, flow="phase")
     assert repr(build(recipe_of(module), VelocityNormalizer)) == repr(module)
 
 

@@ -1,0 +1,149 @@
+"""Optical flow of OpenCV between patches of ground: known shifts, and what cannot be followed."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from helpers import refused
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from dejavu_torch.features.flow import flow_shift
+from dejavu_torch.features.ground import shift_between
+from dejavu_torch.features.velocity import VelocityNormalizer
+
+pytest.importorskip("cv2")
+
+METHODS = ["lk", "dis"]
+
+
+def texture(count: int, rows: int, columns: int = 96) -> Tensor:
+    """(count,1,rows,columns) in about [0.3, 0.7], grains of three pixels."""
+    noise = torch.randn(count, 1, rows + 2, columns + 2)
+    return 0.5 + 0.2 * conv2d(noise, torch.full((1, 1, 3, 3), 1 / 3))
+
+
+def moved(shift: int, count: int = 4, height: int = 96, columns: int = 96) -> tuple[Tensor, Tensor]:
+    """Two patches of the same ground, the second further by so many whole rows."""
+    world = texture(count, height + 2 * 48, columns)
+    return world[:, :, 48 : 48 + height], world[:, :, 48 - shift : 48 - shift + height]
+
+
+@pytest.mark.parametrize(("method", "reach"), [("lk", 39), ("dis", 24)])
+def test_a_known_shift(method: str, reach: int) -> None:
+    for shift in range(-reach, reach + 1, 3):
+        found, confidence = flow_shift(*moved(shift), method)
+        torch.testing.assert_close(found, torch.full((4,), float(shift)), rtol=0, atol=0.15)
+        assert confidence.min() > 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("shift", [-7.5, -0.5, 0.3, 4.8])
+def test_a_part_of_a_pixel(method: str, shift: float) -> None:
+    fine = conv2d(torch.randn(2, 1, 1200, 98), torch.hann_window(31, periodic=False).view(1, 1, -1, 1) / 60)
+    fine = 0.5 + conv2d(fine, torch.full((1, 1, 1, 3), 1 / 3))
+    start = 100 - round(10 * shift)
+    first, second = fine[:, :, 100:1060:10], fine[:, :, start : start + 960 : 10]
+    found, confidence = flow_shift(first, second, method)
+    torch.testing.assert_close(found, torch.full((2,), shift), rtol=0, atol=0.1)
+    assert confidence.min() > 0.8
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_sign_and_shape_are_those_of_phase_correlation(method: str) -> None:
+    pair = moved(6)
+    found, confidence = flow_shift(*pair, method)
+    expected, sure = shift_between(*pair)
+    assert found.shape == expected.shape == confidence.shape == sure.shape == (4,)
+    assert found.dtype == confidence.dtype == torch.float32
+    torch.testing.assert_close(found, expected, rtol=0, atol=0.15)
+    back, _ = flow_shift(*pair[::-1], method)
+    torch.testing.assert_close(back, -found, rtol=0, atol=0.2)
+    double, _ = flow_shift(pair[0].double(), pair[1].double(), method)
+    assert double.dtype == torch.float64
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("gain", "offset"), [(0.3, 0.1), (2.5, -0.6), (1.0, 3.0), (1e-2, 0.0)])
+def test_exposure_changes_nothing(method: str, gain: float, offset: float) -> None:
+    first, second = moved(5)
+    plain = flow_shift(first, second, method)
+    found = flow_shift(first, gain * second + offset, method)
+    torch.testing.assert_close(found, plain, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_noise_and_sway(method: str) -> None:
+    first, second = moved(9)
+    second = second.roll(2, 3) + 0.05 * torch.randn_like(second)
+    found, confidence = flow_shift(first + 0.05 * torch.randn_like(first), second, method)
+    torch.testing.assert_close(found, torch.full((4,), 9.0), rtol=0, atol=0.2)
+    assert confidence.min() > 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_pair_by_itself(method: str) -> None:
+    pairs = [moved(shift, 1) for shift in (3, -12, 0)]
+    found, _ = flow_shift(*(torch.cat(side) for side in zip(*pairs, strict=True)), method)
+    torch.testing.assert_close(found, torch.tensor([3.0, -12.0, 0.0]), rtol=0, atol=0.15)
+    nothing = torch.zeros(0, 1, 64, 64)
+    assert [part.shape for part in flow_shift(nothing, nothing, method)] == [(0,), (0,)]
+
+
+@pytest.mark.parametrize(("method", "most"), [("lk", 0.15), ("dis", 0.3)])
+def test_unrelated_ground_is_not_believed(method: str, most: float) -> None:
+    for one, other in (texture(40, 96).split(20), torch.rand(40, 1, 96, 96).split(20)):
+        assert flow_shift(one, other, method)[1].max() < most
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_shows_nothing_is_not_believed(method: str) -> None:
+    ground = texture(1, 96)
+    for empty in (torch.zeros(1, 1, 96, 96), torch.full((1, 1, 96, 96), math.nan), ground * 1e-4):
+        for pair in ((ground, empty), (empty, ground), (empty, empty)):
+            shift, confidence = flow_shift(*pair, method)
+            assert (shift.item(), confidence.item()) == (0, 0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_texture_in_a_few_rows_tells_the_shift_of_all(method: str) -> None:
+    """A dense flow is zero where there is nothing to see: those pixels must not be asked."""
+    world = torch.full((2, 1, 192, 96), 0.5)
+    world[:, :, 80:110] = texture(2, 30)
+    found, confidence = flow_shift(world[:, :, 48:144], world[:, :, 40:136], method)
+    torch.testing.assert_close(found, torch.full((2,), 8.0), rtol=0, atol=0.3)
+    assert confidence.min() > 0.4
+
+
+def test_wrong_input_is_refused() -> None:
+    two = torch.rand(2, 1, 64, 64)
+    for first, second in ((two, two[:1]), (two.expand(2, 3, 64, 64),) * 2, (two[:, 0],) * 2):
+        with refused(str(tuple(second.shape)), "the same (B,1,h,w)"):
+            flow_shift(first, second, "lk")
+    with refused("(64, 31)", "at least 32"):
+        flow_shift(two[..., :31], two[..., :31], "dis")
+    with refused("'farneback'", "lk, dis"):
+        flow_shift(two, two, "farneback")
+    with refused("'farneback'", "lk, dis"):
+        VelocityNormalizer(flow="farneback")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_without_opencv_one_line_says_what_to_install(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with refused("OpenCV", "pip install 'dejavu_torch[flow]'"):
+        VelocityNormalizer(flow=method)
+    VelocityNormalizer()(torch.rand(2, 1, 240, 320))
+
+
+def test_opencv_is_loaded_only_when_used() -> None:
+    code = (
+        "import sys; from dejavu_torch import VelocityNormalizer as V; V(); print('cv2' in sys.modules);"
+        "V(flow='lk'); print('cv2' in sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["False", "True"]
