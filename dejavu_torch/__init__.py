@@ -14,7 +14,7 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     eq. 5  best place, eq. 6 acceptance          best_match          recognition.select
     IV-A   HOG features                          HOG, hog            features.hog
     IV-A   window slid along an aerial image     SlidingWindow       data.strip
-    IV-B   velocity from the ground              VelocityNormalizer  features.spacing, features.ground
+    IV-B   velocity from the ground              VelocityNormalizer  features.velocity, features.spacing
     IV-A   (ours) channel, local contrast        Preprocess          features.preprocess
     IV-C   precision, recall, area               pr_curve, judge     evaluation.curves
 """
@@ -30,6 +30,7 @@ from dejavu_torch.database.phase import PhaseTemplates, phase_mask
 from dejavu_torch.evaluation.curves import judge, pr_curve
 from dejavu_torch.features.hog import HOG, hog
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.distance import phase_distances
@@ -57,6 +58,7 @@ __all__ = [
     "SlidingWindow",
     "SpectrogramAnalysis",
     "Traverse",
+    "VelocityNormalizer",
     "best_match",
     "hog",
     "judge",

@@ -11,15 +11,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.database.certificate import Certificate, certify
 from dejavu_torch.database.compressed import CompressedMap
-from dejavu_torch.database.mapfile import Recipe, build, map_size, read_map, recipe_of, write_map
+from dejavu_torch.database.mapfile import build_parts, map_size, part_recipes, read_map, write_map
 from dejavu_torch.database.phase import PhaseTemplates
-from dejavu_torch.features.extract import feature_batches, features_of, frame_shape
+from dejavu_torch.features.extract import check_frames, feature_batches, features_of, frame_shape
 from dejavu_torch.features.gather import gather
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.spacing import EvenlySpaced
+from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.distance import Metric
@@ -44,6 +46,8 @@ class DejaVu(nn.Module):
         threshold: accept a match when its score is below; None accepts every finite score.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
+        velocity: makes places and queries even steps along the ground (section IV-B), see `evenly`;
+            None takes the frames as they come.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
@@ -63,6 +67,7 @@ class DejaVu(nn.Module):
         threshold: float | None = None,
         batch_size: int = 64,
         preprocess: Preprocess | None = None,
+        velocity: VelocityNormalizer | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1:
@@ -76,7 +81,9 @@ class DejaVu(nn.Module):
         self.matcher = Matcher(metric, reduction)
         self.threshold = threshold
         self.batch_size = batch_size
+        self.velocity = velocity
         self.map = CompressedMap()
+        self.step: float | None = None  # pixels of ground from one place of the map to the next
         self.learnt_from: tuple[int, ...] | None = None  # a frame's (C,H,W), or (D,) of ready features
 
     def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
@@ -94,31 +101,52 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes.
         """
-        traverse = as_traverse(traverse)
-        features = self.extract_all(traverse, "learning" if progress else None)
-        return self.learn_features(features, frame_shape(traverse))
+        traverse = self.evenly(as_traverse(traverse), progress=progress)
+        return self.learn_features(self.extract_all(traverse, "learning" if progress else None), traverse)
 
-    def learn_features(self, features: Tensor, learnt_from: tuple[int, ...] | None = None) -> DejaVu:
+    def evenly(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
+        """A traverse at even steps along the ground, where `velocity` is set; else as it is.
+
+        Args:
+            traverse: frames, in order; one that is evenly spaced already stays as it is.
+            step: pixels of ground; None is `velocity`'s own. Queries need the map's, `self.step`; of them a
+                single frame, and ready features, stay as they are.
+
+        Raises:
+            InputError: as `EvenlySpaced`.
+        """
+        if self.velocity is None or isinstance(traverse, EvenlySpaced):
+            return traverse
+        if step is not None and (traverse.length == 1 or len(frame_shape(traverse)) == 1):
+            return traverse
+        return EvenlySpaced(traverse, self.velocity, self.batch_size, step, progress)
+
+    def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
         """As `learn`, from features that are there already.
 
         Args:
             features: (N,D) float.
-            learnt_from: shape of the frames that `self.features` made them from, (C,H,W); (D,) where
-                they were made elsewhere, so that the map refuses frames; None where unknown.
+            traverse: what they come from, where known: the map then knows what frames to expect, and,
+                where they are evenly spaced, which frame each place shows.
         """
-        if len(learnt_from or ()) == 3 and features.shape[1] > MANY_FEATURES:
+        shape = () if traverse is None else frame_shape(traverse)
+        if len(shape) == 3 and features.shape[1] > MANY_FEATURES:
             log.warning(
                 "each frame gives %d features; smaller frames make a smaller and faster map, as ?width=160 "
                 "behind a folder or video does",
                 features.shape[1],
             )
-        if len(learnt_from or ()) == 1 and (self.preprocess.channel or self.preprocess.contrast):
+        if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast are left as they are")
         plan = self.periods.plan(features)
         with torch.no_grad():
             templates = self.templates(features, plan)
-        self.map = CompressedMap(plan, templates, *features.shape).to(features.device)
-        self.learnt_from = learnt_from
+        self.step, frame = None, None
+        if isinstance(traverse, EvenlySpaced):
+            self.step, frame = traverse.step, traverse.frame
+        places, dimension = features.shape
+        self.map = CompressedMap(plan, templates, places, dimension, frame).to(features.device)
+        self.learnt_from = shape or None
         return self
 
     def forward(self, queries: Tensor) -> Tensor:
@@ -137,6 +165,8 @@ class DejaVu(nn.Module):
 
         Shape: -> Match of (Q,) on the CPU.
 
+        Convention: on a map of even steps the queries are spaced as evenly first, see `evenly`.
+
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
@@ -148,6 +178,8 @@ class DejaVu(nn.Module):
         self._require_map()
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         queries = as_traverse(queries)
+        if self.step is not None:
+            queries = self.evenly(queries, self.step, progress)
         shape = frame_shape(queries)
         for i, features in enumerate(self.extract(queries, "localizing" if progress else None)):
             if i == 0:
@@ -194,23 +226,19 @@ class DejaVu(nn.Module):
         """
         tensors, header = read_map(Path(path))
         try:
-            made_by, found_by = Recipe(**header["features"]), Recipe(**header["periods"])
-            if features is None:
-                features = build(made_by, nn.Module)
-            elif recipe_of(features) != made_by:
-                raise InputError(f"it was learnt with {made_by}; got {recipe_of(features)}")
-            # only learning needs what found the periods: one from elsewhere need not be built
-            ours = found_by.class_path.startswith("dejavu_torch.")
-            periods = build(found_by, PeriodFinder) if ours else None  # type: ignore[type-abstract]
-            preprocess = build(Recipe(**header["preprocess"]), Preprocess)
+            parts = build_parts(header, features)
             settings = {name: header[name] for name in ("metric", "reduction", "threshold", "batch_size")}
-            model = cls(features, periods, **settings, preprocess=preprocess)
+            model = cls(**parts, **settings)
             model.learnt_from = header["learnt_from"] and tuple(header["learnt_from"])
+            model.step = header["step"]
             loaded = model.load_state_dict(tensors, strict=False)
             not_kept = ("periods.", "_extra_state")
             missing = [name for name in loaded.missing_keys if not name.startswith(not_kept)]
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
+            spaced = model.velocity is not None and isinstance(model.step, float) and model.step > 0
+            if (len(model.map.frame) > 0) != spaced or (model.step is not None) != spaced:
+                raise InputError(f"it has step {model.step!r} and {len(model.map.frame)} frames of places")
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         except (AttributeError, KeyError, RuntimeError, TypeError) as error:
@@ -226,8 +254,7 @@ class DejaVu(nn.Module):
     @property
     def backbone_bytes(self) -> int:
         """The part of `map_bytes` that is weights of the feature module."""
-        weights = [t for t in self.features.state_dict().values() if isinstance(t, Tensor)]
-        return sum(t.numel() * t.element_size() for t in weights)
+        return sum(t.nbytes for t in self.features.state_dict().values() if isinstance(t, Tensor))
 
     @property
     def certificate(self) -> Certificate:
@@ -236,15 +263,13 @@ class DejaVu(nn.Module):
 
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         metric = self.matcher.metric
-        header = {
-            "preprocess": recipe_of(self.preprocess)._asdict(),
-            "features": recipe_of(self.features)._asdict(),
-            "periods": recipe_of(self.periods)._asdict(),
+        header = part_recipes(self) | {
             "metric": metric if isinstance(metric, str) else getattr(metric, "__name__", "callable"),
             "reduction": self.matcher.reduction,
             "threshold": self.threshold,
             "batch_size": self.batch_size,
             "learnt_from": self.learnt_from,
+            "step": self.step,
         }
         # what found the periods is not needed any more
         tensors = {f"map.{name}": t for name, t in self.map.state_dict().items()}
@@ -258,41 +283,17 @@ class DejaVu(nn.Module):
             shape: of one query, (C,H,W) or (D,). dimension: D, how many features it gives.
             name: of the queries, for the message.
         """
-        if self.learnt_from is None or len(shape) != 3:
-            return
-        if len(self.learnt_from) == 1:
-            raise InputError(
-                f"{name} holds frames, but the map was learnt from ready features; "
-                f"expected features (Q, {self.map.dimension})"
-            )
-        if dimension != self.map.dimension:
-            raise InputError(
-                f"{name}: frames of {_by(shape)} give {dimension} features; the map expects "
-                f"{self.map.dimension}, as frames of {_by(self.learnt_from)} give, into which ?width= and "
-                "?height= turn folders and videos"
-            )
-        if shape[1:] != self.learnt_from[1:] and getattr(self.features, "resize", None) is None:
-            log.warning(
-                "%s has frames of %s, the map was learnt from %s", name, _by(shape), _by(self.learnt_from)
-            )
+        resized = getattr(self.features, "resize", None) is not None
+        check_frames(shape, dimension, self.learnt_from, self.map.dimension, resized, name)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the state_dict holds beside the tensors."""
-        return {"learnt_from": self.learnt_from}
+        return {"learnt_from": self.learnt_from, "step": self.step}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` gave."""
-        self.learnt_from = state["learnt_from"]
+        self.learnt_from, self.step = state["learnt_from"], state["step"]
 
     def _require_map(self) -> None:
         if not self.map.places:
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
-
-
-def as_traverse(source: Traverse | Tensor) -> Traverse:
-    """A tensor of frames or features as a traverse; a traverse as it is."""
-    return source if isinstance(source, Traverse) else ArrayTraverse(source)
-
-
-def _by(shape: tuple[int, ...]) -> str:
-    return " x ".join(map(str, shape))

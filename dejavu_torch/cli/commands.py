@@ -7,6 +7,7 @@ from typing import Any
 
 from dejavu_torch.data.files import check_output_file, make_output_folder
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.truth import Shown
 from dejavu_torch.database.certificate import describe
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.evaluation.report import (
@@ -27,6 +28,8 @@ from dejavu_torch.experiments.reproduce import (
     reproduce,
     section_five,
 )
+from dejavu_torch.features.spacing import frames_of
+from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
@@ -51,16 +54,31 @@ def run_learn(source: str, map: Path, model: DejaVu) -> None:
     _print_plan(model)
 
 
-def run_localize(map: Path, source: str, out: Path, threshold: float | None, features: Any) -> None:
+def run_localize(
+    map: Path,
+    source: str,
+    out: Path,
+    threshold: float | None,
+    features: Any,
+    velocity: VelocityNormalizer | None,
+    as_is: bool,
+) -> None:
     """Find the frames of a source on a map; one csv row each."""
     check_output_file(out)
     model = DejaVu.load(map, features)
+    if velocity is not None and model.step is None:
+        raise InputError(f"{map} was learnt without --velocity; expected a map of evenly spaced places")
+    model.velocity = None if as_is else model.velocity if velocity is None else velocity
     model.threshold = model.threshold if threshold is None else threshold
     if model.threshold is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
     if not model.map.plan:
         print("the map holds no layers: no place can be reported")
-    queries, accepted = write_matches(out, model.matches(open_source(source), progress=True))
+    traverse, shown = open_source(source), None
+    if model.step is not None:
+        traverse = model.evenly(traverse, model.step, progress=True)
+        shown = Shown(frames_of(traverse), model.map.frame.long())
+    queries, accepted = write_matches(out, model.matches(traverse, progress=True), shown)
     print(f"{queries} queries, {accepted} accepted; written to {out}")
 
 
@@ -89,13 +107,14 @@ def run_evaluate(
     interpolate: bool,
     reference: str | None,
     query: str | None,
+    map: Path | None,
     out: Path,
     command: str,
 ) -> None:
     """Judge the matches in a csv, whatever found them."""
-    pair = [None if source is None else open_source(source) for source in (reference, query)]
+    one, other = (None if source is None else open_source(source) for source in (reference, query))
     _make_report_folder(out, reference, query)
-    result = evaluate(matches, truth, tolerance, interpolate, *pair)
+    result = evaluate(matches, truth, tolerance, interpolate, one, other, map)
     write_report(out, result.report, result.pictures, f"{matches} judged by {truth}", command)
     _print_scores(result.report, out)
 
@@ -110,7 +129,7 @@ def run_reproduce(dataset: str, out: Path, seed: int, tolerance: int, command: s
         make_output_folder(out / name)
         title, plan = f"dejavu reproduce: {name}", describe(result.model.certificate)
         write_report(out / name, result.report, result.pictures, title, command, plan)
-        write_matches(out / name / "matches.csv", [result.match])
+        write_matches(out / name / "matches.csv", [result.match], result.shown)
         reports[name] = result.report
     rows, notes = section_five(reports), boundary_lines(reports)
     pages = {name: f"{name}/index.html" for name in names}
@@ -126,7 +145,11 @@ def run_info(map: Path, features: Any) -> None:
     if model.learnt_from is not None:
         kind = "frames of " if len(model.learnt_from) == 3 else "ready features, "
         print(f"learnt from {kind}{' x '.join(str(n) for n in model.learnt_from)}")
-    for part in (model.preprocess, model.features, model.periods, model.matcher):
+    parts = [model.preprocess, model.features, model.periods, model.matcher]
+    if model.step is not None and model.velocity is not None:
+        print(f"places are {model.step:.4g} pixels of ground apart")
+        parts.append(model.velocity)
+    for part in parts:
         print(f"{type(part).__name__}: {part.extra_repr()}")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
 
@@ -157,7 +180,7 @@ def _publish(result: Comparison, out: Path, title: str, command: str, save_map: 
     _print_plan(result.model)
     if result.report.ours.scores is None:
         print("the traverses differ in length and no --truth was given: matches and pictures, no scores")
-    write_matches(out / "matches.csv", [result.match])
+    write_matches(out / "matches.csv", [result.match], result.shown)
     if save_map:
         result.model.save(out / "map.safetensors")
     write_report(out, result.report, result.pictures, title, command, describe(result.model.certificate))

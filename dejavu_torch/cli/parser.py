@@ -12,6 +12,7 @@ import torch
 from dejavu_torch import __version__
 from dejavu_torch.experiments.bench import BENCHES
 from dejavu_torch.experiments.reproduce import PUBLISHED
+from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
 
@@ -19,15 +20,15 @@ SOURCE = (
     "folder of images, video (clip.mp4?width=160), .npy of frames or features, sim:NAME?seed=0&traverse=0, "
     "or strip:IMAGE?width=96"
 )
-MODEL = ("features", "periods", "metric", "reduction", "threshold", "batch_size", "preprocess")
+MODEL = ("features", "periods", "metric", "reduction", "threshold", "batch_size", "preprocess", "velocity")
 TRUTH = (
-    "offset (place = query + offset), csv of query,place[,place...], npz with GThard, or utm:25 for "
-    "coordinates in image names"
+    "offset (place = query + offset), csv of query,place[,place...] or query_frame,place_frame[,...], npz "
+    "with GThard, or utm:25 for coordinates in image names"
 )
 HINT = (
     "Options of the parts go by their names, such as --periods.window 512, --features.cell 4, "
-    "--preprocess.contrast patch or --preprocess.channel R-B; --features.help HOG, --periods.help "
-    "SpectrogramAnalysis and --preprocess.help list them."
+    "--preprocess.contrast patch or --velocity.step 5; --features.help HOG, --periods.help "
+    "SpectrogramAnalysis, --preprocess.help and --velocity.help VelocityNormalizer list them."
 )
 PARTS = {
     "features": "dejavu_torch.HOG",
@@ -128,6 +129,17 @@ def build_parser() -> Parser:
     )
     localize.add_argument("--threshold", type=float | None, help="accept a match whose score is below")
 
+    localize.add_argument(
+        "--velocity",
+        type=VelocityNormalizer | None,
+        help="how to measure the ground where the camera is not the map's; the step stays the map's",
+    )
+    localize.add_argument(
+        "--as_is",
+        action="store_true",
+        help="take the frames as they come, though the map's are evenly spaced",
+    )
+
     compare_ = command("compare", "learn, localize and judge, beside baselines and null control", model=True)
     compare_.add_argument("reference", help=SOURCE)
     compare_.add_argument("query", help=SOURCE)
@@ -141,6 +153,11 @@ def build_parser() -> Parser:
         "--reference",
         type=str | None,
         help=f"tells how many places there are, and coordinates for utm: {SOURCE}",
+    )
+    evaluate_.add_argument(
+        "--map",
+        type=Path | None,
+        help="tells how many places there are, and the frame of each that is evenly spaced",
     )
     evaluate_.add_argument("--query", type=str | None, help="as --reference, of the queries")
     for sub in (compare_, evaluate_):

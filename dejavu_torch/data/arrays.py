@@ -65,3 +65,8 @@ def read_array(path: Path) -> ArrayTraverse:
     except (ValueError, OSError, EOFError) as error:
         raise InputError(f"{path} is no whole .npy array; expected {EXPECTED}") from error
     return ArrayTraverse(values, str(path))
+
+
+def as_traverse(source: Traverse | Tensor) -> Traverse:
+    """A tensor of frames or features as a traverse; a traverse as it is."""
+    return source if isinstance(source, Traverse) else ArrayTraverse(source)

@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from dejavu_torch.types import Truth
+from dejavu_torch.types import InputError, Truth
 
 PAIRS_AT_ONCE = 2**20
+
+
+class Shown(NamedTuple):
+    """The frames that evenly spaced queries and places show.
+
+    query: (Q,) int64, the frame of the query's traverse that each query shows.
+    place: (N,) int64, never falling, the reference frame that each place shows; None where unknown.
+    """
+
+    query: Tensor
+    place: Tensor | None
+
+
+def unit_of(shown: Shown | None) -> str:
+    """What queries and places, and so tolerances, count."""
+    return "frames" if shown is None else "evenly spaced places"
 
 
 def as_truth(truth: Tensor | Truth) -> Truth:
@@ -120,3 +138,31 @@ def counted(index: Tensor, truth: Truth, tolerance: int) -> Tensor:
     """
     soft = is_right(index, truth.soft, 0)
     return truth.known & (is_right(index, truth.right, tolerance) | ~soft)
+
+
+def places_of_frames(frames: Tensor, shown: Shown) -> Tensor:
+    """The evenly spaced place that shows each reference frame, or the frame nearest to it; -1 stays -1.
+
+    Shape: int64 of any shape, as are the places.
+
+    Raises:
+        InputError: the frames of the places are not known.
+
+    Example:
+        >>> shown = Shown(torch.tensor([0]), torch.tensor([0, 2, 9]))
+        >>> places_of_frames(torch.tensor([3, 8, -1]), shown).tolist()
+        [1, 2, -1]
+    """
+    if shown.place is None:
+        raise InputError(
+            "the truth counts frames and the matches count evenly spaced places; expected the map (--map), "
+            "which tells the frame of each place"
+        )
+    between = (shown.place[1:] + shown.place[:-1]).double() / 2
+    return torch.where(frames >= 0, torch.searchsorted(between, frames.double().contiguous()), -1)
+
+
+def truth_of_places(truth: Truth, shown: Shown) -> Truth:
+    """A truth whose places are reference frames as one of evenly spaced places."""
+    right, soft = (places_of_frames(table, shown) for table in (truth.right, truth.soft))
+    return Truth(right, truth.known, soft)

@@ -7,7 +7,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.truth import as_truth, near_truth, offset_truth, position_truth
+from dejavu_torch.data.truth import (
+    Shown,
+    as_truth,
+    near_truth,
+    offset_truth,
+    position_truth,
+    truth_of_places,
+)
 from dejavu_torch.data.truthformats import LARGEST, as_number, read_matrices, read_table, utm_coordinates
 from dejavu_torch.types import InputError, Traverse, Truth
 
@@ -45,6 +52,7 @@ def find_truth(
     places: int | None,
     queries: int | Tensor,
     interpolate: bool = False,
+    shown: Shown | None = None,
 ) -> Truth | None:
     """The truth that a command was given, or what it can know by itself.
 
@@ -53,8 +61,8 @@ def find_truth(
             `utm` alone means 25) by the UTM coordinates in the names of both traverses' images,
             `@easting@northing@...@.jpg`. None: the positions that both traverses carry, else query i is
             place i where both are equally long, else no truth.
-        reference, query: the traverses; None where there is none at hand.
-        places, queries, interpolate: see `read_truth`.
+        reference, query: the traverses as they came; None where there is none at hand.
+        places, queries, interpolate, shown: see `read_truth`. Positions and coordinates are of frames.
 
     Raises:
         InputError: a truth that cannot be read or does not fit, or in which no query has a right answer.
@@ -63,18 +71,24 @@ def find_truth(
         if reference is None or query is None:
             return None
         if reference.place is not None and query.place is not None:
-            return as_truth(position_truth(reference.place, query.place[_numbers(queries, len(query.place))]))
-        count = queries if isinstance(queries, int) else query.length
+            frames = _numbers(queries, len(query.place), shown)
+            return _spaced(as_truth(position_truth(reference.place, query.place[frames])), shown)
+        several = query.length if shown is None else len(shown.query)
+        count = queries if isinstance(queries, int) else several
         return as_truth(offset_truth(queries, places)) if count == places is not None else None
     check_truth_text(truth, interpolate)
     radius = _radius(truth)
     if radius is None:
-        return read_truth(truth, places, queries, interpolate)
+        return read_truth(truth, places, queries, interpolate, shown)
     if reference is None or query is None:
         raise InputError(f"truth {truth} lies in the names of images; expected both traverses")
     seen = utm_coordinates(query)
-    right = near_truth(utm_coordinates(reference), seen[_numbers(queries, len(seen))], radius)
-    return _answered(as_truth(right), f"within {radius:g} m of {reference.name}")
+    right = near_truth(utm_coordinates(reference), seen[_numbers(queries, len(seen), shown)], radius)
+    return _answered(_spaced(as_truth(right), shown), f"within {radius:g} m of {reference.name}")
+
+
+def _spaced(truth: Truth, shown: Shown | None) -> Truth:
+    return truth if shown is None else truth_of_places(truth, shown)
 
 
 def describe_truth(truth: str | None, interpolate: bool = False, positions: bool = False) -> str:
@@ -98,7 +112,13 @@ def describe_truth(truth: str | None, interpolate: bool = False, positions: bool
     return f"{truth}, interpolated" if interpolate else truth
 
 
-def read_truth(truth: str, places: int | None, queries: int | Tensor, interpolate: bool = False) -> Truth:
+def read_truth(
+    truth: str,
+    places: int | None,
+    queries: int | Tensor,
+    interpolate: bool = False,
+    shown: Shown | None = None,
+) -> Truth:
     """The truth that a text means.
 
     Args:
@@ -108,13 +128,16 @@ def read_truth(truth: str, places: int | None, queries: int | Tensor, interpolat
             - a `.csv` of `query,place[,place...]`, with or without such a header: every listed place is
               right, so no other columns.
               A query listed without a place, or with -1, has no right answer; a query not listed is not
-              known, and is left out of the scores;
+              known, and is left out of the scores. Under `query_frame,place_frame[,place_frame...]` the
+              numbers are of frames, where queries and places are evenly spaced;
             - an `.npz` with the boolean matrices (places, queries) `GThard` and/or `GTsoft`, as the visual
               place recognition tutorial of Schubert et al. keeps them. What is in GThard is right (in
-              GTsoft, if that is the only one); what is in GTsoft only counts neither way.
+              GTsoft, if that is the only one); what is in GTsoft only counts neither way. Matrices as
+              large as the traverses in frames are of frames.
         places: how many places the map has, None where unknown.
         queries: how many, or (Q,) int64 the number of each.
         interpolate: a query between two that the .csv lists gets the place between theirs, rounded.
+        shown: the frames that evenly spaced queries and places show; None where they are frames.
 
     Convention: the tolerance of the scores applies on top, inclusive; with tolerance 0 the places count
         as they stand.
@@ -131,9 +154,9 @@ def read_truth(truth: str, places: int | None, queries: int | Tensor, interpolat
         raise InputError(f"truth {truth} lies in the names of images; expected both traverses")
     numbers = torch.arange(queries) if isinstance(queries, int) else queries
     if _kind(truth) == ".csv":
-        return _answered(read_table(Path(truth), places, numbers, interpolate), f"in {truth}")
+        return _answered(read_table(Path(truth), places, numbers, interpolate, shown), f"in {truth}")
     if _kind(truth) == ".npz":
-        return _answered(read_matrices(Path(truth), places, queries), f"in {truth}")
+        return _answered(read_matrices(Path(truth), places, queries, shown), f"in {truth}")
     last = "" if places is None else f" to {places - 1 - int(numbers.min())}"
     return _answered(
         as_truth(offset_truth(numbers, places, int(truth))),
@@ -147,9 +170,10 @@ def _answered(truth: Truth, told: str) -> Truth:
     return truth
 
 
-def _numbers(queries: int | Tensor, count: int) -> Tensor:
-    """The number of each query, all below the number of query frames."""
+def _numbers(queries: int | Tensor, count: int, shown: Shown | None = None) -> Tensor:
+    """The frame of each query, all below the number of query frames."""
     numbers = torch.arange(queries) if isinstance(queries, int) else queries
+    numbers = numbers if shown is None else shown.query
     if int(numbers.max()) >= count:
         raise InputError(f"there is a query {int(numbers.max())}; expected numbers below {count}")
     return numbers

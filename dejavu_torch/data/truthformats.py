@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.truth import padded
+from dejavu_torch.data.truth import Shown, padded, truth_of_places
 from dejavu_torch.types import InputError, Traverse, Truth
 
+Rows = list[tuple[int, list[str]]]  # number of a line, and its cells
 LARGEST = 2**53  # beyond it a float does not hold every whole number
 
 
@@ -54,14 +56,24 @@ def utm_coordinates(traverse: Traverse) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def read_table(path: Path, places: int | None, numbers: Tensor, interpolate: bool = False) -> Truth:
+def read_table(
+    path: Path, places: int | None, numbers: Tensor, interpolate: bool = False, shown: Shown | None = None
+) -> Truth:
     """A csv of `query,place[,place...]`; see `read_truth`.
 
     Args:
         places: how many places the map has, None where unknown. numbers: (Q,) the number of each query.
         interpolate: queries between two listed ones get the place between theirs.
+        shown: the frames of evenly spaced queries and places.
     """
-    listed = _listed(path, places, interpolate)
+    rows, of_frames = _table_rows(path)
+    if shown is not None and of_frames:
+        return truth_of_places(_table(path, rows, None, shown.query, interpolate), shown)
+    return _table(path, rows, places, numbers, interpolate)
+
+
+def _table(path: Path, rows: Rows, places: int | None, numbers: Tensor, interpolate: bool) -> Truth:
+    listed = _listed(path, rows, places, interpolate)
     queries, first, last = numbers.tolist(), min(listed), max(listed)
     if interpolate:
         knots = sorted(listed)
@@ -80,10 +92,10 @@ def read_table(path: Path, places: int | None, numbers: Tensor, interpolate: boo
     return Truth(right, known, right.new_zeros(len(right), 0))
 
 
-def _listed(path: Path, places: int | None, interpolate: bool) -> dict[int, list[float]]:
+def _listed(path: Path, rows: Rows, places: int | None, interpolate: bool) -> dict[int, list[float]]:
     """The places of each query that a csv lists."""
     listed: dict[int, list[float]] = {}
-    for line, cells in _table_rows(path):
+    for line, cells in rows:
         where = f"{path}, line {line}"
         values = []
         for cell in cells:
@@ -112,12 +124,12 @@ def _listed(path: Path, places: int | None, interpolate: bool) -> dict[int, list
     return listed
 
 
-def _table_rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Number and cells of each line that is not blank, without the header."""
+def _table_rows(path: Path) -> tuple[Rows, bool]:
+    """Number and cells of each line that is not blank, without the header, and whether that says frames."""
     text = read_text(path, "lines of query,place").replace('"', "")
     # where semicolons separate, a comma may be a decimal one: it stays in its cell and is refused
     separator = next((sign for sign in ";\t," if sign in text), None)
-    rows = []
+    rows, of_frames = [], False
     for number, line in enumerate(text.split("\n"), 1):
         cells = [cell.strip() for cell in line.strip(" ").split(separator)]
         while cells and not cells[-1]:
@@ -127,17 +139,42 @@ def _table_rows(path: Path) -> list[tuple[int, list[str]]]:
     if rows and all(as_number(cell) is None for cell in rows[0][1]):
         number, names = rows.pop(0)
         first, *others = [name.lower() for name in names]
+        of_frames = first == "query_frame"
+        begins = "place_frame" if of_frames else "place"
         # another column, such as a distance, would count as a right place
-        if first != "query" or any(name and not name.startswith("place") for name in others):
+        wrong = any(name and not name.startswith(begins) for name in others)
+        if first not in ("query", "query_frame") or wrong or ("place_frame" in others) != of_frames:
             raise InputError(
-                f"{path}, line {number}: columns {','.join(names)}; expected query,place[,place...]"
+                f"{path}, line {number}: columns {','.join(names)}; expected query,place[,place...], or "
+                "query_frame,place_frame[,place_frame...]"
             )
-    return rows
+    return rows, of_frames
 
 
-def read_matrices(path: Path, places: int | None, queries: int | Tensor) -> Truth:
+def read_matrices(path: Path, places: int | None, queries: int | Tensor, shown: Shown | None = None) -> Truth:
     """An npz of the matrices (places, queries) GThard and/or GTsoft; see `read_truth`."""
     matrices = _load_matrices(path)
+    if shown is not None and _of_frames(matrices, places, queries, shown):
+        return truth_of_places(_matrices(path, matrices, None, shown.query), shown)
+    return _matrices(path, matrices, places, queries)
+
+
+def _of_frames(
+    matrices: Mapping[str, np.ndarray], places: int | None, queries: int | Tensor, shown: Shown
+) -> bool:
+    """Whether matrices are as large as traverses in frames, and not as evenly spaced ones."""
+    shape = next(iter(matrices.values())).shape
+    if len(shape) != 2:
+        return False
+    rows, columns = shape
+    count = queries if isinstance(queries, int) else int(queries.max()) + 1
+    fits = rows > (0 if shown.place is None else int(shown.place[-1])) and columns > int(shown.query.max())
+    return fits and (rows, columns) != (places, count)
+
+
+def _matrices(
+    path: Path, matrices: Mapping[str, np.ndarray], places: int | None, queries: int | Tensor
+) -> Truth:
     for name, matrix in matrices.items():
         _check_shape(f"{path}: {name}", matrix, places, queries)
     if len({matrix.shape for matrix in matrices.values()}) > 1:

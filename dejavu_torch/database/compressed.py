@@ -22,6 +22,8 @@ class CompressedMap(nn.Module):
         feature_ptr: (L+1,) int64, where each layer's features begin in `feature_index`.
         feature_index: (sum F,) int32.
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
+        frame: (N,) int32, the reference frame that each place shows where places are evenly spaced; (0,)
+            where place i is frame i.
 
     Args:
         plan: the layers.
@@ -29,6 +31,7 @@ class CompressedMap(nn.Module):
             gradients.
         places: N, frames of the reference traverse.
         dimension: D, features per frame.
+        frame: see above; None where place i is frame i.
 
     Convention: places are 0..N-1. `load_state_dict` takes the shapes of what it loads, so an empty
         `CompressedMap()` can receive any map.
@@ -39,9 +42,15 @@ class CompressedMap(nn.Module):
     feature_ptr: Tensor
     feature_index: Tensor
     templates: Tensor
+    frame: Tensor
 
     def __init__(
-        self, plan: Plan = (), templates: Sequence[Tensor] = (), places: int = 0, dimension: int = 0
+        self,
+        plan: Plan = (),
+        templates: Sequence[Tensor] = (),
+        places: int = 0,
+        dimension: int = 0,
+        frame: Tensor | None = None,
     ) -> None:
         super().__init__()
         for layer, block in zip(plan, templates, strict=True):
@@ -60,6 +69,8 @@ class CompressedMap(nn.Module):
         self.register_buffer("feature_ptr", torch.tensor(pointer, device=device))
         self.register_buffer("feature_index", torch.tensor(index, dtype=torch.int32, device=device))
         self.register_buffer("templates", flat)
+        shown = torch.zeros(0, dtype=torch.int32) if frame is None else frame.to(torch.int32)
+        self.register_buffer("frame", shown.to(device))
         self._plan: Plan | None = None
         self.check()
 
@@ -107,6 +118,7 @@ class CompressedMap(nn.Module):
 
     def _disagreement(self) -> str:
         shapes = {"size": "(2,)", "layers": "(L,5)", "feature_ptr": "(L+1,)", "feature_index": "(F,)"}
+        shapes |= {"frame": "(N,)"}
         for name, shape in shapes.items():
             buffer = getattr(self, name)
             whole = not (buffer.is_floating_point() or buffer.is_complex() or buffer.dtype == torch.bool)
@@ -119,6 +131,10 @@ class CompressedMap(nn.Module):
             return f"feature_ptr does not rise from 0 over {len(self.layers)} layers"
         if pointer[-1] != len(self.feature_index):
             return f"{len(self.feature_index)} feature indices; expected {pointer[-1]}"
+        if len(self.frame) not in (0, self.places):
+            return f"frame {tuple(self.frame.shape)}; expected ({self.places},), or (0,)"
+        if len(self.frame) and bool((self.frame.diff(prepend=self.frame.new_zeros(1)) < 0).any()):
+            return "frames of places that are negative or fall"
         if bool((self.layers[:, 1] < 1).any()):
             return "a period with a denominator below 1"
         for layer in self.plan:  # each layer checks itself as it is built

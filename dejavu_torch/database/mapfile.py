@@ -13,10 +13,20 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from dejavu_torch.data.files import whole_file
+from dejavu_torch.database.compressed import CompressedMap
+from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import InputError
 
 FORMAT = 1
 PACKAGE = "dejavu_torch"
+PARTS: dict[str, type[nn.Module]] = {  # what a header holds recipes of
+    "preprocess": Preprocess,
+    "features": nn.Module,
+    "periods": PeriodFinder,
+    "velocity": VelocityNormalizer,
+}
 LAYER_COLUMNS = ["period_numerator", "period_denominator", "phases", "start", "stop"]
 
 
@@ -61,6 +71,34 @@ def build(recipe: Recipe, kind: type[M]) -> M:
     except (ImportError, AttributeError, TypeError) as error:
         raise InputError(f"the map names {recipe.class_path}, which cannot be built: {error}") from error
     return module
+
+
+def part_recipes(model: nn.Module) -> dict[str, Any]:
+    """The header's entries of a model's parts, by the names of `PARTS`."""
+    parts = {name: getattr(model, name) for name in PARTS}
+    return {name: None if part is None else recipe_of(part)._asdict() for name, part in parts.items()}
+
+
+def build_parts(header: dict[str, Any], features: nn.Module | None = None) -> dict[str, Any]:
+    """The modules that a map's header names, by the names of `PARTS`.
+
+    Args:
+        features: the module that made the map's features, needed where it is not one of this package.
+
+    Raises:
+        InputError: modules that cannot be built, or other features than the map's.
+    """
+    there = [name for name in PARTS if name != "velocity" or header[name] is not None]
+    recipes = {name: Recipe(**header[name]) for name in there}
+    if features is not None and recipe_of(features) != recipes["features"]:
+        raise InputError(f"it was learnt with {recipes['features']}; got {recipe_of(features)}")
+    parts: dict[str, Any] = dict.fromkeys(PARTS) | {"features": features}
+    for name, recipe in recipes.items():
+        # only learning needs what found the periods: one from elsewhere need not be built
+        elsewhere = name == "periods" and not recipe.class_path.startswith(PACKAGE + ".")
+        if parts[name] is None and not elsewhere:
+            parts[name] = build(recipe, PARTS[name])
+    return parts
 
 
 def metadata_of(header: dict[str, Any]) -> dict[str, str]:
@@ -129,3 +167,19 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
+
+
+def read_compressed(path: Path) -> CompressedMap:
+    """The map alone, without what made its features.
+
+    Raises:
+        InputError: as `read_map`, or tensors that make no map.
+    """
+    tensors, _ = read_map(path)
+    stored = CompressedMap()
+    own = {name.removeprefix("map."): tensor for name, tensor in tensors.items() if name.startswith("map.")}
+    try:
+        stored.load_state_dict(own)
+    except (InputError, RuntimeError) as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())}") from error
+    return stored

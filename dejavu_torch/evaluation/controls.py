@@ -25,6 +25,7 @@ def same_settings(model: DejaVu) -> DejaVu:
         model.threshold,
         model.batch_size,
         model.preprocess,
+        model.velocity,
     )
 
 

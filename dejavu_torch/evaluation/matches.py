@@ -1,4 +1,4 @@
-"""Matches as a csv of query,place,score,accepted."""
+"""Matches as a csv of query,place,score,accepted, and the frames of evenly spaced ones."""
 
 from __future__ import annotations
 
@@ -6,44 +6,64 @@ import csv
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import whole_file
+from dejavu_torch.data.truth import Shown
 from dejavu_torch.data.truthformats import as_number, read_text
 from dejavu_torch.types import InputError, Match
 
 EXPECTED = "columns query,place,score and, if wanted, accepted"
+FRAMES = ("query_frame", "place_frame")
 _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 
 
-def write_matches(path: Path, matches: Iterable[Match]) -> tuple[int, int]:
-    """Write query,place,score,accepted for matches that come in parts; (queries, accepted) written."""
+class Matches(NamedTuple):
+    """Matches read from a file, in its order.
+
+    query: (Q,) int64, the number of each query. match: Match of (Q,). query_frame: (Q,) int64, the frame
+    that each evenly spaced query shows; None where queries are frames.
+    """
+
+    query: Tensor
+    match: Match
+    query_frame: Tensor | None
+
+
+def write_matches(path: Path, matches: Iterable[Match], shown: Shown | None = None) -> tuple[int, int]:
+    """Write query,place,score,accepted for matches that come in parts; (queries, accepted) written.
+
+    Args:
+        shown: the frames that evenly spaced queries and places show: adds query_frame,place_frame, which is
+            -1 where no place is reported.
+    """
     total = accepted = 0
+    frames = None if shown is None or shown.place is None else (shown.query.tolist(), shown.place.tolist())
     with whole_file(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["query", "place", "score", "accepted"])
+        writer.writerow(["query", "place", "score", "accepted", *(FRAMES if frames else ())])
         for match in matches:
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
             rows = zip(match.index.tolist(), match.score.tolist(), match.accepted.tolist(), strict=True)
             for place, score, good in rows:
-                writer.writerow([total, place, f"{score:.{digits}g}", int(good)])
+                also = (frames[0][total], frames[1][place] if place >= 0 else -1) if frames else ()
+                writer.writerow([total, place, f"{score:.{digits}g}", int(good), *also])
                 total += 1
                 accepted += good
     return total, accepted
 
 
-def read_matches(path: Path) -> tuple[Tensor, Match]:
+def read_matches(path: Path) -> Matches:
     """The matches of a csv, which may come from any method.
 
     Args:
         path: a csv with a header. query: number of the query frame, each once, in any order. place: the
             reported place, -1 for none. score: lower is better, inf for none. accepted: 1 or 0; where the
-            column is missing, every match with a finite score is accepted. Other columns are ignored.
-
-    Returns:
-        (Q,) int64 the number of each query, and Match of (Q,), both in the order of the file.
+            column is missing, every match with a finite score is accepted. query_frame: the frame that an
+            evenly spaced query shows. Other columns are ignored.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
         accepted.
@@ -52,6 +72,7 @@ def read_matches(path: Path) -> tuple[Tensor, Match]:
         InputError: what cannot be read, with the number of the line.
     """
     rows: dict[int, tuple[int, float, bool]] = {}
+    frames: list[int] = []
     for where, cells in _rows(path):
         query, place = (
             _whole(cells[name], name, least, where) for name, least in (("query", 0), ("place", -1))
@@ -62,13 +83,15 @@ def read_matches(path: Path) -> tuple[Tensor, Match]:
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:
             raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
+        if FRAMES[0] in cells:
+            frames.append(_whole(cells[FRAMES[0]], FRAMES[0], 0, where))
         nothing = place < 0 or math.isinf(score)
         rows[query] = (-1, math.inf, False) if nothing else (place, score, accepted)
     if not rows:
         raise InputError(f"{path} holds no matches; expected a line for each query")
     index, scores, accepted_ = zip(*rows.values(), strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
-    return torch.tensor(list(rows)), match
+    return Matches(torch.tensor(list(rows)), match, torch.tensor(frames) if frames else None)
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

@@ -19,7 +19,7 @@ from dejavu_torch.types import Match, Truth
 
 PICTURES = (
     *("frames", "pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"),
-    *("autocorrelogram", "layers"),
+    *("autocorrelogram", "layers", "velocity"),
 )
 LATE = 0.1  # recall at which a curve starts late
 
@@ -158,10 +158,15 @@ def summary(report: Report) -> str:
     """What was judged, in a few sentences: those that the facts can tell."""
     facts = report.facts
     places = f" on {facts['frames']} places" if "frames" in facts else ""
-    right = f"right within {facts['tolerance']} frames"
+    right = f"right within {facts['tolerance']} {facts.get('unit', 'frames')}"
     right += f" of the truth ({facts['truth']})" if facts.get("truth") else ""
     scored = right if report.ours.scores else "no truth was given, so nothing is scored"
     told = [f"{facts['queries']} queries{places}; {scored}"]
+    if "spacing" in facts:
+        told.append(
+            "{reference_frames} frames of the reference and {query_frames} of the query were brought to even "
+            "steps of {step:.4g} pixels of ground".format(**facts["spacing"])
+        )
     if facts.get("unknown"):
         told.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")
     if facts.get("ignored"):

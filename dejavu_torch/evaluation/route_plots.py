@@ -45,6 +45,23 @@ def plot_frames(first: Tensor, second: Tensor, numbers: Sequence[int]) -> Plot:
     return figure, axes
 
 
+def plot_velocity(ways: Mapping[str, Tensor], step: float) -> Plot:
+    """How fast the ground moves along traverses, and at which steps it is sampled (section IV-B).
+
+    Args:
+        ways: name -> (N,) pixels of ground at each frame. step: pixels from one place to the next.
+    """
+    figure, axes = canvas(1.6 + 1.5 * len(ways), len(ways), squeeze=False, sharey=True)
+    for axis, (name, way), colour in zip(axes.flat, ways.items(), (BLUE, ORANGE), strict=False):
+        axis.plot(torch.arange(1, len(way)), way.diff(), color=colour, linewidth=0.8)
+        axis.axhline(step, color=DARK, linewidth=0.8, linestyle=":")
+        axis.set(xlim=(0, len(way)), ylabel="pixels of ground\nper frame")
+        axis.set_title(name, loc="left", fontsize=9)
+        axis.grid(alpha=0.25)
+    axes[-1, 0].set_xlabel("frame as it came (dotted: one step of the evenly spaced places)")
+    return figure, axes
+
+
 def plot_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int = 0) -> Plot:
     """How alike a feature is to itself some frames later (figure 1 (c) of the paper).
 

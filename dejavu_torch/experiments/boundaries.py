@@ -98,6 +98,6 @@ def known_boundaries(result: Comparison, cuts: Sequence[int], tolerance: int) ->
     names = ("min_period", "strongest", "peaks", "false_alarm", "similar")
     other = same_settings(model)
     other.periods = GivenChunks(cuts, {name: getattr(model.periods, name) for name in names})
-    other.learn_features(result.stored, model.learnt_from)
+    other.learn_features(result.stored, result.reference)
     name, match = "chunks cut where structures start and stop", other.localize(result.seen)
     return contend(name, match, result.truth, tolerance, other.map_bytes)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.truth import as_truth, counted
+from dejavu_torch.data.truth import Shown, as_truth, counted, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
 from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
@@ -23,8 +23,10 @@ from dejavu_torch.evaluation.curves import (
 )
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Contender, Report, contend
+from dejavu_torch.evaluation.route_plots import plot_velocity
 from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
+from dejavu_torch.features.spacing import EvenlySpaced, frames_of
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
@@ -37,7 +39,8 @@ class Comparison(NamedTuple):
     """A comparison's figures, matches and pictures.
 
     model holds the map; stored (N,D) and seen (Q,D) are the features of reference and query; truth is
-    None where there is none.
+    None where there is none; shown tells the frames of both where they are evenly spaced, else None;
+    reference is the traverse as it was learnt.
     """
 
     report: Report
@@ -47,6 +50,8 @@ class Comparison(NamedTuple):
     stored: Tensor
     seen: Tensor
     truth: Truth | None
+    shown: Shown | None
+    reference: Traverse
 
 
 def compare(
@@ -78,21 +83,29 @@ def compare(
     """
     if tolerance < 0 or (leave_out is not None and leave_out < 0):
         raise InputError(f"tolerance is {tolerance}, leave_out {leave_out}; expected at least 0")
+    if truth is not None:
+        check_truth_text(truth, interpolate)
     known = None
+    model = DejaVu() if model is None else model
+    _check_sizes(model, reference, query)
+    came, shown = (reference, query), None
+    began = time.perf_counter()
+    reference = model.evenly(reference, progress=progress)
+    measured = time.perf_counter()
+    if isinstance(reference, EvenlySpaced):
+        query = model.evenly(query, reference.step, progress)
+        shown = Shown(frames_of(query), reference.frame)
+    both = time.perf_counter()
     early = reference.length is not None and query.length is not None
     if early:  # a truth that does not fit is told before the long work
-        known = find_truth(truth, reference, query, reference.length, query.length or 0, interpolate)
-    elif truth is not None:
-        check_truth_text(truth, interpolate)
+        known = find_truth(truth, *came, reference.length, query.length or 0, interpolate, shown)
     if reference.name == query.name:
         log.warning(
             "%s is matched with itself, every frame with its own; judge on a second traverse", query.name
         )
-    model = DejaVu() if model is None else model
-    _check_sizes(model, reference, query)
-    began = time.perf_counter()
+    ready = time.perf_counter()
     stored = model.extract_all(reference, "learning" if progress else None)
-    model.learn_features(stored, frame_shape(reference))
+    model.learn_features(stored, reference)
     learnt = time.perf_counter()
     seen = model.extract_all(query, "localizing" if progress else None)
     model.check_queries(frame_shape(query), seen.shape[1], query.name)
@@ -100,7 +113,7 @@ def compare(
     localized = time.perf_counter()
 
     if not early:
-        known = find_truth(truth, reference, query, len(stored), len(seen), interpolate)
+        known = find_truth(truth, *came, len(stored), len(seen), interpolate, shown)
     itemsize = model.map.templates.element_size()
     size = model.map_bytes
     frames, dimension = stored.shape
@@ -146,6 +159,7 @@ def compare(
         "frames": len(stored),
         "queries": len(seen),
         "tolerance": tolerance,
+        "unit": unit_of(shown),
         "recall_definition": RECALL_DEFINITION,
         "map_bytes": size,
         "backbone_bytes": model.backbone_bytes,
@@ -163,8 +177,8 @@ def compare(
             }
             for c in chunks
         ],
-        "seconds_learn": learnt - began,
-        "seconds_localize": localized - learnt,
+        "seconds_learn": measured - began + learnt - ready,
+        "seconds_localize": both - measured + localized - learnt,
         "accepted": int(match.accepted.sum()),
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
@@ -174,6 +188,12 @@ def compare(
         "version": dejavu_torch.__version__,
         "torch": torch.__version__,
     }
+    if isinstance(reference, EvenlySpaced):
+        facts["spacing"] = {
+            "step": reference.step,
+            "reference_frames": len(reference.way),
+            "query_frames": len(query.way) if isinstance(query, EvenlySpaced) else len(seen),
+        }
     if known is not None:
         positions = reference.place is not None and query.place is not None
         facts |= tally(match, known, tolerance)
@@ -181,8 +201,22 @@ def compare(
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
     ours = contender("this map", match, known, size, None)
     pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, found)
+    if isinstance(reference, EvenlySpaced):
+        pictures = {"velocity": _velocity(reference, query)} | pictures
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
-    return Comparison(Report(ours, contenders, facts), match, model, pictures, stored, seen, known)
+    report = Report(ours, contenders, facts)
+    return Comparison(report, match, model, pictures, stored, seen, known, shown, reference)
+
+
+def _velocity(reference: EvenlySpaced, query: Traverse) -> Picture:
+    pair = [("reference", reference), ("query", query)]
+    ways = {f"{role}: {one.name}": one.way for role, one in pair if isinstance(one, EvenlySpaced)}
+    return Picture(
+        plot_velocity(ways, reference.step),
+        "how fast the ground moves",
+        "The motion of the ground from frame to frame. Places are even steps along it: a camera that stands "
+        "adds none.",
+    )
 
 
 def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
+from dejavu_torch.data.truth import Shown, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
+from dejavu_torch.database.mapfile import read_compressed
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     curve_of,
@@ -40,6 +42,7 @@ def evaluate(
     interpolate: bool = False,
     reference: Traverse | None = None,
     query: Traverse | None = None,
+    map: Path | None = None,
 ) -> Evaluation:
     """Scores and pictures of the matches in a csv.
 
@@ -50,6 +53,8 @@ def evaluate(
         interpolate: see `read_truth`.
         reference, query: the traverses, where the truth lies in them; a reference also tells how many
             places there are: without it, an offset gives every query a right place.
+        map: file of the map that was matched. It too tells how many places there are, and where they are
+            evenly spaced, the frame of each, for a truth that counts frames.
 
     Raises:
         InputError: matches or truth that cannot be read, do not fit each other, or leave nothing to judge.
@@ -58,11 +63,21 @@ def evaluate(
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
     if truth is not None:
         check_truth_text(truth, interpolate)
-    queries, match = read_matches(matches)
-    places = None if reference is None else reference.length
+    queries, match, query_frame = read_matches(matches)
+    places = None if reference is None or query_frame is not None else reference.length
+    place_frame = None
+    if map is not None:
+        stored = read_compressed(map)
+        places, place_frame = stored.places, stored.frame.long() if len(stored.frame) else None
+        if (place_frame is None) != (query_frame is None):
+            raise InputError(
+                f"{matches} has {'no ' if query_frame is None else ''}query_frame, the places of {map} are "
+                f"{'frames' if place_frame is None else 'evenly spaced'}; expected the map that was matched"
+            )
     if places is not None and int(match.index.max()) >= places:
         raise InputError(f"{matches} reports place {int(match.index.max())}; expected one below {places}")
-    known = find_truth(truth, reference, query, places, queries, interpolate)
+    shown = None if query_frame is None else Shown(query_frame, place_frame)
+    known = find_truth(truth, reference, query, places, queries, interpolate, shown)
     if known is None:
         raise InputError("there is no truth; expected one, or two traverses that carry their positions")
     counts = tally(match, known, tolerance)
@@ -70,6 +85,7 @@ def evaluate(
     facts = counts | {
         "accepted_precision": counts["accepted_right"] / counts["accepted"] if counts["accepted"] else None,
         "tolerance": tolerance,
+        "unit": unit_of(shown),
         "recall_definition": RECALL_DEFINITION,
         "matches": str(matches),
         "places": places,
@@ -82,7 +98,7 @@ def evaluate(
     seen = 1 + max(int(table.max()) for table in (match.index, known.right))
     pictures = {
         "pr": Picture(
-            plot_curves({matches.name: curve}, f"right within {tolerance} frames"),
+            plot_curves({matches.name: curve}, f"right within {tolerance} {unit_of(shown)}"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises.",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -248,6 +248,17 @@ def frames_between(traverse: Traverse, start: int, stop: int) -> Iterator[Tensor
         if len(part):
             yield part
         seen += len(batch)
+
+
+def frames_at(traverse: Traverse, numbers: Sequence[int]) -> Tensor:
+    """Some frames of a traverse, which is read once up to the last of them: (K,C,H,W)."""
+    found: dict[int, Tensor] = {}
+    seen = 0
+    for batch in frames_between(traverse, 0, max(numbers) + 1):
+        inside = [n for n in numbers if seen <= n < seen + len(batch)]
+        found |= {n: batch[n - seen].clone() for n in inside}
+        seen += len(batch)
+    return torch.stack([found[n] for n in numbers])
 
 
 def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:

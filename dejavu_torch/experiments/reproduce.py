@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.truth import places_of_frames
 from dejavu_torch.evaluation.controls import leave_out_match, same_settings
 from dejavu_torch.evaluation.curves import judge
 from dejavu_torch.evaluation.plots import Picture
@@ -22,10 +23,11 @@ from dejavu_torch.evaluation.route_plots import (
 )
 from dejavu_torch.experiments.boundaries import boundary_effect, known_boundaries
 from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.pictures import best_explained, frames_between, leading_layers
+from dejavu_torch.experiments.pictures import best_explained, frames_at, leading_layers
+from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import InputError, Traverse, Truth
+from dejavu_torch.types import InputError, Traverse
 
 LENGTHS = (256, 512, 1024, 2048)
 EXAMPLES = 4  # places of which frames are shown
@@ -39,13 +41,24 @@ class Published(NamedTuple):
     auc_reported: float
 
 
-PUBLISHED = {"aerial": Published(0.2064, 0.959, 0.9813)}
+PUBLISHED = {
+    "aerial": Published(0.2064, 0.959, 0.9813),
+    "outdoor": Published(0.4143, 0.9785, 0.991),
+    "underground": Published(0.0032, None, 0.6998),
+}
+PATCH = (32, 32)  # pixels: as many rows as the region of ground has in a frame, and some more
 
 
-def paper_model() -> DejaVu:
-    """The paper's letter: the settings of configs/paper.yaml."""
+def paper_model(reference: Traverse | None = None) -> DejaVu:
+    """The paper's letter: the settings of configs/paper.yaml.
+
+    Args:
+        reference: a railway, whose `ground` gives the velocity (section IV-B); others are taken as they come.
+    """
     periods = SpectrogramAnalysis(min_period=8, peaks="bins", false_alarm=None, short="refuse")
-    return DejaVu(periods=periods, reduction="sum")
+    ground = getattr(reference, "ground", None)
+    velocity = None if ground is None else VelocityNormalizer(ground, PATCH)
+    return DejaVu(periods=periods, reduction="sum", velocity=velocity)
 
 
 def reproduce(
@@ -61,7 +74,7 @@ def reproduce(
 
     Args:
         dataset: a key of `PUBLISHED`.
-        model: settings; None is `paper_model()`.
+        model: settings; None is `paper_model` of the dataset.
         tolerance: frames within which a place is right, inclusive.
         seed: of the simulated route. frames: its length, None is the simulator's own.
         lengths: of chunks, frames, to compare.
@@ -85,7 +98,7 @@ def reproduce(
     result = compare(
         reference,
         query,
-        model=paper_model() if model is None else model,
+        model=paper_model(reference) if model is None else model,
         tolerance=tolerance,
         progress=progress,
     )
@@ -101,40 +114,35 @@ def reproduce(
     contenders = dict(result.report.contenders)
     for key, (name, match) in matches.items():
         contenders[key] = contend(name, match, itself, tolerance)
-    found = chunk_lengths(model, stored, result.seen, result.truth, tolerance, lengths)
+    found = chunk_lengths(result, tolerance, lengths)
     facts = {
         **result.report.facts,
         "published": PUBLISHED[dataset]._asdict(),
         "chunk_lengths": [row._asdict() for row in found],
     }
     cuts = structure_cuts(reference)
+    if result.shown is not None:
+        cuts = places_of_frames(torch.tensor(cuts), result.shown).unique().tolist()
     if cuts and result.truth is not None:
         facts["boundaries"] = boundary_effect(result.match, result.truth, cuts, tolerance)._asdict()
         contenders["known_boundaries"] = known_boundaries(result, cuts, tolerance)
     pictures = {
-        **_frames(reference, query),
+        **_frames(reference, query, result),
         **result.pictures,
         **_map_pictures(model, stored),
     }
     return result._replace(report=Report(result.report.ours, contenders, facts), pictures=pictures)
 
 
-def chunk_lengths(
-    model: DejaVu,
-    stored: Tensor,
-    seen: Tensor,
-    truth: Truth | None,
-    tolerance: int,
-    lengths: Sequence[int] = LENGTHS,
-) -> list[Length]:
+def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int] = LENGTHS) -> list[Length]:
     """Recall and storage of maps whose chunks have other lengths (section VI).
 
     Args:
-        model: the other settings. stored: (N,D), seen: (Q,D) features of reference and query.
-        lengths: in frames; those longer than the reference are left out.
+        result: with the other settings. lengths: in frames; those longer than the reference are left out.
     """
     rows: list[Length] = []
-    if truth is None or not isinstance(model.periods, SpectrogramAnalysis):
+    model, stored = result.model, result.stored
+    if result.truth is None or not isinstance(model.periods, SpectrogramAnalysis):
         return rows
     names = ("min_period", "strongest", "peaks", "false_alarm", "similar", "short")
     kept = {name: getattr(model.periods, name) for name in names}
@@ -142,8 +150,8 @@ def chunk_lengths(
         if window <= len(stored):
             other = same_settings(model)
             other.periods = SpectrogramAnalysis(window, **kept)
-            other.learn_features(stored, model.learnt_from)
-            scores = judge(other.localize(seen), truth, tolerance)
+            other.learn_features(stored, result.reference)
+            scores = judge(other.localize(result.seen), result.truth, tolerance)
             size = other.map_bytes
             rows.append(Length(window, scores.recall_at_1, scores.auc, size, size / len(stored)))
     return rows
@@ -225,19 +233,21 @@ def _text(value: float | None) -> str:
     return "" if value is None else f"{value:.4f}"
 
 
-def _frames(reference: Traverse, query: Traverse) -> dict[str, Picture]:
-    """Frames of both traverses at the same places, where both know their places."""
-    if reference.place is None or query.place is None:
+def _frames(reference: Traverse, query: Traverse, result: Comparison) -> dict[str, Picture]:
+    """Frames of both traverses at the same places."""
+    if result.truth is None:
         return {}
-    last = min(float(reference.place.max()), float(query.place.max()))
-    places = [int(last * (k + 0.5) / EXAMPLES) for k in range(EXAMPLES)]
-    both = []
-    for traverse, where in ((reference, reference.place), (query, query.place)):
-        nearest = [int((where - place).abs().argmin()) for place in places]
-        both.append(torch.cat([next(frames_between(traverse, i, i + 1)) for i in nearest]))
+    places, queries = [], []
+    for k in range(EXAMPLES):
+        apart = (result.truth.right - len(result.stored) * (k + 0.5) / EXAMPLES).abs()
+        queries.append(int(torch.where(result.truth.right >= 0, apart, torch.inf).amin(1).argmin()))
+        places.append(int(result.truth.right[queries[-1]].max()))
+    at = places, queries  # the frames they show
+    if result.shown is not None:
+        at = result.model.map.frame[places].tolist(), result.shown.query[queries].tolist()
     return {
         "frames": Picture(
-            plot_frames(both[0], both[1], places),
+            plot_frames(frames_at(reference, at[0]), frames_at(query, at[1]), places),
             "the route",
             "The same places on the reference and on the second traverse.",
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 
@@ -10,6 +11,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from dejavu_torch.types import InputError, Traverse
+
+log = logging.getLogger("dejavu_torch")
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch, 256 MB
 
@@ -88,3 +91,40 @@ def frame_shape(traverse: Traverse) -> tuple[int, ...]:
     for batch in traverse.batches(1):
         return tuple(batch.shape[1:])
     raise InputError(f"{traverse.name} holds no frames; expected at least one")
+
+
+def check_frames(
+    shape: tuple[int, ...],
+    dimension: int,
+    learnt_from: tuple[int, ...] | None,
+    expected: int,
+    resized: bool,
+    name: str,
+) -> None:
+    """Refuse queries that do not fit a map, and tell of frames of another size that do.
+
+    Args:
+        shape: of one query, (C,H,W) or (D,). dimension: how many features it gives.
+        learnt_from: shape of what the map was learnt from, None where unknown. expected: its features.
+        resized: whether the features are made of frames brought to one size.
+        name: of the queries, for the message.
+    """
+    if learnt_from is None or len(shape) != 3:
+        return
+    if len(learnt_from) == 1:
+        raise InputError(
+            f"{name} holds frames, but the map was learnt from ready features; "
+            f"expected features (Q, {expected})"
+        )
+    if dimension != expected:
+        raise InputError(
+            f"{name}: frames of {_by(shape)} give {dimension} features; the map expects "
+            f"{expected}, as frames of {_by(learnt_from)} give, into which ?width= and "
+            "?height= turn folders and videos"
+        )
+    if shape[1:] != learnt_from[1:] and not resized:
+        log.warning("%s has frames of %s, the map was learnt from %s", name, _by(shape), _by(learnt_from))
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape))

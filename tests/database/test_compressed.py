@@ -39,6 +39,7 @@ def test_buffers_are_flat_rows(route: CompressedMap) -> None:
         "feature_ptr": (4,),
         "feature_index": (6,),
         "templates": (numbers,),
+        "frame": (0,),
     }
     assert route.size.tolist() == [300, 4]
     assert route.layers.tolist() == [[195, 2, 98, 0, 200], [7, 1, 7, 100, 250], [115, 1, 23, 100, 250]]
@@ -173,6 +174,9 @@ def changed(tensor: Tensor, row: int, column: int, value: int) -> Tensor:
         ("layers", lambda t: t.flatten(), r"layers .*\(15,\)"),
         ("layers", lambda t: t[:, :4], r"layers .*\(3, 4\)"),
         ("layers", lambda t: t[:2], r"feature_ptr does not rise from 0 over 2 layers"),
+        ("frame", lambda t: torch.arange(299), r"frame \(299,\); expected \(300,\), or \(0,\)"),
+        ("frame", lambda t: torch.arange(300).flip(0), r"frames of places that are negative or fall"),
+        ("frame", lambda t: torch.arange(300) - 1, r"frames of places that are negative or fall"),
         ("layers", lambda t: changed(t, 0, 0, -195), r"period -195/2"),
         ("layers", lambda t: changed(t, 0, 1, 0), r"denominator"),
         ("layers", lambda t: changed(t, 0, 2, 0), r"0 phases"),
@@ -199,7 +203,7 @@ def test_buffers_that_do_not_fit_together_are_refused(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["size", "layers", "feature_ptr", "feature_index"])
+@pytest.mark.parametrize("name", ["size", "layers", "feature_ptr", "feature_index", "frame"])
 def test_indices_that_are_no_whole_numbers_are_refused(route: CompressedMap, name: str) -> None:
     state = route.state_dict()
     state[name] = state[name].float()

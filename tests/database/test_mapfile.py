@@ -18,6 +18,7 @@ from helpers import Fixed, refused
 from safetensors import safe_open
 from torch import Tensor, nn
 
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -166,7 +167,8 @@ def test_the_threshold_is_stored(path: Path, threshold: float | None) -> None:
 
 @pytest.mark.parametrize("shape", [(2,), (3, 64, 48), None])
 def test_a_map_knows_what_it_was_learnt_from(path: Path, shape: tuple[int, ...] | None) -> None:
-    DejaVu(periods=WINDOW).learn_features(waves(), shape).save(path)
+    traverse = None if shape is None else ArrayTraverse(torch.rand(2, *shape))
+    DejaVu(periods=WINDOW).learn_features(waves(), traverse).save(path)
     assert DejaVu.load(path).learnt_from == shape
 
 
@@ -338,6 +340,10 @@ def test_a_version_that_is_no_number_is_refused(saved: Path) -> None:
         {"features": {"class_path": "dejavu_torch.types.InputError", "init_args": {}}},
         {"features": {"class_path": "dejavu_torch.features.hog.hog", "init_args": {}}},
         {"periods": {"class_path": "dejavu_torch.features.hog.HOG", "init_args": {}}},
+        {"velocity": {"class_path": "dejavu_torch.features.hog.HOG", "init_args": {}}},
+        {"velocity": 3},
+        {"step": 2.0},
+        {"step": "far"},
     ],
     ids=str,
 )
