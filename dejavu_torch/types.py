@@ -42,6 +42,20 @@ class Traverse(ABC):
         holds ready-made features.
         """
 
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        """The frames [start, stop), as `batches` gives them; those ahead of them are read as well.
+
+        A traverse that can begin anywhere does so.
+        """
+        seen = 0
+        for batch in self.batches(64):
+            if seen >= stop:
+                return
+            part = batch[max(0, start - seen) : max(0, stop - seen)]
+            if len(part):
+                yield part
+            seen += len(batch)
+
 
 @dataclass(frozen=True)
 class FrequencyLayer:

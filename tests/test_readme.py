@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -37,10 +38,10 @@ def test_every_linked_file_is_there() -> None:
 def test_every_command_shown_is_understood() -> None:
     from dejavu_torch.cli.parser import build_parser
 
-    shown = re.findall(r"^(dejavu .*?)(?:\s+#.*)?$", README, re.MULTILINE)
+    shown = re.findall(r"^dejavu .*$", README.replace("\\\n", " "), re.MULTILINE)
     assert len(shown) >= 4
     for line in shown:
-        build_parser().parse_args(line.split()[1:])
+        build_parser().parse_args(shlex.split(line, comments=True)[1:])
 
 
 def test_ci_calls_the_readmes_test_command() -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -13,8 +15,7 @@ from torch import Tensor
 import dejavu_torch
 from dejavu_torch.data.truth import Shown, as_truth, counted, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
-from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
-from dejavu_torch.evaluation.controls import leave_out_match, null_control
+from dejavu_torch.evaluation.controls import leave_out_match
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     curve_of,
@@ -24,6 +25,7 @@ from dejavu_torch.evaluation.curves import (
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Contender, Report, contend
 from dejavu_torch.evaluation.route_plots import plot_velocity
+from dejavu_torch.experiments.others import Other, others_of
 from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
 from dejavu_torch.features.spacing import EvenlySpaced, frames_of
@@ -39,8 +41,8 @@ class Comparison(NamedTuple):
     """A comparison's figures, matches and pictures.
 
     model holds the map; stored (N,D) and seen (Q,D) are the features of reference and query; truth is
-    None where there is none; shown tells the frames of both where they are evenly spaced, else None;
-    reference is the traverse as it was learnt.
+    None where there is none; reference and query are the traverses as they were learnt and localized, shown
+    tells the frames of both where they are evenly spaced, else None.
     """
 
     report: Report
@@ -50,8 +52,9 @@ class Comparison(NamedTuple):
     stored: Tensor
     seen: Tensor
     truth: Truth | None
-    shown: Shown | None
     reference: Traverse
+    query: Traverse
+    shown: Shown | None
 
 
 def compare(
@@ -88,14 +91,13 @@ def compare(
     known = None
     model = DejaVu() if model is None else model
     _check_sizes(model, reference, query)
-    came, shown = (reference, query), None
-    began = time.perf_counter()
-    reference = model.evenly(reference, progress=progress)
-    measured = time.perf_counter()
+    came, shown, clock = (reference, query), None, Clock()
+    with clock("learn"):
+        reference = model.evenly(reference, progress=progress)
     if isinstance(reference, EvenlySpaced):
-        query = model.evenly(query, reference.step, progress)
+        with clock("localize"):
+            query = model.evenly(query, reference.step, progress)
         shown = Shown(frames_of(query), reference.frame)
-    both = time.perf_counter()
     early = reference.length is not None and query.length is not None
     if early:  # a truth that does not fit is told before the long work
         known = find_truth(truth, *came, reference.length, query.length or 0, interpolate, shown)
@@ -103,56 +105,26 @@ def compare(
         log.warning(
             "%s is matched with itself, every frame with its own; judge on a second traverse", query.name
         )
-    ready = time.perf_counter()
-    stored = model.extract_all(reference, "learning" if progress else None)
-    model.learn_features(stored, reference)
-    learnt = time.perf_counter()
-    seen = model.extract_all(query, "localizing" if progress else None)
-    model.check_queries(frame_shape(query), seen.shape[1], query.name)
-    match = model.localize(seen)
-    localized = time.perf_counter()
+    with clock("learn"):
+        stored = model.extract_all(reference, "learning" if progress else None)
+        model.learn_features(stored, reference)
+    with clock("localize"):
+        seen = model.extract_all(query, "localizing" if progress else None)
+        model.check_queries(frame_shape(query), seen.shape[1], query.name)
+        match = model.localize(seen)
 
     if not early:
         known = find_truth(truth, *came, len(stored), len(seen), interpolate, shown)
-    itemsize = model.map.templates.element_size()
-    size = model.map_bytes
-    frames, dimension = stored.shape
-    k = fair_stride(frames, dimension, itemsize, size, tolerance)
-    coarsest = max(1, 2 * tolerance)
-    metric = model.matcher.metric
-    everything, strided, sparse = nearest_frames(stored, seen, (1, k, coarsest), metric, progress)
-    found = {
-        "uncompressed": (f"all {len(stored)} frames", everything, 1),
-        "stride": (f"{_every(k)} (at least the map's bytes)", strided, k),
-        "stride_coarsest": (f"{_every(coarsest)} (2 x tolerance)", sparse, coarsest),
-        "null": (
-            "null: all learnt shuffled",
-            null_control(model, stored, seen, seed, progress=progress),
-            None,
-        ),
-        "null_same_plan": (
-            "null: this map's layers, shuffled",
-            null_control(model, stored, seen, seed, same_plan=True, progress=progress),
-            None,
-        ),
-    }
+    others = others_of(model, stored, seen, tolerance, seed, progress)
     if leave_out is not None:
         itself = leave_out_match(model, stored, leave_out)
-        found["leave_out"] = (f"reference on itself, +-{leave_out} left out", itself, None)
-
-    def contender(
-        name: str, match: Match, truth: Truth | None, bytes: int | None, k: int | None
-    ) -> Contender:
-        if truth is None or not counted(match.index, truth, tolerance).any():
-            return Contender(name, None, bytes, k)
-        return contend(name, match, truth, tolerance, bytes, k)
-
+        others["leave_out"] = Other(f"reference on itself, +-{leave_out} left out", itself)
     contenders = {}
-    for key, (name, other, stride) in found.items():
-        bytes = None if stride is None else stride_bytes(frames, dimension, itemsize, stride)
+    for key, (name, other, bytes, k) in others.items():
         own = as_truth(torch.arange(len(stored))[:, None]) if key == "leave_out" else known
-        contenders[key] = contender(name, other, own, bytes, stride)
+        contenders[key] = _judged(name, other, own, tolerance, bytes, k)
 
+    size = model.map_bytes
     plan = model.map.plan
     chunks = model.certificate.chunks
     facts = {
@@ -164,7 +136,7 @@ def compare(
         "map_bytes": size,
         "backbone_bytes": model.backbone_bytes,
         "bytes_per_place": size / len(stored),
-        "full_bytes": stored.numel() * itemsize,
+        "full_bytes": stored.numel() * model.map.templates.element_size(),
         "templates": sum(layer.phases for layer in plan),
         "template_numbers": model.map.templates.numel(),
         "periods": sorted({_plain(layer.period) for layer in plan}),
@@ -177,8 +149,8 @@ def compare(
             }
             for c in chunks
         ],
-        "seconds_learn": measured - began + learnt - ready,
-        "seconds_localize": both - measured + localized - learnt,
+        "seconds_learn": clock.seconds["learn"],
+        "seconds_localize": clock.seconds["localize"],
         "accepted": int(match.accepted.sum()),
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
@@ -199,13 +171,40 @@ def compare(
         facts |= tally(match, known, tolerance)
         facts["truth"] = describe_truth(truth, interpolate, positions)
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
-    ours = contender("this map", match, known, size, None)
-    pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, found)
+    ours = _judged("this map", match, known, tolerance, size)
+    pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, others)
     if isinstance(reference, EvenlySpaced):
         pictures = {"velocity": _velocity(reference, query)} | pictures
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     report = Report(ours, contenders, facts)
-    return Comparison(report, match, model, pictures, stored, seen, known, shown, reference)
+    return Comparison(report, match, model, pictures, stored, seen, known, reference, query, shown)
+
+
+class Clock:
+    """Adds up the seconds of what is done under a name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - began
+
+
+def _judged(
+    name: str,
+    match: Match,
+    truth: Truth | None,
+    tolerance: int,
+    bytes: int | None = None,
+    k: int | None = None,
+) -> Contender:
+    """Scores where there is a truth that counts any of the queries."""
+    if truth is None or not counted(match.index, truth, tolerance).any():
+        return Contender(name, None, bytes, k)
+    return contend(name, match, truth, tolerance, bytes, k)
 
 
 def _velocity(reference: EvenlySpaced, query: Traverse) -> Picture:
@@ -233,7 +232,3 @@ def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
 def _plain(period: object) -> int | float:
     value = float(period)  # type: ignore[arg-type]
     return int(value) if value.is_integer() else value
-
-
-def _every(k: int) -> str:
-    return "every frame" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } frame"

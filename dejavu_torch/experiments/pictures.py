@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -19,6 +19,8 @@ from dejavu_torch.evaluation.plots import (
     plot_coverage,
     plot_curves,
 )
+from dejavu_torch.experiments.others import Other
+from dejavu_torch.features.extract import frame_shape
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -37,7 +39,7 @@ def draw_pictures(
     match: Match,
     truth: Truth | None,
     tolerance: int,
-    found: Mapping[str, tuple[str, Match, int | None]],
+    others: Mapping[str, Other],
 ) -> dict[str, Picture]:
     """Every picture that can be drawn: what is not there, such as a truth or layers, leaves its own out.
 
@@ -46,7 +48,7 @@ def draw_pictures(
             rows and columns are read.
         seen: (Q,D) features of the queries. match: where they were found.
         truth: their right places, or None. tolerance: frames within which a place is right.
-        found: other matches of the same queries by key: name, match, and the stride of what is stored.
+        others: other matches of the same queries, by key.
 
     Returns:
         Of pr, auc, coverage, chunks, spectrogram, templates, features, activations those that can be
@@ -56,14 +58,15 @@ def draw_pictures(
     plan, places = model.map.plan, model.map.places
     curves = {}
     if truth is not None:
-        others, strides = [], []
-        for key, (name, other, stride) in found.items():
+        judged, strides = {"this map": match}, []
+        for key, (name, other, _, stride) in others.items():
+            # leave_out has other queries
             if key != "leave_out" and (stride is None or stride not in strides):
-                others.append((name, other))
+                judged[name] = other
                 strides.append(stride)
-        curves = {  # leave_out has other queries
+        curves = {
             name: curve_of(one, truth, tolerance)
-            for name, one in [("this map", match), *others]
+            for name, one in judged.items()
             if counted(one.index, truth, tolerance).any()
         }
     if curves:
@@ -161,8 +164,8 @@ def draw_features(model: DejaVu, reference: Traverse, stored: Tensor) -> dict[st
     features = model.features
     if type(features) is HOG:
         number = (layer.start + layer.stop) // 2
-        frame = next(frames_between(reference, number, number + 1), None)
-        if frame is not None:
+        frame = next(reference.between(number, number + 1), None)
+        if frame is not None and frame.ndim == 4:
             if features.resize is not None:
                 frame = torch.nn.functional.interpolate(
                     frame.float(), features.resize, mode="bilinear", antialias=True
@@ -238,35 +241,14 @@ def best_phases(model: DejaVu, queries: Tensor, j: int) -> Tensor:
     return present[torch.cat(nearest)]
 
 
-def frames_between(traverse: Traverse, start: int, stop: int) -> Iterator[Tensor]:
-    """The frames [start, stop) in batches (B,C,H,W); nothing where the traverse holds features."""
-    seen = 0
-    for batch in traverse.batches(64):
-        if batch.ndim == 2 or seen >= stop:
-            break
-        part = batch[max(0, start - seen) : stop - seen]
-        if len(part):
-            yield part
-        seen += len(batch)
-
-
-def frames_at(traverse: Traverse, numbers: Sequence[int]) -> Tensor:
-    """Some frames of a traverse, which is read once up to the last of them: (K,C,H,W)."""
-    found: dict[int, Tensor] = {}
-    seen = 0
-    for batch in frames_between(traverse, 0, max(numbers) + 1):
-        inside = [n for n in numbers if seen <= n < seen + len(batch)]
-        found |= {n: batch[n - seen].clone() for n in inside}
-        seen += len(batch)
-    return torch.stack([found[n] for n in numbers])
-
-
 def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:
     """The middle image column of each of the frames [start, stop), side by side: (C,H,stop - start).
 
     None where the traverse holds features.
     """
+    if len(frame_shape(traverse)) == 1:
+        return None
     columns = [  # a view would keep the whole frames
-        batch[..., batch.shape[-1] // 2].clone() for batch in frames_between(traverse, start, stop)
+        batch[..., batch.shape[-1] // 2].clone() for batch in traverse.between(start, stop)
     ]
     return torch.cat(columns).permute(1, 2, 0).float() if columns else None

@@ -23,7 +23,7 @@ from dejavu_torch.evaluation.route_plots import (
 )
 from dejavu_torch.experiments.boundaries import boundary_effect, known_boundaries
 from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.pictures import best_explained, frames_at, leading_layers
+from dejavu_torch.experiments.pictures import best_explained, leading_layers
 from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -127,7 +127,7 @@ def reproduce(
         facts["boundaries"] = boundary_effect(result.match, result.truth, cuts, tolerance)._asdict()
         contenders["known_boundaries"] = known_boundaries(result, cuts, tolerance)
     pictures = {
-        **_frames(reference, query, result),
+        **_frames(result),
         **result.pictures,
         **_map_pictures(model, stored),
     }
@@ -233,21 +233,20 @@ def _text(value: float | None) -> str:
     return "" if value is None else f"{value:.4f}"
 
 
-def _frames(reference: Traverse, query: Traverse, result: Comparison) -> dict[str, Picture]:
+def _frames(result: Comparison) -> dict[str, Picture]:
     """Frames of both traverses at the same places."""
     if result.truth is None:
         return {}
-    places, queries = [], []
+    right, places, queries = result.truth.right, [], []
     for k in range(EXAMPLES):
-        apart = (result.truth.right - len(result.stored) * (k + 0.5) / EXAMPLES).abs()
-        queries.append(int(torch.where(result.truth.right >= 0, apart, torch.inf).amin(1).argmin()))
-        places.append(int(result.truth.right[queries[-1]].max()))
-    at = places, queries  # the frames they show
-    if result.shown is not None:
-        at = result.model.map.frame[places].tolist(), result.shown.query[queries].tolist()
+        apart = (right - len(result.stored) * (k + 0.5) / EXAMPLES).abs()
+        queries.append(int(torch.where(right >= 0, apart, torch.inf).amin(1).argmin()))
+        places.append(int(right[queries[-1]].max()))
+    first = torch.cat([next(result.reference.between(n, n + 1)) for n in places])
+    second = torch.cat([next(result.query.between(n, n + 1)) for n in queries])
     return {
         "frames": Picture(
-            plot_frames(frames_at(reference, at[0]), frames_at(query, at[1]), places),
+            plot_frames(first, second, places),
             "the route",
             "The same places on the reference and on the second traverse.",
         )

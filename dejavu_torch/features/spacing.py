@@ -35,6 +35,8 @@ class EvenlySpaced(Traverse):
         InputError: as `VelocityNormalizer.distances`, and footage that does not move, or less than a step.
     """
 
+    length: int
+
     def __init__(
         self,
         traverse: Traverse,
@@ -77,18 +79,29 @@ class EvenlySpaced(Traverse):
             self.place = place[self._low].lerp(place[self._high], self._share)
 
     def batches(self, size: int) -> Iterator[Tensor]:
-        seen = done = 0
+        yield from self._shown(self.traverse.batches(size), 0, 0, self.length, size)
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        stop = min(stop, self.length)
+        if start < stop:
+            first, last = int(self._low[start]), int(self._high[stop - 1])
+            yield from self._shown(self.traverse.between(first, last + 1), first, start, stop, 64)
+
+    def _shown(
+        self, batches: Iterator[Tensor], seen: int, done: int, stop: int, size: int
+    ) -> Iterator[Tensor]:
+        """The places [done, stop) of batches that begin with frame `seen` of the inner traverse."""
         last: Tensor | None = None
-        for batch in self.traverse.batches(size):
+        for batch in batches:
             frames = batch if last is None else torch.cat([last, batch])
             seen += len(batch)
-            ready = int(torch.searchsorted(self._high, seen))
+            ready = min(stop, int(torch.searchsorted(self._high, seen)))
             for part in torch.arange(done, ready).split(size):
                 low, high = (index[part] - (seen - len(frames)) for index in (self._low, self._high))
                 share = self._share[part].to(frames)[:, None, None, None]
                 yield frames[low].lerp(frames[high], share)
             done, last = ready, frames[-1:]
-            if done == self.length:
+            if done == stop:
                 return
 
 

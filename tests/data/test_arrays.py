@@ -139,3 +139,10 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with refused("missing.npy", "expected frames"):
         read_array(tmp_path / "missing.npy")
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0, 5), (60, 140), (64, 128), (199, 200), (190, 400), (7, 7)])
+def test_frames_between_are_those_frames(start: int, stop: int) -> None:
+    clip = torch.rand(200, 1, 2, 2)
+    parts = list(ArrayTraverse(clip).between(start, stop))
+    assert torch.equal(torch.cat([clip[:0], *parts]), clip[start:stop])

@@ -526,3 +526,10 @@ def test_what_is_no_whole_number_is_refused(kind: type[Railway], key: str, value
 def test_an_empty_batch_is_refused() -> None:
     with pytest.raises(InputError, match="0 frames; expected at least 1"):
         next(Outdoor(frames=3).batches(0))
+
+
+@both
+def test_a_ride_can_begin_anywhere(kind: type[Railway]) -> None:
+    train = ride_of(kind)
+    assert torch.equal(torch.cat(list(train.between(700, 703))), frames_at(train, torch.arange(700, 703)))
+    assert len(torch.cat(list(train.between(train.length - 2, train.length + 9)))) == 2

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, SlidingWindow, SpectrogramAnalysis
 from dejavu_torch.data.truth import as_truth, offset_truth
 from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.experiments.others import Other
 from dejavu_torch.experiments.pictures import (
     best_explained,
     best_phases,
     draw_pictures,
-    frames_between,
     leading_layers,
     slit_scan,
 )
@@ -44,7 +44,7 @@ def drawn(
     traverse = ArrayTraverse(reference)
     stored, seen = model.extract_all(traverse), model.extract_all(ArrayTraverse(query))
     model.learn_features(stored)
-    others = {key: (f"the {key}", match, None) for key, match in found.items()}
+    others = {key: Other(f"the {key}", match) for key, match in found.items()}
     pictures = draw_pictures(model, traverse, stored, seen, model.localize(seen), truth, 2, others)
     for picture in pictures.values():
         buffer = io.BytesIO()
@@ -177,12 +177,6 @@ def test_best_phases_are_those_that_the_chunk_has() -> None:
     best = best_phases(model, queries, 0)
     assert best[:20].tolist() == list(range(10, 30))
     assert 10 <= int(best[20]) < 30
-
-
-def test_frames_between_are_those_frames() -> None:
-    clip = torch.rand(200, 1, 2, 2)
-    assert torch.equal(torch.cat(list(frames_between(ArrayTraverse(clip), 60, 140))), clip[60:140])
-    assert list(frames_between(ArrayTraverse(torch.rand(9, 4)), 0, 5)) == []
 
 
 def test_slit_scan_holds_no_more_than_it_shows() -> None:

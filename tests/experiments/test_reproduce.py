@@ -98,7 +98,7 @@ def test_a_number_the_paper_does_not_tell_is_left_empty(aerial: Comparison) -> N
 
 
 def test_other_datasets_are_refused() -> None:
-    with refused("'moon'", "expected aerial"):
+    with refused("'moon'", "expected aerial, outdoor, underground"):
         reproduce("moon")
 
 
@@ -116,6 +116,56 @@ def test_the_command_writes_an_index_over_the_reports(
     assert "0.9813" in page
     report = json.loads((tmp_path / "out" / "aerial" / "report.json").read_text())
     assert {"ideal", "ideal_leave_out", "chunk_lengths", "published", "auc", "null"} <= set(report)
+
+
+@pytest.fixture(scope="module")
+def outdoor() -> Comparison:
+    """The first 420 frames, from the start of the train on, in chunks of 64."""
+    paper = paper_model(open_source("sim:outdoor?frames=1"))
+    paper.periods = SpectrogramAnalysis(64, min_period=8, peaks="bins", false_alarm=None, short="refuse")
+    return reproduce("outdoor", paper, frames=420, lengths=(32, 64))
+
+
+def test_train_footage_is_spaced_evenly(outdoor: Comparison) -> None:
+    facts, shown = outdoor.report.facts, outdoor.shown
+    assert facts["unit"] == "evenly spaced places"
+    assert facts["spacing"]["reference_frames"] == facts["spacing"]["query_frames"] == 420
+    assert facts["frames"] == len(outdoor.stored) == len(outdoor.model.map.frame)
+    assert shown is not None
+    assert shown.place is not None
+    came = open_source("sim:outdoor?frames=420").distance
+
+    def bend(metres: torch.Tensor) -> float:
+        return float((metres - torch.linspace(0, 1, len(metres)) * metres[-1]).abs().max())
+
+    assert bend(came) > 15  # the train speeds up all the way
+    assert bend(came[shown.place]) < 2.5
+
+
+def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> None:
+    assert outdoor.truth is not None
+    assert outdoor.shown is not None
+    assert outdoor.shown.place is not None
+    reference, query = (open_source(f"sim:outdoor?frames=420&traverse={k}") for k in (0, 1))
+    right = outdoor.truth.right[:, 0]
+    known = right >= 0
+    assert known.float().mean() > 0.7
+    apart = reference.distance[outdoor.shown.place[right[known]]] - query.distance[outdoor.shown.query[known]]
+    assert apart.abs().max() < 0.8  # metres; a step is about 0.4
+
+
+def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
+    cuts = structure_cuts(open_source("sim:outdoor?frames=420"))
+    assert cuts
+    effect = outdoor.report.facts["boundaries"]
+    assert effect["queries_near"] + effect["queries_far"] > 0
+    assert outdoor.report.as_json()["known_boundaries"]["bytes"] > 0
+    assert {"velocity", "frames", "layers", "autocorrelogram"} < set(outdoor.pictures)
+
+
+def test_other_lengths_store_the_frames_of_the_places_too(outdoor: Comparison) -> None:
+    row = outdoor.report.facts["chunk_lengths"][1]
+    assert (row["window"], row["map_bytes"]) == (64, outdoor.report.facts["map_bytes"])
 
 
 class Rails(ArrayTraverse):

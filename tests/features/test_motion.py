@@ -505,6 +505,9 @@ def test_any_batch_size_any_number_of_times(blend: bool, step: float) -> None:
         batches = list(even.batches(size))
         assert max(len(batch) for batch in batches) <= size
         assert torch.equal(torch.cat(batches), frames)
+    for start, stop in ((0, 1), (3, 9), (len(frames) - 2, len(frames) + 9)):
+        assert torch.equal(torch.cat(list(even.between(start, stop))), frames[start:stop])
+    assert list(even.between(len(frames), len(frames) + 5)) == []
     assert even.name == "the drive"
 
 

@@ -183,8 +183,12 @@ class Railway(Traverse):
         """Yield the frames in order, at most `size` at a time. Shape: (B,3,H,W) float32 in [0,1]."""
         if size < 1:
             raise InputError(f"a batch holds {size} frames; expected at least 1")
-        for start in range(0, self.length, size):
-            yield self._frames(torch.arange(start, min(start + size, self.length)))
+        for part in torch.arange(self.length).split(size):
+            yield self._frames(part)
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        for part in torch.arange(self.length)[start:stop].split(64):
+            yield self._frames(part)
 
     def _frames(self, at: Tensor) -> Tensor:
         painter, sky, margin = self._painter

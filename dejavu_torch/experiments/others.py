@@ -1,0 +1,59 @@
+"""What else could be stored of a route, matched with the same queries."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
+from dejavu_torch.evaluation.controls import null_control
+from dejavu_torch.model import DejaVu
+from dejavu_torch.types import Match
+
+
+class Other(NamedTuple):
+    """Matches of another way to store the route; bytes and k as of a Contender."""
+
+    name: str
+    match: Match
+    bytes: int | None = None
+    k: int | None = None
+
+
+def others_of(
+    model: DejaVu, stored: Tensor, seen: Tensor, tolerance: int, seed: int, progress: bool
+) -> dict[str, Other]:
+    """The baselines and null controls that every report sets beside the map.
+
+    Args:
+        model: with the map. stored: (N,D) features of the reference. seen: (Q,D) those of the queries.
+        tolerance: the coarsest stride is twice as much. seed: of the shuffle of the null controls.
+        progress: show progress bars on a terminal.
+    """
+    frames, dimension = stored.shape
+    itemsize = model.map.templates.element_size()
+    strides = {
+        "uncompressed": 1,
+        "stride": fair_stride(frames, dimension, itemsize, model.map_bytes, tolerance),
+        "stride_coarsest": max(1, 2 * tolerance),
+    }
+    names = {
+        "uncompressed": f"all {frames} frames",
+        "stride": f"{_every(strides['stride'])} (at least the map's bytes)",
+        "stride_coarsest": f"{_every(strides['stride_coarsest'])} (2 x tolerance)",
+    }
+    nearest = nearest_frames(stored, seen, tuple(strides.values()), model.matcher.metric, progress)
+    others = {
+        key: Other(names[key], match, stride_bytes(frames, dimension, itemsize, k), k)
+        for (key, k), match in zip(strides.items(), nearest, strict=True)
+    }
+    null = null_control(model, stored, seen, seed, progress=progress)
+    others["null"] = Other("null: all learnt shuffled", null)
+    null = null_control(model, stored, seen, seed, same_plan=True, progress=progress)
+    others["null_same_plan"] = Other("null: this map's layers, shuffled", null)
+    return others
+
+
+def _every(k: int) -> str:
+    return "every frame" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } frame"
