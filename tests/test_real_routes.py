@@ -8,8 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from torch import Tensor
 
 from dejavu_torch.cli import main
+from dejavu_torch.data.source import open_source
+from dejavu_torch.features.ground import ground_patch
+from dejavu_torch.features.spacing import EvenlySpaced
+from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.model import DejaVu
 
 TOLD = (Path(__file__).parents[1] / "docs" / "real_routes.md").read_text()
 KEYS = ("auc", "recall_at_1", "recall_at_100_precision", "auc_reported")
@@ -35,6 +42,42 @@ def rows(text: str) -> dict[str, list[str]]:
     return table
 
 
+def layers(text: str) -> dict[int, int]:
+    """Period -> number of features, of the layers that a line names."""
+    pairs = re.findall(r"(\d+) \((\d+)(?: features)?\)", text)
+    return {int(period): int(count) for period, count in pairs}
+
+
+def numbers(text: str) -> list[float]:
+    return [float(number) for number in re.findall(r"\d*\.?\d+", text)]
+
+
+def autocorrelation(features: Tensor, lags: int) -> Tensor:
+    """Summed over features (N,D), each lag over the pairs it has, 1 at lag 0: (lags,)."""
+    centred, count = features.double() - features.double().mean(0), len(features)
+    power = torch.fft.rfft(centred, n=2 * count, dim=0).abs().square().sum(1)
+    sums: Tensor = torch.fft.irfft(power)[:lags] / torch.arange(count, count - lags, -1)
+    return sums / sums[:1]
+
+
+def top(values: Tensor, low: int, high: int) -> float:
+    """Where between the samples the highest of low..high-1 lies, by a parabola."""
+    at = low + int(values[low:high].argmax())
+    left, mid, right = (float(value) for value in values[at - 1 : at + 2])
+    return at + (left - right) / (2 * (left - 2 * mid + right))
+
+
+def lap_peak(features: Tensor, low: float, high: float) -> tuple[int, float, float, float]:
+    """Lag of one lap, found from low to high (shares of all); height; width in laps; highest elsewhere."""
+    count = len(features)
+    values = autocorrelation(features, int(0.75 * count))
+    lap = int(low * count) + int(values[int(low * count) : int(high * count)].argmax())
+    below = (values < values[lap] / 2).nonzero()[:, 0]
+    width = int(below[below > lap].min() - below[below < lap].max()) - 1
+    elsewhere = torch.cat([values[lap // 2 : int(0.85 * lap)], values[int(1.15 * lap) : int(1.5 * lap)]])
+    return lap, float(values[lap]), width / lap, float(elsewhere.max())
+
+
 def assert_told(table: dict[str, list[str]], report: dict[str, Any], entries: dict[str, str]) -> None:
     for name, key in entries.items():
         entry = report[key] if key else report
@@ -50,14 +93,87 @@ def test_the_dashes_of_the_motorway_are_found(
 ) -> None:
     clip = f"{data_dir}/highway/solidWhiteRight.mp4?width=160"
     main(["learn", clip, "--map", str(tmp_path / "map.safetensors")])
-    told, measured = (
-        {int(period): int(count) for period, count in re.findall(r"(\d+) \((\d+) features\)", text)}
-        for text in (section("A motorway"), capsys.readouterr().out)
-    )
+    told, measured = layers(section("A motorway")), layers(capsys.readouterr().out)
     assert max(measured, key=lambda period: measured[period]) == 12
     assert max((p for p in measured if p < 44 and p != 12), key=lambda period: measured[period]) == 6
     assert told.keys() == measured.keys()
     assert all(told[period] == pytest.approx(measured[period], rel=0.02) for period in told)
+
+
+ROAD = ((0.41, 0.66), (0.605, 0.66), (0.925, 0.985), (0.12, 0.985))
+
+
+def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_dir: Path) -> None:
+    clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
+    ground = VelocityNormalizer(corners=ROAD).distances(clip)
+    speed = ground.distance.diff()
+    patches = torch.cat([ground_patch(batch, ROAD) for batch in clip.batches(64)])[:, 0]
+    column = int(patches[:, :, :32].var(0).mean(0).argmax())  # the dashed line changes most
+    dashes = patches[:, :, column - 1 : column + 2].mean(2)
+    dashes = dashes - dashes.mean(0)
+    frames, still = top(autocorrelation(dashes, 40), 9, 16), top(autocorrelation(dashes.T, 95), 40, 90)
+    found = re.search(r"(5\.\d+) pixels of ground a frame.*?12.2 m", section("The same motorway"), re.S)
+    assert found is not None
+    told = numbers(found[0])
+    mean, spread, _, low, high, confidence, period, moved, stands, *_ = told
+    assert float(speed.mean()) == pytest.approx(mean, rel=0.01)
+    assert 100 * float(speed.std() / speed.mean()) == pytest.approx(spread, abs=0.5)
+    means = speed.view(-1, 20).mean(1)
+    assert [float(means.min()), float(means.max())] == pytest.approx([low, high], rel=0.01)
+    assert float(ground.confidence.min()) == pytest.approx(confidence, abs=0.03)
+    assert [frames, still] == pytest.approx([period, stands], rel=0.01)
+    assert frames * float(speed.mean()) == pytest.approx(moved, rel=0.01)
+    assert moved == pytest.approx(still, rel=0.02)
+
+
+@pytest.mark.parametrize("places", ["221 frames as they came", "220 even steps"])
+def test_even_steps_leave_the_periods_of_a_constant_speed(
+    places: str, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clip = f"{data_dir}/highway/solidWhiteRight.mp4?width=320"
+    corners = str([list(corner) for corner in ROAD]).replace(" ", "")
+    spaced = ["--velocity.corners", corners] if "even" in places else []
+    main(["learn", clip, "--map", str(tmp_path / "map.safetensors"), *spaced])
+    told, measured = layers(rows(section("The same motorway"))[places][0]), layers(capsys.readouterr().out)
+    assert measured[12] > 3500
+    assert all(measured[period] == pytest.approx(told[period], rel=0.03) for period in told)
+
+
+def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(data_dir: Path) -> None:
+    laps = open_source(f"{data_dir}/rc_car_laps/frames")
+    features = DejaVu().extract_all(open_source(f"{data_dir}/rc_car_laps/frames?width=80"))
+    told = rows(section("Laps of a small car"))
+    frames = {"frames as they came": torch.arange(len(features))}
+    for name in ("even steps, near ground", "even steps, far ground"):
+        values = numbers(told[name][0])
+        corners = tuple(zip(values[::2], values[1::2], strict=True))
+        height, width = map(int, numbers(told[name][1]))
+        frames[name] = EvenlySpaced(laps, VelocityNormalizer(corners=corners, size=(height, width))).frame
+    heights, widths = {}, {}
+    for name, frame in frames.items():
+        lap, heights[name], widths[name], elsewhere = lap_peak(features[frame], 0.2, 0.32)
+        (at, count), (level,), (wide,), (other,) = map(numbers, told[name][2:])
+        assert [lap, len(frame)] == pytest.approx([at, count], rel=0.02)
+        assert heights[name] == pytest.approx(level, abs=0.015)
+        assert 100 * widths[name] == pytest.approx(wide, abs=1.5)
+        assert elsewhere == pytest.approx(other, abs=0.01)
+    came, near, far = frames
+    assert heights[near] < heights[came] < heights[far]
+    assert widths[near] > widths[came] > widths[far]
+    shuffled = autocorrelation(features[torch.randperm(len(features))], 440)[330:]
+    assert float(shuffled.max()) < 0.02
+
+    halves = re.search(r"shorter by and by, (.*?)No recall", section("Laps of a small car"), re.S)
+    assert halves is not None
+    first, _, last, *both = numbers(halves[1])
+    for name, share in ((came, both[:2]), (far, both[2:4])):
+        for (start, stop), told_height, told_lap in zip(
+            ((0, 800), (712, 1512)), share, (first, last), strict=True
+        ):
+            inside = frames[name][(frames[name] >= start) & (frames[name] < stop)]
+            found, peak, *_ = lap_peak(features[inside], 0.4, 0.56)
+            assert peak == pytest.approx(told_height, abs=0.015)
+            assert name != came or found == pytest.approx(told_lap, abs=6)
 
 
 @pytest.mark.parametrize("channel", ["grey", "R-B"])

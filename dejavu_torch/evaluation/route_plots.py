@@ -16,11 +16,15 @@ MARKED = 12  # multiples of a period
 
 
 class Length(NamedTuple):
-    """What a map with chunks of `window` frames recognises, and what it stores."""
+    """What a map with chunks of `window` frames recognises, and what it stores.
+
+    recall_at_1_comparable: with scores that are comparable between chunks, `reduction="mean"`.
+    """
 
     window: int
     recall_at_1: float
     auc: float
+    recall_at_1_comparable: float
     map_bytes: int
     bytes_per_place: float
 
@@ -54,6 +58,7 @@ def plot_velocity(ways: Mapping[str, Tensor], step: float) -> Plot:
     figure, axes = canvas(1.6 + 1.5 * len(ways), len(ways), squeeze=False, sharey=True)
     for axis, (name, way), colour in zip(axes.flat, ways.items(), (BLUE, ORANGE), strict=False):
         axis.plot(torch.arange(1, len(way)), way.diff(), color=colour, linewidth=0.8)
+        axis.axhline(0, color=GREY, linewidth=0.6)
         axis.axhline(step, color=DARK, linewidth=0.8, linestyle=":")
         axis.set(xlim=(0, len(way)), ylabel="pixels of ground\nper frame")
         axis.set_title(name, loc="left", fontsize=9)
@@ -111,7 +116,8 @@ def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
     figure, (above, below) = canvas(5.4, 2, sharex=True)
     for (name, rows), colour in zip(datasets.items(), (BLUE, ORANGE, GREEN, RED, GREY), strict=False):
         windows = [row.window for row in rows]
-        above.plot(windows, [row.recall_at_1 for row in rows], "o-", color=colour, label=name)
+        above.plot(windows, [row.recall_at_1_comparable for row in rows], "o-", color=colour, label=name)
+        above.plot(windows, [row.recall_at_1 for row in rows], "o:", color=colour, markersize=3)
         below.plot(windows, [row.bytes_per_place for row in rows], "o-", color=colour)
     windows = sorted({row.window for rows in datasets.values() for row in rows})
     below.set_xscale("log", base=2)

@@ -14,6 +14,7 @@ from dejavu_torch.evaluation.controls import same_settings
 from dejavu_torch.evaluation.report import Contender, contend
 from dejavu_torch.experiments.compare import Comparison
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.scores import Matcher
 from dejavu_torch.types import InputError, Match, Truth
 
 
@@ -60,7 +61,7 @@ class BoundaryEffect(NamedTuple):
 
 
 def boundary_effect(
-    match: Match, truth: Truth, cuts: Sequence[int], tolerance: int, near: int = 128
+    match: Match, truth: Truth, cuts: Sequence[int], tolerance: int, near: int = 32
 ) -> BoundaryEffect:
     """Recall@1 near to the cuts and far from them.
 
@@ -84,20 +85,41 @@ def boundary_effect(
     return BoundaryEffect(near, int(inside.sum()), int(outside.sum()), recall(inside), recall(outside))
 
 
-def known_boundaries(result: Comparison, cuts: Sequence[int], tolerance: int) -> Contender:
-    """The same settings with chunks that end at the cuts, judged as the comparison's own map is.
+class Boundaries(NamedTuple):
+    """What the chunks' ends cost, told by two maps of comparable scores (`reduction="mean"`).
+
+    fixed: chunks as they were. known: chunks that end at the cuts. Each with its recall near to the cuts
+    and far from them. The printed sum of eq. 4 would hide it: of chunks of different size the one of the
+    fewest features gets nearly all queries.
+    """
+
+    fixed: Contender
+    known: Contender
+    fixed_effect: BoundaryEffect
+    known_effect: BoundaryEffect
+
+
+def known_boundaries(result: Comparison, cuts: Sequence[int], tolerance: int) -> Boundaries:
+    """The settings of a comparison, with comparable scores, on its own chunks and on those the cuts make.
 
     Raises:
         InputError: a comparison without truth, or whose periods another finder found.
     """
-    model = result.model
-    if result.truth is None or not isinstance(model.periods, SpectrogramAnalysis):
+    model, truth = result.model, result.truth
+    if truth is None or not isinstance(model.periods, SpectrogramAnalysis):
         raise InputError(
             "known boundaries need a truth and SpectrogramAnalysis; this comparison has not both"
         )
     names = ("min_period", "strongest", "peaks", "false_alarm", "similar")
-    other = same_settings(model)
-    other.periods = GivenChunks(cuts, {name: getattr(model.periods, name) for name in names})
-    other.learn_features(result.stored, result.reference)
-    name, match = "chunks cut where structures start and stop", other.localize(result.seen)
-    return contend(name, match, result.truth, tolerance, other.map_bytes)
+    given = GivenChunks(cuts, {name: getattr(model.periods, name) for name in names})
+    contenders, effects = [], []
+    for name, periods in (
+        ("the same chunks, comparable scores", model.periods),
+        ("chunks cut where structures start and stop, comparable scores", given),
+    ):
+        other = same_settings(model)
+        other.periods, other.matcher = periods, Matcher(model.matcher.metric, "mean")
+        match = other.learn_features(result.stored, result.reference).localize(result.seen)
+        contenders.append(contend(name, match, truth, tolerance, other.map_bytes))
+        effects.append(boundary_effect(match, truth, cuts, tolerance))
+    return Boundaries(contenders[0], contenders[1], effects[0], effects[1])

@@ -97,7 +97,8 @@ def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, 
     seen = torch.tensor(corners).to(grey) * scale
     right, bottom = width - 1.0, height - 1.0
     above = grey.new_tensor([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
-    matrix = get_perspective_transform(seen[None], above[None])
+    # the other way round it fails where the frame's first pixel lies on the patch's horizon
+    matrix = torch.linalg.inv(get_perspective_transform(above[None], seen[None]))
     patch: Tensor = warp_perspective(grey, matrix.expand(len(grey), 3, 3), (height, width))
     return patch
 

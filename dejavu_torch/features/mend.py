@@ -45,7 +45,11 @@ def _interruptions(bad: list[int], steps: int) -> str:
     lost = [f"{first} to {last + 1}" for first, last in runs if first < last]
     told = []
     if cuts:
-        told.append(f"{len(cuts)} cuts, after frames " if len(cuts) > 1 else "a cut after frame ")
+        told.append(
+            f"{len(cuts)} cuts or bad views, after frames "
+            if len(cuts) > 1
+            else "a cut or bad view after frame "
+        )
         told[-1] += _first_few(cuts)
     if lost:
         share = f"({len(bad) - len(cuts)} of {steps} steps)"

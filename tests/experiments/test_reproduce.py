@@ -15,6 +15,7 @@ from dejavu_torch.cli import commands, main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.boundaries import BoundaryEffect
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.reproduce import (
@@ -64,6 +65,9 @@ def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> No
     scores = judge(other.localize(aerial.seen), aerial.truth, 5)
     assert (rows[0]["auc"], rows[0]["recall_at_1"]) == (scores.auc, scores.recall_at_1)
     assert rows[0]["bytes_per_place"] == rows[0]["map_bytes"] / FRAMES
+    other.matcher.reduction = "mean"
+    again = judge(other.localize(aerial.seen), aerial.truth, 5)
+    assert rows[0]["recall_at_1_comparable"] == again.recall_at_1
 
 
 def test_section_five_sets_the_papers_numbers_beside_ours(aerial: Comparison) -> None:
@@ -157,8 +161,10 @@ def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> 
 def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
     cuts = structure_cuts(open_source("sim:outdoor?frames=420"))
     assert cuts
-    effect = outdoor.report.facts["boundaries"]
-    assert effect["queries_near"] + effect["queries_far"] > 0
+    told = outdoor.report.facts["boundaries"]
+    assert told["cuts"] <= len(cuts)
+    for name in ("comparable", "known_boundaries"):
+        assert told[name]["queries_near"] + told[name]["queries_far"] == outdoor.report.facts["with_answer"]
     assert outdoor.report.as_json()["known_boundaries"]["bytes"] > 0
     assert {"velocity", "frames", "layers", "autocorrelogram"} < set(outdoor.pictures)
 
@@ -182,8 +188,11 @@ def test_cuts_are_the_frames_at_which_a_structure_starts_or_stops() -> None:
 
 def test_the_effect_of_boundaries_is_told(aerial: Comparison) -> None:
     assert boundary_lines({"aerial": aerial.report}) == []
-    told = BoundaryEffect(128, 10, 20, 0.25, None)._asdict()
-    report = aerial.report._replace(facts={**aerial.report.facts, "boundaries": told})
+    told = {"cuts": 7, "known_boundaries": BoundaryEffect(32, 10, 20, 0.25, None)._asdict()}
+    others = {"comparable": aerial.report.contenders["null"], "known_boundaries": aerial.report.ours}
+    report = Report(aerial.report.ours, others, {**aerial.report.facts, "boundaries": told})
     (line,) = boundary_lines({"underground": report})
-    assert line.startswith("underground: recall@1 0.2500 within 128 frames")
-    assert line.endswith("(10 queries), unknown elsewhere (20)")
+    printed, shuffled = (c.scores.recall_at_1 for c in (report.ours, others["comparable"]) if c.scores)
+    assert line.startswith("underground: 7 times something that repeats starts or stops.")
+    assert f"{printed:.4f} as printed, {shuffled:.4f} with" in line
+    assert "0.2500 within 32 places of such an end (10 queries), unknown elsewhere (20)" in line

@@ -139,6 +139,17 @@ def test_a_region_of_ground_becomes_even() -> None:
         torch.testing.assert_close(patch[1:-1, 1:-1], even[1:-1, 1:-1], rtol=0, atol=0.003)
 
 
+@pytest.mark.parametrize("far", [0.4, 0.45])
+def test_the_corner_of_the_frame_may_lie_on_the_horizon(far: float) -> None:
+    """A straight line across the frame stays one, in the row where the region has it."""
+    frames = torch.zeros(1, 1, 101, 101)
+    frames[..., int(100 * (far + 0.4)) - 2 :, :] = 1
+    patch = ground_patch(frames, ((0.25, far), (0.75, far), (1, far + 0.4), (0, far + 0.4)), (48, 48))
+    assert patch.isfinite().all()
+    assert patch[..., -1, 4:-4].min() > 0.9
+    assert patch[..., :40, :].max() < 0.1
+
+
 def test_colours_become_grey() -> None:
     frames = torch.rand(2, 3, 60, 80)
     grey = (frames * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
@@ -337,19 +348,21 @@ def test_a_cut_is_told(caplog: pytest.LogCaptureFixture) -> None:
     position = travelled((6, 6, 8), (900, 900, 1), (6, 6, 8))
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
         way = VelocityNormalizer().distances(Shown(drive(position))).distance
-    assert caplog.messages == ["the drive: a cut after frame 8: the velocity there is interpolated"]
+    assert caplog.messages == [
+        "the drive: a cut or bad view after frame 8: the velocity there is interpolated"
+    ]
     torch.testing.assert_close(way.diff(), torch.full((17,), 6.0).double(), rtol=0, atol=0.1)
 
 
 @pytest.mark.parametrize(
     ("lost", "told"),
     [
-        ([10, 57, 90], "3 cuts, after frames 10, 57, 90:"),
-        ([0, 2, 4, 6, 8, 10, 12, 99], "8 cuts, after frames 0, 2, 4, 6, 8, 10 and 2 more:"),
+        ([10, 57, 90], "3 cuts or bad views, after frames 10, 57, 90:"),
+        ([0, 2, 4, 6, 8, 10, 12, 99], "8 cuts or bad views, after frames 0, 2, 4, 6, 8, 10 and 2 more:"),
         ([20, 21, 22], "no common ground in frames 20 to 23 (3 of 100 steps):"),
         (
             [5, 40, 41, 60, 98, 99],
-            "2 cuts, after frames 5, 60; no common ground in frames 40 to 42, 98 to 100 ",
+            "2 cuts or bad views, after frames 5, 60; no common ground in frames 40 to 42, 98 to 100 ",
         ),
         (
             [i for i in range(28) if i % 4 < 2],
