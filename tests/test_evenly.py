@@ -63,7 +63,7 @@ def model() -> DejaVu:
     return DejaVu(periods=everything(101), velocity=camera()).learn(footage(REFERENCE))
 
 
-def test_places_are_even_steps_and_a_stop_adds_none(model: DejaVu) -> None:
+def test_convention_11_places_are_even_steps_and_a_stop_adds_none(model: DejaVu) -> None:
     assert model.map.places == 600 // STEP + 1
     where = REFERENCE[model.map.frame.long()]
     assert (where - STEP * torch.arange(101)).abs().max() <= 4.5  # half of the fastest step
@@ -141,7 +141,7 @@ def test_a_frame_belongs_to_the_place_that_shows_the_nearest_one() -> None:
     assert places_of_frames(frames, shown()).tolist() == [[0, 0], [1, 1], [2, 2], [-1, 1]]
 
 
-def test_a_csv_says_in_its_header_what_it_counts(tmp_path: Path) -> None:
+def test_convention_11_a_csv_says_in_its_header_what_it_counts(tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
     path.write_text("query_frame,place_frame,place_frame\n3,4\n4,0\n9,11,2\n")
     found = find_truth(str(path), None, None, 3, 2, shown=shown())
@@ -228,7 +228,7 @@ def evaluate(folder: Path, truth: str, out: Path, *options: str) -> dict:
     return json.loads((out / "report.json").read_text())
 
 
-def test_matches_name_the_frames_as_well(folder: Path) -> None:
+def test_convention_11_matches_name_the_frames_as_well(folder: Path) -> None:
     rows = localize(folder, "again.csv")
     assert list(rows[0]) == ["query", "place", "score", "accepted", "query_frame", "place_frame"]
     assert [int(row["query"]) for row in rows] == list(range(101))

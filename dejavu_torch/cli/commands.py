@@ -125,6 +125,7 @@ def run_reproduce(dataset: str, out: Path, seed: int, tolerance: int, command: s
     names = list(PUBLISHED) if dataset == "all" else [dataset]
     reports: dict[str, Report] = {}
     for name in names:
+        print(f"{name}: a second traverse, the database itself, chunks of other lengths", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
         make_output_folder(out / name)
         title, plan = f"dejavu reproduce: {name}", describe(result.model.certificate)
@@ -135,7 +136,7 @@ def run_reproduce(dataset: str, out: Path, seed: int, tolerance: int, command: s
     pages = {name: f"{name}/index.html" for name in names}
     write_index(out, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
     print("\n".join([text_table(rows), *notes]))
-    print(f"right within {tolerance} frames; report: {out / 'index.html'}")
+    print(f"right within {tolerance} places; report: {out / 'index.html'}")
 
 
 def run_info(map: Path, features: Any) -> None:

@@ -145,7 +145,7 @@ def plot_spectrogram(
                 below.annotate(f"{period:.4g}", (middle, period), (10, 0), **_BESIDE)
     figure.colorbar(mesh, ax=below, label="% of its power", pad=0.01, aspect=30)
     period_axis(below, shortest, max((stop - start) / 1.5 for start, stop, _ in spectra))
-    below.set(xlim=(0, len(values)), xlabel="place (reference frame)")
+    below.set(xlim=(0, len(values)), xlabel="place")
     below.set_title("power at each period, chunk by chunk; circles: kept", loc="left", fontsize=10)
     return figure, (above, below)
 

@@ -113,13 +113,13 @@ def plot_coverage(
         wrong = judged & reported & ~right
         dots(reported & ~judged, GREY, f"{(~judged).sum()} not judged")
         dots(wrong, RED, f"{wrong.sum()} wrong")
-        dots(right, GREEN, f"{right.sum()} right (within {tolerance} frames)", 4)
+        dots(right, GREEN, f"{right.sum()} right (within {tolerance} places)", 4)
         missing &= judged
     if missing.any():
         label = f"{missing.sum()} not reported"
         axis.plot(number[missing], torch.zeros(int(missing.sum())), "|", color=DARK, label=label)
     first, last = int(number.min()), int(number.max())
-    axis.set(xlabel="query (frame)", ylabel="reported place (reference frame)")
+    axis.set(xlabel="query", ylabel="reported place")
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * places, places))
     figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
     return figure, axis
@@ -128,7 +128,7 @@ def plot_coverage(
 def plot_chunks(plan: Plan, places: int) -> Plot:
     """Chunks along the route and the periods found in each; the wider a bar, the more features."""
     figure, axis = canvas(4.2)
-    axis.set(xlim=(0, places), xlabel="place (reference frame)", ylabel="period (frames)")
+    axis.set(xlim=(0, places), xlabel="place", ylabel="period (frames)")
     if not plan:
         axis.set(yticks=[])
         axis.text(0.5, 0.5, "this route does not repeat: no layers", ha="center", transform=axis.transAxes)
@@ -207,5 +207,5 @@ def plot_activations(
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
     figure.supylabel(f"difference of query {query} (lower is better)", fontsize=10)
-    rows[-1].set(xlabel="place (reference frame)", xlim=(start, stop))
+    rows[-1].set(xlabel="place", xlim=(start, stop))
     return figure, rows

@@ -35,7 +35,8 @@ def plot_frames(first: Tensor, second: Tensor, numbers: Sequence[int]) -> Plot:
     Shape: first, second (K,C,H,W) in [0,1]; numbers: K places.
     """
     height, width = first.shape[-2:]
-    columns = max(1, min(len(numbers), round(2 + 2 * height / width)))  # wide frames need room
+    most = max(1, min(len(numbers), round(2 + 2 * height / width)))  # wide frames need room
+    columns = next(n for n in range(most, 0, -1) if len(numbers) % n == 0)
     rows = -(-len(numbers) // columns)
     side = WIDTH / columns * height / width
     figure, axes = canvas(2 * rows * (side + 0.28), 2 * rows, columns, squeeze=False)
@@ -105,7 +106,7 @@ def plot_layers(layers: Sequence[FrequencyLayer]) -> Plot:
         phases.numpy(), aspect="auto", extent=extent, cmap="twilight", vmin=0, vmax=1, interpolation="nearest"
     )
     axis.set_yticks(range(len(shown)), [f"{float(layer.period):.4g}" for layer in shown])
-    axis.set(xlabel="place (reference frame)", ylabel="period (frames)")
+    axis.set(xlabel="place", ylabel="period (frames)")
     axis.set_title(f"phase in {len(shown)} of {len(layers)} layers", loc="left", fontsize=10)
     figure.colorbar(image, ax=axis, label="phase / period", pad=0.01, aspect=20)
     return figure, axis

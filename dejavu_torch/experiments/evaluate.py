@@ -98,7 +98,7 @@ def evaluate(
     seen = 1 + max(int(table.max()) for table in (match.index, known.right))
     pictures = {
         "pr": Picture(
-            plot_curves({matches.name: curve}, f"right within {tolerance} {unit_of(shown)}"),
+            plot_curves({matches.name: curve}, f"right within {tolerance} places"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises.",

@@ -71,7 +71,7 @@ def draw_pictures(
         }
     if curves:
         pictures["pr"] = Picture(
-            plot_curves(curves, f"right within {tolerance} frames"),
+            plot_curves(curves, f"right within {tolerance} places"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises. The higher and the further to the right, the better.",
@@ -210,7 +210,7 @@ def draw_activations(
     strip = slit_scan(reference, start, stop)
     covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
     told = (
-        f" Right: within {tolerance} frames, for a layer in phase. Elsewhere: queries from other chunks, the "
+        f" Right: within {tolerance} places, for a layer in phase. Elsewhere: queries from other chunks, the "
         "layer's phase counted on; near chance where its period ends with the chunk. All layers fused choose "
         "from the whole route."
     )
