@@ -22,10 +22,12 @@ from dejavu_torch.experiments import bench
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.evaluate import evaluate
 from dejavu_torch.experiments.reproduce import (
+    FOOTAGE,
     PUBLISHED,
     boundary_lines,
     lengths_picture,
     reproduce,
+    route_lines,
     section_five,
 )
 from dejavu_torch.features.spacing import frames_of
@@ -132,7 +134,7 @@ def run_reproduce(dataset: str, out: Path, seed: int, tolerance: int, command: s
         write_report(out / name, result.report, result.pictures, title, command, plan)
         write_matches(out / name / "matches.csv", [result.match], result.shown)
         reports[name] = result.report
-    rows, notes = section_five(reports), boundary_lines(reports)
+    rows, notes = section_five(reports), [*route_lines(reports), *boundary_lines(reports), FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
     write_index(out, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
     print("\n".join([text_table(rows), *notes]))

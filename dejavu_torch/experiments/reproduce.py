@@ -47,6 +47,10 @@ PUBLISHED = {
     "outdoor": Published(0.4143, 0.9785, 0.991),
     "underground": Published(0.0032, None, 0.6998),
 }
+FOOTAGE = (
+    "The paper's footage cannot be had: these routes are simulated after its description, so its numbers "
+    "stand beside ours, not against them."
+)
 PATCH = (32, 32)  # pixels: as many rows as the region of ground has in a frame, and some more
 
 
@@ -181,6 +185,21 @@ def structure_cuts(reference: Traverse) -> list[int]:
     return sorted(
         set(torch.searchsorted(distance.double(), torch.tensor(inside, dtype=torch.float64)).tolist())
     )
+
+
+def route_lines(reports: Mapping[str, Report]) -> list[str]:
+    """What each map holds and how long it took, a line a dataset."""
+    lines = []
+    for dataset, report in reports.items():
+        facts = report.facts
+        periods = facts["periods"]
+        told = f"{len(periods)} periods from {periods[0]:g} to {periods[-1]:g}" if periods else "no periods"
+        lines.append(
+            f"{dataset}: {facts['frames']} places, {facts['queries']} queries; {told} in "
+            f"{len(facts['chunks'])} chunks, {facts['templates']} templates, {facts['map_bytes']} bytes; "
+            f"learning took {facts['seconds_learn']:.0f} s, localizing {facts['seconds_localize']:.0f} s"
+        )
+    return lines
 
 
 def boundary_lines(reports: Mapping[str, Report]) -> list[str]:

@@ -24,6 +24,7 @@ from dejavu_torch.experiments.reproduce import (
     boundary_lines,
     paper_model,
     reproduce,
+    route_lines,
     section_five,
     structure_cuts,
 )
@@ -94,6 +95,14 @@ def test_every_picture_of_the_paper_is_there(aerial: Comparison) -> None:
     assert {"spectrogram", "templates", "features", "activations"} < set(aerial.pictures)
 
 
+def test_each_dataset_tells_what_its_map_holds(aerial: Comparison) -> None:
+    facts = aerial.report.facts
+    (line,) = route_lines({"aerial": aerial.report})
+    assert f"{len(facts['periods'])} periods from {facts['periods'][0]} to {facts['periods'][-1]}" in line
+    nothing = aerial.report._replace(facts={**facts, "periods": [], "chunks": []})
+    assert "no periods in 0 chunks" in route_lines({"aerial": nothing})[0]
+
+
 def test_a_number_the_paper_does_not_tell_is_left_empty(aerial: Comparison) -> None:
     report = aerial.report._replace(
         facts={**aerial.report.facts, "published": Published(0.0032, None, 0.6998)._asdict()}
@@ -118,6 +127,7 @@ def test_the_command_writes_an_index_over_the_reports(
     assert (tmp_path / "out" / links[0]).exists()
     assert "<pre>dejavu reproduce aerial --out" in page
     assert "0.9813" in page
+    assert f"aerial: {FRAMES} places, {FRAMES} queries; " in page
     report = json.loads((tmp_path / "out" / "aerial" / "report.json").read_text())
     assert {"ideal", "ideal_leave_out", "chunk_lengths", "published", "auc", "null"} <= set(report)
 
