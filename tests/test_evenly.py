@@ -274,6 +274,13 @@ def test_compare_of_a_single_query_frame() -> None:
     assert result.report.as_json()["recall_at_1"] == 1.0
 
 
+def test_learn_and_localize_tell_the_steps(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    localize(folder, "told.csv")
+    assert f"{len(QUERY)} frames make 101 even steps of 6 pixels of ground" in capsys.readouterr().out
+    main(["learn", f"{folder}/reference.npy", "--map", f"{folder}/told.safetensors", *OPTIONS])
+    assert f"{len(REFERENCE)} frames make 101 even steps of 6 pixels" in capsys.readouterr().out
+
+
 def test_info_tells_how_the_ground_was_measured(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["info", f"{folder}/m.safetensors"])
     told = capsys.readouterr().out

@@ -30,12 +30,12 @@ from dejavu_torch.experiments.reproduce import (
     route_lines,
     section_five,
 )
-from dejavu_torch.features.spacing import frames_of
+from dejavu_torch.features.spacing import EvenlySpaced, frames_of
 from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 
 def run_demo(out: Path, seed: int, model: DejaVu, command: str) -> None:
@@ -51,7 +51,9 @@ def run_demo(out: Path, seed: int, model: DejaVu, command: str) -> None:
 def run_learn(source: str, map: Path, model: DejaVu) -> None:
     """Learn a map and print its plan."""
     check_output_file(map)
-    model.learn(open_source(source), progress=True)
+    traverse = model.evenly(open_source(source), progress=True)
+    _tell_spacing(traverse)
+    model.learn(traverse, progress=True)
     model.save(map)
     _print_plan(model)
 
@@ -79,6 +81,7 @@ def run_localize(
     traverse, shown = open_source(source), None
     if model.step is not None:
         traverse = model.evenly(traverse, model.step, progress=True)
+        _tell_spacing(traverse)
         shown = Shown(frames_of(traverse), model.map.frame.long())
     queries, accepted = write_matches(out, model.matches(traverse, progress=True), shown)
     print(f"{queries} queries, {accepted} accepted; written to {out}")
@@ -171,6 +174,12 @@ def _make_report_folder(out: Path, *sources: str | None) -> None:
     if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
         raise InputError(f"{out} holds the images; expected another folder for the report")
     make_output_folder(out)
+
+
+def _tell_spacing(traverse: Traverse) -> None:
+    if isinstance(traverse, EvenlySpaced):
+        frames, steps = len(traverse.way), f"even steps of {traverse.step:.4g} pixels of ground"
+        print(f"{frames} frames make {traverse.length} {steps}")
 
 
 def _print_plan(model: DejaVu) -> None:
