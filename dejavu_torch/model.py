@@ -141,11 +141,11 @@ class DejaVu(nn.Module):
         plan = self.periods.plan(features)
         with torch.no_grad():
             templates = self.templates(features, plan)
-        self.step, frame = None, None
+        self.step, way = None, None
         if isinstance(traverse, EvenlySpaced):
-            self.step, frame = traverse.step, traverse.frame
+            self.step, way = traverse.step, traverse.way
         places, dimension = features.shape
-        self.map = CompressedMap(plan, templates, places, dimension, frame).to(features.device)
+        self.map = CompressedMap(plan, templates, places, dimension, way).to(features.device)
         self.learnt_from = shape or None
         return self
 
@@ -237,8 +237,8 @@ class DejaVu(nn.Module):
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
             spaced = model.velocity is not None and isinstance(model.step, float) and model.step > 0
-            if (len(model.map.frame) > 0) != spaced or (model.step is not None) != spaced:
-                raise InputError(f"it has step {model.step!r} and {len(model.map.frame)} frames of places")
+            if (len(model.map.way) > 0) != spaced or (model.step is not None) != spaced:
+                raise InputError(f"it has step {model.step!r} and a way of {len(model.map.way)} frames")
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         except (AttributeError, KeyError, RuntimeError, TypeError) as error:

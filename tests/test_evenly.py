@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 import torch
 from helpers import Fixed, refused
+from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dejavu_torch import DejaVu, FrequencyLayer, VelocityNormalizer
+from dejavu_torch import DejaVu, FrequencyLayer, ImageFolder, VelocityNormalizer
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truth import Shown, places_of_frames
-from dejavu_torch.data.truthfile import find_truth
+from dejavu_torch.data.truth import Shown, as_truth, places_of_frames, truth_of_places
+from dejavu_torch.data.truthfile import describe_truth, find_truth
+from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.features.spacing import EvenlySpaced
 
@@ -131,14 +133,41 @@ def test_ready_features_cannot_be_spaced() -> None:
 # truth ---------------------------------------------------------------------------------------------------
 
 
-def shown() -> Shown:
-    """Two queries show frames 3 and 9; three places show frames 0, 4 and 10."""
-    return Shown(torch.tensor([3, 9]), torch.tensor([0, 4, 10]))
+def shown(queries: int | None = 11) -> Shown:
+    """Two queries show frames 3 and 9 of 11; three places show frames 0, 4 and 9 of 12."""
+    place_of = torch.tensor([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 2])
+    return Shown(torch.tensor([3, 9]), torch.tensor([0, 4, 9]), place_of, queries)
 
 
-def test_a_frame_belongs_to_the_place_that_shows_the_nearest_one() -> None:
-    frames = torch.tensor([[0, 2], [3, 7], [8, 99], [-1, 4]])
-    assert places_of_frames(frames, shown()).tolist() == [[0, 0], [1, 1], [2, 2], [-1, 1]]
+def test_a_frame_belongs_to_the_place_nearest_to_it() -> None:
+    frames = torch.tensor([[0, 2], [3, 7], [8, 11], [-1, 4]])
+    assert places_of_frames(frames, shown()).tolist() == [[0, 0], [1, 2], [2, 2], [-1, 1]]
+    with refused("frame 12 of the reference", "from 0 to 11"):
+        places_of_frames(torch.tensor([12]), shown())
+
+
+def test_all_places_that_show_the_right_frame_are_right() -> None:
+    """16 pixels a frame at a pixel a step: each frame is shown at 16 places."""
+    even = EvenlySpaced(ArrayTraverse(footage(positions((16, 12)))), camera(step=1.0))
+    where = Shown(None, even.frame, even.place_of)
+    right = truth_of_places(as_truth(torch.tensor([[5], [0]])), where).right
+    for row, frame in zip(right, (5, 0), strict=True):
+        assert row[row >= 0].tolist() == (even.frame == frame).nonzero()[:, 0].tolist()
+    assert 14 <= int((right[0] >= 0).sum()) <= 18
+
+
+def test_the_way_back_belongs_to_the_places_it_passes() -> None:
+    where = positions((6, 50), (-6, 15), (6, 40))
+    even = EvenlySpaced(ArrayTraverse(footage(where)), camera())
+    assert (even.place_of - where / STEP).abs().max() <= 1
+    away = EvenlySpaced(ArrayTraverse(footage(200 + positions((-6, 3), (6, 30)))), camera())
+    assert away.place_of[:5].tolist() == [0, -1, -1, -1, -1]  # behind where it began
+
+
+def test_the_map_knows_the_frames_as_the_traverse_does(model: DejaVu) -> None:
+    even = EvenlySpaced(ArrayTraverse(footage(REFERENCE)), camera())
+    assert torch.equal(model.map.frame, even.frame)
+    assert torch.equal(model.map.place_of, even.place_of)
 
 
 def test_convention_11_a_csv_says_in_its_header_what_it_counts(tmp_path: Path) -> None:
@@ -147,6 +176,7 @@ def test_convention_11_a_csv_says_in_its_header_what_it_counts(tmp_path: Path) -
     found = find_truth(str(path), None, None, 3, 2, shown=shown())
     assert found is not None
     assert found.right.tolist() == [[1, -1], [2, 0]]
+    assert describe_truth(str(path), spaced=True).endswith("which counts frames")
     path.write_text("query,place\n0,2\n1,1\n")
     found = find_truth(str(path), None, None, 3, 2, shown=shown())
     assert found is not None
@@ -158,12 +188,34 @@ def test_convention_11_a_csv_says_in_its_header_what_it_counts(tmp_path: Path) -
     assert found.right.tolist() == [[2], [1]]
 
 
+def test_a_frame_that_no_query_shows_tells_of_the_nearest_one_that_does(tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    path.write_text("query_frame,place_frame\n1,0\n10,4\n")
+    found = find_truth(str(path), None, None, 3, 2, shown=shown())
+    assert found is not None
+    assert found.right.tolist() == [[0], [1]]
+    assert found.known.all()
+
+
+def test_frames_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    path.write_text("query_frame,place_frame\n3,99999\n")
+    with refused("frame 99999 of the reference", "from 0 to 11"):
+        find_truth(str(path), None, None, 3, 2, shown=shown())
+    path.write_text("query_frame,place_frame\n11,1\n")
+    with refused("lists query frame 11", "from 0 to 10"):
+        find_truth(str(path), None, None, 3, 2, shown=shown())
+    path.write_text("query,place\n1,8\n")
+    with refused("place 8", "query_frame,place_frame"):
+        find_truth(str(path), None, None, 3, 2, shown=shown())
+
+
 def test_a_csv_of_frames_is_interpolated_between_frames(tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
-    path.write_text("query_frame,place_frame\n0,0\n12,12\n")
+    path.write_text("query_frame,place_frame\n0,0\n10,11\n")
     found = find_truth(str(path), None, None, 3, 2, interpolate=True, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[1], [2]]  # frames 3 and 9
+    assert found.right.tolist() == [[1], [2]]  # frames 3 and 10 of the reference
 
 
 @pytest.mark.parametrize("head", ["query_frame,place", "query,place_frame", "query_frame,place_frame,place"])
@@ -175,12 +227,14 @@ def test_a_csv_that_mixes_frames_and_places_is_refused(tmp_path: Path, head: str
 
 
 def test_matrices_as_large_as_the_traverses_are_of_frames(tmp_path: Path) -> None:
-    hard = np.zeros((12, 11), bool)
-    hard[11, 3] = hard[0, 9] = hard[5, 0] = True
-    np.savez(tmp_path / "frames.npz", GThard=hard)
-    found = find_truth(str(tmp_path / "frames.npz"), None, None, 3, 2, shown=shown())
-    assert found is not None
-    assert found.right.tolist() == [[2], [0]]
+    hard, soft = np.zeros((12, 11), bool), np.zeros((12, 11), bool)
+    hard[11, 3] = hard[0, 9] = hard[5, 0] = soft[4, 3] = True
+    np.savez(tmp_path / "frames.npz", GThard=hard, GTsoft=soft)
+    for count in (11, None):
+        found = find_truth(str(tmp_path / "frames.npz"), None, None, 3, 2, shown=shown(count))
+        assert found is not None
+        assert found.right.tolist() == [[2], [0]]
+        assert found.soft.tolist() == [[1], [-1]]
     np.savez(tmp_path / "places.npz", GThard=np.eye(3, 2, dtype=bool))
     found = find_truth(str(tmp_path / "places.npz"), None, None, 3, 2, shown=shown())
     assert found is not None
@@ -188,6 +242,27 @@ def test_matrices_as_large_as_the_traverses_are_of_frames(tmp_path: Path) -> Non
     np.savez(tmp_path / "neither.npz", GThard=np.eye(5, 6, dtype=bool))
     with refused("(5, 6)", "(3, 2)"):
         find_truth(str(tmp_path / "neither.npz"), None, None, 3, 2, shown=shown())
+
+
+def test_coordinates_are_of_frames(tmp_path: Path) -> None:
+    for name, count, first in (("reference", 12, 0), ("query", 11, 1)):
+        (tmp_path / name).mkdir()
+        for i in range(count):
+            Image.new("L", (8, 8)).save(tmp_path / name / f"@{10 * (first + i)}@0@{i:03}@.png")
+    folders = [ImageFolder(tmp_path / name) for name in ("reference", "query")]
+    found = find_truth("utm:1", *folders, 3, 2, shown=shown())
+    assert found is not None
+    assert found.right.tolist() == [[1], [2]]  # frames 4 and 10 of the reference
+
+
+def test_as_many_even_steps_are_no_truth() -> None:
+    pair = ArrayTraverse(torch.rand(12, 3)), ArrayTraverse(torch.rand(11, 3))
+    assert find_truth(None, *pair, 2, 2, shown=shown()) is None
+
+
+def test_queries_as_they_came_have_no_offset_to_even_steps() -> None:
+    with refused("queries are frames as they came", "query_frame,place_frame"):
+        find_truth("0", None, None, 3, 2, shown=shown()._replace(query=None))
 
 
 def test_positions_are_of_frames() -> None:
@@ -289,9 +364,9 @@ def test_info_tells_how_the_ground_was_measured(folder: Path, capsys: pytest.Cap
 
 
 def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
-    # half the rows: half the pixels of ground a frame, and so half as many steps
-    rows = localize(folder, "half.csv", *CORNERS[:2], "--velocity.size", f"[{SIDE // 2 + 8},{SIDE}]")
-    assert len(rows) == pytest.approx(101 * (SIDE // 2 + 8) / SIDE, abs=2)
+    # half of the ground fills the patch: it seems to move twice as fast
+    rows = localize(folder, "half.csv", "--corners", "[[0,0.5],[1,0.5],[1,1],[0,1]]")
+    assert len(rows) == pytest.approx(2 * 101, rel=0.05)
     rows = localize(folder, "as_is.csv", "--as_is")
     assert [int(row["query_frame"]) for row in rows] == list(range(len(QUERY)))
 
@@ -314,6 +389,8 @@ def fails(*command: object) -> None:
         (["--velocity.size", "[8,8]"], "(8, 8)"),
         (["--velocity.step", "-1"], "step is -1"),
         (["--velocity.step", "4000", *CORNERS], "expected at least one step, 4000"),
+        (["--velocity.step", "1e-9", *CORNERS], "at most 100 a frame"),
+        (["--velocity.step", "1e-300", *CORNERS], "at most 100 a frame"),
         (["--velocity", "true"], "--velocity"),
     ],
 )
@@ -348,17 +425,77 @@ def test_a_map_that_was_not_matched_is_refused(
     judge = ["evaluate", folder / "matches.csv", "--truth", "0", "--out", tmp_path / "e", "--map"]
     fails(*judge, tmp_path / "plain.safetensors")
     told = capsys.readouterr().err
-    assert "matches.csv has query_frame" in told
+    assert "matches.csv has place_frame" in told
     assert "are frames; expected the map that was matched" in told
     (tmp_path / "short.csv").write_text("query,place,score\n0,5,0.1\n")
     fails("evaluate", tmp_path / "short.csv", *judge[2:], folder / "m.safetensors")
-    assert "short.csv has no query_frame" in capsys.readouterr().err
-    fails(
-        "localize",
-        tmp_path / "plain.safetensors",
-        folder / "query.npy",
-        "--out",
-        tmp_path / "m.csv",
-        *CORNERS,
+    assert "short.csv has no place_frame" in capsys.readouterr().err
+    other = [*CORNERS, "--velocity.step", "5.5", "--periods.false_alarm", "null"]
+    main(["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/other.safetensors", *other])
+    fails(*judge, tmp_path / "other.safetensors")
+    assert (
+        "tell other frames of the same places; expected the map that was matched" in capsys.readouterr().err
     )
-    assert "learnt without --velocity; expected a map of evenly spaced places" in capsys.readouterr().err
+
+
+def test_corners_of_another_camera_need_ground(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/plain.safetensors"])
+    rest = [folder / "query.npy", "--out", tmp_path / "m.csv", "--corners", "[[0,0],[1,0],[1,1],[0,1]]"]
+    fails("localize", tmp_path / "plain.safetensors", *rest)
+    assert "learnt without --velocity" in capsys.readouterr().err
+    fails("localize", folder / "m.safetensors", *rest, "--as_is")
+    assert "--as_is measures no ground" in capsys.readouterr().err
+    fails("localize", folder / "m.safetensors", *rest[:-1], "[[0,0],[1,0],[1,2],[0,1]]")
+    assert "lie outside the frame" in capsys.readouterr().err
+    assert not (tmp_path / "m.csv").exists()
+
+
+def test_queries_that_stand_are_told_of_as_is(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "still.npy", np.load(folder / "query.npy")[[7] * 9])
+    fails("localize", folder / "m.safetensors", tmp_path / "still.npy", "--out", tmp_path / "m.csv")
+    assert "stands still in all of its 9 frames; expected motion to space evenly, or --as_is" in (
+        capsys.readouterr().err
+    )
+
+
+def test_a_source_of_unknown_length_is_taken_as_it_is(folder: Path, tmp_path: Path) -> None:
+    model = DejaVu.load(folder / "m.safetensors")
+    model.velocity = None
+    queries = ArrayTraverse(footage(QUERY)[:20])
+    queries.length = None
+    count, _ = write_matches(tmp_path / "m.csv", model.matches(queries), Shown(None, model.map.frame))
+    rows = list(csv.DictReader((tmp_path / "m.csv").open()))
+    assert [int(row["query_frame"]) for row in rows] == list(range(20)) == list(range(count))
+
+
+def test_a_bare_velocity_is_understood(folder: Path, tmp_path: Path) -> None:
+    command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors", "--velocity"]
+    main([*command, *OPTIONS])
+    assert DejaVu.load(tmp_path / "m.safetensors").step == STEP
+
+
+def test_ground_that_moves_to_and_fro_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    where = 100 + positions(*[(4, 2), (-4, 1)] * 10)
+    with caplog.at_level("WARNING", "dejavu_torch"):
+        EvenlySpaced(ArrayTraverse(footage(where)), camera())
+    assert any("20 of 30 steps go forward and 10 backwards" in line for line in caplog.messages)
+
+
+def test_a_step_may_be_a_whole_number(tmp_path: Path) -> None:
+    model = DejaVu(periods=everything(101), velocity=camera(step=6)).learn(footage(REFERENCE))
+    model.save(tmp_path / "m.safetensors")
+    assert DejaVu.load(tmp_path / "m.safetensors").step == 6
+
+
+def test_nan_is_told_by_the_frame_as_it_came() -> None:
+    frames = footage(REFERENCE)
+    velocity = camera()
+    even = EvenlySpaced(ArrayTraverse(frames), velocity)
+    frames[30, :, :3, :3] = torch.nan
+    even.traverse = ArrayTraverse(frames)
+    with refused("frame 30 gives NaN"):
+        DejaVu(velocity=velocity).learn(even)

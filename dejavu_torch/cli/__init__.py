@@ -30,7 +30,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `dejavu` command."""
     logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    given = _spelt_out(list(sys.argv[1:] if arguments is None else arguments))
     if arguments is None:  # so that temporary files are removed
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     parser = build_parser()
@@ -59,6 +59,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("dejavu: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _spelt_out(given: list[str]) -> list[str]:
+    """The command line with a bare --velocity given the one value it can have."""
+    following = [*given[1:], "--"]
+    return [
+        "--velocity=VelocityNormalizer" if word == "--velocity" and after.startswith("--") else word
+        for word, after in zip(given, following, strict=True)
+    ]
 
 
 def _config_first(given: list[str]) -> list[str]:

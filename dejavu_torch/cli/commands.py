@@ -21,17 +21,17 @@ from dejavu_torch.evaluation.report import (
 from dejavu_torch.experiments import bench
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.evaluate import evaluate
-from dejavu_torch.experiments.reproduce import (
+from dejavu_torch.experiments.reproduce import reproduce
+from dejavu_torch.experiments.section_five import (
     FOOTAGE,
     PUBLISHED,
     boundary_lines,
     lengths_picture,
-    reproduce,
     route_lines,
     section_five,
 )
-from dejavu_torch.features.spacing import EvenlySpaced, frames_of
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.features.ground import check_corners
+from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
@@ -64,15 +64,19 @@ def run_localize(
     out: Path,
     threshold: float | None,
     features: Any,
-    velocity: VelocityNormalizer | None,
+    corners: list[list[float]] | None,
     as_is: bool,
 ) -> None:
     """Find the frames of a source on a map; one csv row each."""
     check_output_file(out)
     model = DejaVu.load(map, features)
-    if velocity is not None and model.step is None:
-        raise InputError(f"{map} was learnt without --velocity; expected a map of evenly spaced places")
-    model.velocity = None if as_is else model.velocity if velocity is None else velocity
+    if corners is not None:
+        if as_is or model.velocity is None or model.step is None:
+            why = "--as_is measures no ground" if as_is else f"{map} was learnt without --velocity"
+            raise InputError(f"--corners {corners}: {why}; expected one that does")
+        check_corners(corners)
+        model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
+    model.velocity = None if as_is else model.velocity
     model.threshold = model.threshold if threshold is None else threshold
     if model.threshold is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
@@ -82,7 +86,8 @@ def run_localize(
     if model.step is not None:
         traverse = model.evenly(traverse, model.step, progress=True)
         _tell_spacing(traverse)
-        shown = Shown(frames_of(traverse), model.map.frame.long())
+        frame = traverse.frame if isinstance(traverse, EvenlySpaced) else None
+        shown = Shown(frame, model.map.frame)
     queries, accepted = write_matches(out, model.matches(traverse, progress=True), shown)
     print(f"{queries} queries, {accepted} accepted; written to {out}")
 
@@ -191,7 +196,7 @@ def _print_plan(model: DejaVu) -> None:
 def _publish(result: Comparison, out: Path, title: str, command: str, save_map: bool = False) -> None:
     _print_plan(result.model)
     if result.report.ours.scores is None:
-        print("the traverses differ in length and no --truth was given: matches and pictures, no scores")
+        print("nothing tells which places are right, see --truth: matches and pictures, no scores")
     write_matches(out / "matches.csv", [result.match], result.shown)
     if save_map:
         result.model.save(out / "map.safetensors")

@@ -11,8 +11,7 @@ import torch
 
 from dejavu_torch import __version__
 from dejavu_torch.experiments.bench import BENCHES
-from dejavu_torch.experiments.reproduce import PUBLISHED
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.experiments.section_five import PUBLISHED
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
 
@@ -125,14 +124,17 @@ def build_parser() -> Parser:
     localize.add_argument("map", type=Path, help="map file")
     localize.add_argument("source", help=SOURCE)
     localize.add_argument(
-        "--out", type=Path, required=True, help="csv of query,place,score,accepted to write"
+        "--out",
+        type=Path,
+        required=True,
+        help="csv of query,place,score,accepted and more",
     )
     localize.add_argument("--threshold", type=float | None, help="accept a match whose score is below")
 
     localize.add_argument(
-        "--velocity",
-        type=VelocityNormalizer | None,
-        help="how to measure the ground where the camera is not the map's; the step stays the map's",
+        "--corners",
+        type=list[list[float]] | None,
+        help="where this camera sees the ground that the map's saw in its --velocity.corners",
     )
     localize.add_argument(
         "--as_is",
@@ -164,7 +166,7 @@ def build_parser() -> Parser:
         sub.add_argument(
             "--truth", type=str if sub is evaluate_ else str | None, required=sub is evaluate_, help=TRUTH
         )
-        sub.add_argument("--tolerance", type=int, default=5, help="right within this many frames, inclusive")
+        sub.add_argument("--tolerance", type=int, default=5, help="right within this many places, inclusive")
         sub.add_argument(
             "--interpolate", action="store_true", help="fill in a csv that lists some queries only"
         )
@@ -176,7 +178,7 @@ def build_parser() -> Parser:
     reproduce.add_argument("--out", type=Path, required=True, help="folder for the reports")
     reproduce.add_argument("--seed", type=int, default=0, help="which routes")
     reproduce.add_argument(
-        "--tolerance", type=int, default=5, help="right within this many frames, inclusive"
+        "--tolerance", type=int, default=5, help="right within this many places, inclusive"
     )
 
     bench = command("bench", "time this package beside what a user would pick instead")

@@ -13,14 +13,18 @@ PAIRS_AT_ONCE = 2**20
 
 
 class Shown(NamedTuple):
-    """The frames that evenly spaced queries and places show.
+    """The frames that evenly spaced places, and queries, show.
 
-    query: (Q,) int64, the frame of the query's traverse that each query shows.
+    query: (Q,) int64, the frame of the query's traverse that each query shows; None where queries are frames.
     place: (N,) int64, never falling, the reference frame that each place shows; None where unknown.
+    place_of: (F,) int64, the place nearest to each reference frame, -1 for none; None where unknown.
+    frames: how many frames the query's traverse has, None where unknown.
     """
 
-    query: Tensor
-    place: Tensor | None
+    query: Tensor | None
+    place: Tensor | None = None
+    place_of: Tensor | None = None
+    frames: int | None = None
 
 
 def unit_of(shown: Shown | None) -> str:
@@ -141,28 +145,49 @@ def counted(index: Tensor, truth: Truth, tolerance: int) -> Tensor:
 
 
 def places_of_frames(frames: Tensor, shown: Shown) -> Tensor:
-    """The evenly spaced place that shows each reference frame, or the frame nearest to it; -1 stays -1.
+    """The evenly spaced place nearest to each reference frame; -1, no frame, stays -1.
 
     Shape: int64 of any shape, as are the places.
 
     Raises:
-        InputError: the frames of the places are not known.
+        InputError: the frames of the places are not known, or a frame that the reference has not.
 
     Example:
-        >>> shown = Shown(torch.tensor([0]), torch.tensor([0, 2, 9]))
-        >>> places_of_frames(torch.tensor([3, 8, -1]), shown).tolist()
-        [1, 2, -1]
+        >>> shown = Shown(None, place=torch.tensor([0, 2, 3]), place_of=torch.tensor([0, 0, 1, 2]))
+        >>> places_of_frames(torch.tensor([3, 1, -1]), shown).tolist()
+        [2, 0, -1]
     """
-    if shown.place is None:
+    if shown.place_of is None:
         raise InputError(
             "the truth counts frames and the matches count evenly spaced places; expected the map (--map), "
             "which tells the frame of each place"
         )
-    between = (shown.place[1:] + shown.place[:-1]).double() / 2
-    return torch.where(frames >= 0, torch.searchsorted(between, frames.double().contiguous()), -1)
+    if frames.numel() and int(frames.max()) >= len(shown.place_of):
+        raise InputError(
+            f"the truth names frame {int(frames.max())} of the reference; expected frames from 0 to "
+            f"{len(shown.place_of) - 1}"
+        )
+    return torch.where(frames >= 0, shown.place_of[frames], -1)
 
 
 def truth_of_places(truth: Truth, shown: Shown) -> Truth:
-    """A truth whose places are reference frames as one of evenly spaced places."""
-    right, soft = (places_of_frames(table, shown) for table in (truth.right, truth.soft))
-    return Truth(right, truth.known, soft)
+    """A truth whose places are reference frames as one of evenly spaced places.
+
+    Convention: where several places show the same frame, all of them are right.
+
+    Raises:
+        InputError: see `places_of_frames`.
+    """
+
+    shows = torch.zeros(0) if shown.place is None else shown.place
+
+    def among_places(table: Tensor) -> Tensor:
+        nearest = places_of_frames(table, shown)
+        row, column = (nearest >= 0).nonzero().T
+        frame = shows[nearest[row, column]]
+        start, stop = (torch.searchsorted(shows, frame, right=right) for right in (False, True))
+        count = stop - start
+        within = torch.arange(int(count.sum())) - (count.cumsum(0) - count).repeat_interleave(count)
+        return padded(row.repeat_interleave(count), start.repeat_interleave(count) + within, len(table))
+
+    return Truth(among_places(truth.right), truth.known, among_places(truth.soft))

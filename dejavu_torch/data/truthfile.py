@@ -15,7 +15,14 @@ from dejavu_torch.data.truth import (
     position_truth,
     truth_of_places,
 )
-from dejavu_torch.data.truthformats import LARGEST, as_number, read_matrices, read_table, utm_coordinates
+from dejavu_torch.data.truthformats import (
+    LARGEST,
+    as_number,
+    counts_frames,
+    read_matrices,
+    read_table,
+    utm_coordinates,
+)
 from dejavu_torch.types import InputError, Traverse, Truth
 
 EXPECTED = (
@@ -73,8 +80,9 @@ def find_truth(
         if reference.place is not None and query.place is not None:
             frames = _numbers(queries, len(query.place), shown)
             return _spaced(as_truth(position_truth(reference.place, query.place[frames])), shown)
-        several = query.length if shown is None else len(shown.query)
-        count = queries if isinstance(queries, int) else several
+        if shown is not None:  # as many steps may be chance
+            return None
+        count = queries if isinstance(queries, int) else query.length
         return as_truth(offset_truth(queries, places)) if count == places is not None else None
     check_truth_text(truth, interpolate)
     radius = _radius(truth)
@@ -91,11 +99,14 @@ def _spaced(truth: Truth, shown: Shown | None) -> Truth:
     return truth if shown is None else truth_of_places(truth, shown)
 
 
-def describe_truth(truth: str | None, interpolate: bool = False, positions: bool = False) -> str:
+def describe_truth(
+    truth: str | None, interpolate: bool = False, positions: bool = False, spaced: bool = False
+) -> str:
     """What `find_truth` takes for the truth, in words.
 
     Args:
         positions: whether both traverses carry their positions.
+        spaced: whether places are evenly spaced, so that a .csv may count those or frames.
 
     Example:
         >>> describe_truth("12"), describe_truth(None)
@@ -109,7 +120,10 @@ def describe_truth(truth: str | None, interpolate: bool = False, positions: bool
         return "place = query" + (f" {'-' if offset < 0 else '+'} {abs(offset)}" if offset else "")
     if radius is not None:
         return f"within {radius:g} m by the coordinates in image names"
-    return f"{truth}, interpolated" if interpolate else truth
+    told = truth
+    if spaced and _kind(truth) == ".csv":
+        told += ", which counts frames" if counts_frames(Path(truth)) else ", which counts even steps"
+    return f"{told}, interpolated" if interpolate else told
 
 
 def read_truth(
@@ -157,6 +171,11 @@ def read_truth(
         return _answered(read_table(Path(truth), places, numbers, interpolate, shown), f"in {truth}")
     if _kind(truth) == ".npz":
         return _answered(read_matrices(Path(truth), places, queries, shown), f"in {truth}")
+    if shown is not None and shown.query is None and len(numbers) > 1:
+        raise InputError(
+            f"truth {truth}: queries are frames as they came, places even steps; expected a truth by frames, "
+            "such as a csv of query_frame,place_frame"
+        )
     last = "" if places is None else f" to {places - 1 - int(numbers.min())}"
     return _answered(
         as_truth(offset_truth(numbers, places, int(truth))),
@@ -173,7 +192,8 @@ def _answered(truth: Truth, told: str) -> Truth:
 def _numbers(queries: int | Tensor, count: int, shown: Shown | None = None) -> Tensor:
     """The frame of each query, all below the number of query frames."""
     numbers = torch.arange(queries) if isinstance(queries, int) else queries
-    numbers = numbers if shown is None else shown.query
+    if shown is not None and shown.query is not None:
+        numbers = shown.query
     if int(numbers.max()) >= count:
         raise InputError(f"there is a query {int(numbers.max())}; expected numbers below {count}")
     return numbers

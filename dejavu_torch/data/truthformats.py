@@ -67,13 +67,39 @@ def read_table(
         shown: the frames of evenly spaced queries and places.
     """
     rows, of_frames = _table_rows(path)
-    if shown is not None and of_frames:
-        return truth_of_places(_table(path, rows, None, shown.query, interpolate), shown)
-    return _table(path, rows, places, numbers, interpolate)
+    if shown is None or not of_frames:
+        hint = "" if shown is None else " (frames stand under the header query_frame,place_frame)"
+        return _table(path, _listed(path, rows, places, interpolate, hint), numbers, interpolate)
+    frames = numbers if shown.query is None else shown.query
+    listed = _listed(path, rows, None, interpolate)
+    if shown.frames is not None and max(listed) >= shown.frames:
+        raise InputError(
+            f"{path} lists query frame {max(listed)}; expected frames from 0 to {shown.frames - 1}"
+        )
+    if not interpolate:
+        listed = _at_shown(listed, frames)
+    return truth_of_places(_table(path, listed, frames, interpolate), shown)
 
 
-def _table(path: Path, rows: Rows, places: int | None, numbers: Tensor, interpolate: bool) -> Truth:
-    listed = _listed(path, rows, places, interpolate)
+def counts_frames(path: Path) -> bool:
+    """Whether a csv says in its header that it counts frames."""
+    return _table_rows(path)[1]
+
+
+def _at_shown(listed: dict[int, list[float]], frames: Tensor) -> dict[int, list[float]]:
+    """Listed query frames that no query shows as the one nearest to them that is shown and not listed."""
+    ordered = frames.sort().values
+    moved = dict(listed)
+    for frame in listed:
+        after = int(torch.searchsorted(ordered, frame))
+        near = ordered[max(0, after - 1) : after + 1].tolist()
+        nearest = min(near, key=lambda other: abs(other - frame))
+        if nearest not in listed:
+            moved[nearest] = [*moved.get(nearest, []), *listed[frame]]
+    return moved
+
+
+def _table(path: Path, listed: dict[int, list[float]], numbers: Tensor, interpolate: bool) -> Truth:
     queries, first, last = numbers.tolist(), min(listed), max(listed)
     if interpolate:
         knots = sorted(listed)
@@ -92,7 +118,9 @@ def _table(path: Path, rows: Rows, places: int | None, numbers: Tensor, interpol
     return Truth(right, known, right.new_zeros(len(right), 0))
 
 
-def _listed(path: Path, rows: Rows, places: int | None, interpolate: bool) -> dict[int, list[float]]:
+def _listed(
+    path: Path, rows: Rows, places: int | None, interpolate: bool, hint: str = ""
+) -> dict[int, list[float]]:
     """The places of each query that a csv lists."""
     listed: dict[int, list[float]] = {}
     for line, cells in rows:
@@ -112,7 +140,7 @@ def _listed(path: Path, rows: Rows, places: int | None, interpolate: bool) -> di
             if place < 0 or (places is not None and _rounded(place) >= places):
                 last = "" if places is None else f" to {places - 1}"
                 raise InputError(
-                    f"{where}: place {place:.12g}; expected a place from 0{last}, or -1 for none"
+                    f"{where}: place {place:.12g}; expected a place from 0{last}, or -1 for none{hint}"
                 )
             if place % 1 and not interpolate:
                 raise InputError(f"{where}: place {place:.12g}; expected a whole number, or interpolation")
@@ -154,22 +182,20 @@ def _table_rows(path: Path) -> tuple[Rows, bool]:
 def read_matrices(path: Path, places: int | None, queries: int | Tensor, shown: Shown | None = None) -> Truth:
     """An npz of the matrices (places, queries) GThard and/or GTsoft; see `read_truth`."""
     matrices = _load_matrices(path)
-    if shown is not None and _of_frames(matrices, places, queries, shown):
-        return truth_of_places(_matrices(path, matrices, None, shown.query), shown)
+    if shown is not None and _of_frames(matrices, shown):
+        numbers = queries if shown.query is None else shown.query
+        rows = next(iter(matrices.values())).shape[0]
+        return truth_of_places(_matrices(path, matrices, rows, numbers), shown)
     return _matrices(path, matrices, places, queries)
 
 
-def _of_frames(
-    matrices: Mapping[str, np.ndarray], places: int | None, queries: int | Tensor, shown: Shown
-) -> bool:
-    """Whether matrices are as large as traverses in frames, and not as evenly spaced ones."""
-    shape = next(iter(matrices.values())).shape
-    if len(shape) != 2:
+def _of_frames(matrices: Mapping[str, np.ndarray], shown: Shown) -> bool:
+    """Whether matrices are as large as the traverses are in frames."""
+    rows, *columns = next(iter(matrices.values())).shape
+    if shown.place_of is None or len(columns) != 1 or rows != len(shown.place_of):
         return False
-    rows, columns = shape
-    count = queries if isinstance(queries, int) else int(queries.max()) + 1
-    fits = rows > (0 if shown.place is None else int(shown.place[-1])) and columns > int(shown.query.max())
-    return fits and (rows, columns) != (places, count)
+    last = -1 if shown.query is None else int(shown.query.max())
+    return bool(columns[0] > last if shown.frames is None else columns[0] == shown.frames)
 
 
 def _matrices(

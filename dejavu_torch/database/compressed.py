@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.features.spacing import nearest_places, shown_frames
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 
@@ -22,8 +23,8 @@ class CompressedMap(nn.Module):
         feature_ptr: (L+1,) int64, where each layer's features begin in `feature_index`.
         feature_index: (sum F,) int32.
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
-        frame: (N,) int32, the reference frame that each place shows where places are evenly spaced; (0,)
-            where place i is frame i.
+        way: (frames of the reference,) float32, how many steps of evenly spaced places each is from the first
+            place; (0,) where place i is frame i.
 
     Args:
         plan: the layers.
@@ -31,7 +32,7 @@ class CompressedMap(nn.Module):
             gradients.
         places: N, frames of the reference traverse.
         dimension: D, features per frame.
-        frame: see above; None where place i is frame i.
+        way: see above; None where place i is frame i.
 
     Convention: places are 0..N-1. `load_state_dict` takes the shapes of what it loads, so an empty
         `CompressedMap()` can receive any map.
@@ -42,7 +43,7 @@ class CompressedMap(nn.Module):
     feature_ptr: Tensor
     feature_index: Tensor
     templates: Tensor
-    frame: Tensor
+    way: Tensor
 
     def __init__(
         self,
@@ -50,7 +51,7 @@ class CompressedMap(nn.Module):
         templates: Sequence[Tensor] = (),
         places: int = 0,
         dimension: int = 0,
-        frame: Tensor | None = None,
+        way: Tensor | None = None,
     ) -> None:
         super().__init__()
         for layer, block in zip(plan, templates, strict=True):
@@ -69,8 +70,7 @@ class CompressedMap(nn.Module):
         self.register_buffer("feature_ptr", torch.tensor(pointer, device=device))
         self.register_buffer("feature_index", torch.tensor(index, dtype=torch.int32, device=device))
         self.register_buffer("templates", flat)
-        shown = torch.zeros(0, dtype=torch.int32) if frame is None else frame.to(torch.int32)
-        self.register_buffer("frame", shown.to(device))
+        self.register_buffer("way", torch.zeros(0, device=device) if way is None else way.float().to(device))
         self._plan: Plan | None = None
         self.check()
 
@@ -83,6 +83,16 @@ class CompressedMap(nn.Module):
     def dimension(self) -> int:
         """D, the number of features per frame."""
         return int(self.size[1])
+
+    @property
+    def frame(self) -> Tensor:
+        """The reference frame that each evenly spaced place shows, (N,) int64; (0,) where it is its own."""
+        return shown_frames(self.way.cpu()) if len(self.way) else torch.zeros(0, dtype=torch.int64)
+
+    @property
+    def place_of(self) -> Tensor:
+        """The evenly spaced place nearest to each reference frame, int64, -1 behind the first; or (0,)."""
+        return nearest_places(self.way.cpu()) if len(self.way) else torch.zeros(0, dtype=torch.int64)
 
     @property
     def plan(self) -> Plan:
@@ -118,7 +128,6 @@ class CompressedMap(nn.Module):
 
     def _disagreement(self) -> str:
         shapes = {"size": "(2,)", "layers": "(L,5)", "feature_ptr": "(L+1,)", "feature_index": "(F,)"}
-        shapes |= {"frame": "(N,)"}
         for name, shape in shapes.items():
             buffer = getattr(self, name)
             whole = not (buffer.is_floating_point() or buffer.is_complex() or buffer.dtype == torch.bool)
@@ -131,10 +140,10 @@ class CompressedMap(nn.Module):
             return f"feature_ptr does not rise from 0 over {len(self.layers)} layers"
         if pointer[-1] != len(self.feature_index):
             return f"{len(self.feature_index)} feature indices; expected {pointer[-1]}"
-        if len(self.frame) not in (0, self.places):
-            return f"frame {tuple(self.frame.shape)}; expected ({self.places},), or (0,)"
-        if len(self.frame) and bool((self.frame.diff(prepend=self.frame.new_zeros(1)) < 0).any()):
-            return "frames of places that are negative or fall"
+        if self.way.ndim != 1 or not self.way.is_floating_point() or not self.way.isfinite().all():
+            return f"way {tuple(self.way.shape)} {self.way.dtype}; expected finite floats of one dimension"
+        if len(self.way) and len(self.frame) != self.places:
+            return f"a way of {len(self.frame)} steps; expected {self.places}"
         if bool((self.layers[:, 1] < 1).any()):
             return "a period with a denominator below 1"
         for layer in self.plan:  # each layer checks itself as it is built

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
@@ -19,7 +20,7 @@ from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import InputError
 
-FORMAT = 1
+FORMAT = 2  # 1 knew no even steps
 PACKAGE = "dejavu_torch"
 PARTS: dict[str, type[nn.Module]] = {  # what a header holds recipes of
     "preprocess": Preprocess,
@@ -162,7 +163,11 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                     f"a newer {PACKAGE} is needed"
                 )
             header = json.loads(metadata["config"])
-            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if int(metadata["version"]) == 1:
+                header |= {"velocity": None, "step": None}
+                tensors["map.way"] = torch.zeros(0)
+            return tensors, header
     except InputError:
         raise
     except (SafetensorError, OSError, KeyError, ValueError) as error:

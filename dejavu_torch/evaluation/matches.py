@@ -24,13 +24,15 @@ _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 class Matches(NamedTuple):
     """Matches read from a file, in its order.
 
-    query: (Q,) int64, the number of each query. match: Match of (Q,). query_frame: (Q,) int64, the frame
-    that each evenly spaced query shows; None where queries are frames.
+    query: (Q,) int64, the number of each query. match: Match of (Q,). query_frame, place_frame: (Q,) int64,
+    the frames that evenly spaced queries and their reported places show, -1 for no place; None where the
+    file has no such column.
     """
 
     query: Tensor
     match: Match
     query_frame: Tensor | None
+    place_frame: Tensor | None
 
 
 def write_matches(path: Path, matches: Iterable[Match], shown: Shown | None = None) -> tuple[int, int]:
@@ -41,15 +43,17 @@ def write_matches(path: Path, matches: Iterable[Match], shown: Shown | None = No
             -1 where no place is reported.
     """
     total = accepted = 0
-    frames = None if shown is None or shown.place is None else (shown.query.tolist(), shown.place.tolist())
+    places = None if shown is None or shown.place is None else shown.place.tolist()
+    queries = None if shown is None or shown.query is None else shown.query.tolist()
     with whole_file(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["query", "place", "score", "accepted", *(FRAMES if frames else ())])
+        writer.writerow(["query", "place", "score", "accepted", *(FRAMES if places else ())])
         for match in matches:
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
             rows = zip(match.index.tolist(), match.score.tolist(), match.accepted.tolist(), strict=True)
             for place, score, good in rows:
-                also = (frames[0][total], frames[1][place] if place >= 0 else -1) if frames else ()
+                also = [queries[total] if queries else total] if places else []
+                also += [places[place] if place >= 0 else -1] if places else []
                 writer.writerow([total, place, f"{score:.{digits}g}", int(good), *also])
                 total += 1
                 accepted += good
@@ -62,8 +66,8 @@ def read_matches(path: Path) -> Matches:
     Args:
         path: a csv with a header. query: number of the query frame, each once, in any order. place: the
             reported place, -1 for none. score: lower is better, inf for none. accepted: 1 or 0; where the
-            column is missing, every match with a finite score is accepted. query_frame: the frame that an
-            evenly spaced query shows. Other columns are ignored.
+            column is missing, every match with a finite score is accepted. query_frame, place_frame: the
+            frames that an evenly spaced query and place show, -1 for no place. Other columns are ignored.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
         accepted.
@@ -72,7 +76,7 @@ def read_matches(path: Path) -> Matches:
         InputError: what cannot be read, with the number of the line.
     """
     rows: dict[int, tuple[int, float, bool]] = {}
-    frames: list[int] = []
+    frames: dict[str, list[int]] = {name: [] for name in FRAMES}
     for where, cells in _rows(path):
         query, place = (
             _whole(cells[name], name, least, where) for name, least in (("query", 0), ("place", -1))
@@ -83,15 +87,17 @@ def read_matches(path: Path) -> Matches:
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:
             raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
-        if FRAMES[0] in cells:
-            frames.append(_whole(cells[FRAMES[0]], FRAMES[0], 0, where))
+        for name, least in zip(FRAMES, (0, -1), strict=True):
+            if name in cells:
+                frames[name].append(_whole(cells[name], name, least, where))
         nothing = place < 0 or math.isinf(score)
         rows[query] = (-1, math.inf, False) if nothing else (place, score, accepted)
     if not rows:
         raise InputError(f"{path} holds no matches; expected a line for each query")
     index, scores, accepted_ = zip(*rows.values(), strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
-    return Matches(torch.tensor(list(rows)), match, torch.tensor(frames) if frames else None)
+    of_query, of_place = (torch.tensor(frames[name]) if frames[name] else None for name in FRAMES)
+    return Matches(torch.tensor(list(rows)), match, of_query, of_place)
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

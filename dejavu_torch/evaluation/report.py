@@ -163,9 +163,12 @@ def summary(report: Report) -> str:
     scored = right if report.ours.scores else "no truth was given, so nothing is scored"
     told = [f"{facts['queries']} queries{places}; {scored}"]
     if "spacing" in facts:
+        step, reference, query = (
+            facts["spacing"][key] for key in ("step", "reference_frames", "query_frames")
+        )
+        both = f" and {query} of the query were" if query else " were"
         told.append(
-            "{reference_frames} frames of the reference and {query_frames} of the query were brought to even "
-            "steps of {step:.4g} pixels of ground".format(**facts["spacing"])
+            f"{reference} frames of the reference{both} brought to even steps of {step:.4g} pixels of ground"
         )
     if facts.get("unknown"):
         told.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")

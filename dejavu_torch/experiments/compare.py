@@ -28,7 +28,7 @@ from dejavu_torch.evaluation.route_plots import plot_velocity
 from dejavu_torch.experiments.others import Other, others_of
 from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
-from dejavu_torch.features.spacing import EvenlySpaced, frames_of
+from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.l1 import l1_backend
@@ -97,7 +97,8 @@ def compare(
     if isinstance(reference, EvenlySpaced):
         with clock("localize"):
             query = model.evenly(query, reference.step, progress)
-        shown = Shown(frames_of(query), reference.frame)
+        frame = query.frame if isinstance(query, EvenlySpaced) else None
+        shown = Shown(frame, reference.frame, reference.place_of, came[1].length)
     early = reference.length is not None and query.length is not None
     if early:  # a truth that does not fit is told before the long work
         known = find_truth(truth, *came, reference.length, query.length or 0, interpolate, shown)
@@ -164,12 +165,12 @@ def compare(
         facts["spacing"] = {
             "step": reference.step,
             "reference_frames": len(reference.way),
-            "query_frames": len(query.way) if isinstance(query, EvenlySpaced) else len(seen),
+            "query_frames": len(query.way) if isinstance(query, EvenlySpaced) else None,
         }
     if known is not None:
         positions = reference.place is not None and query.place is not None
         facts |= tally(match, known, tolerance)
-        facts["truth"] = describe_truth(truth, interpolate, positions)
+        facts["truth"] = describe_truth(truth, interpolate, positions, spaced=shown is not None)
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
     ours = _judged("this map", match, known, tolerance, size)
     pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, others)
@@ -209,7 +210,7 @@ def _judged(
 
 def _velocity(reference: EvenlySpaced, query: Traverse) -> Picture:
     pair = [("reference", reference), ("query", query)]
-    ways = {f"{role}: {one.name}": one.way for role, one in pair if isinstance(one, EvenlySpaced)}
+    ways = {f"{role}: {one.name}": one.way * one.step for role, one in pair if isinstance(one, EvenlySpaced)}
     return Picture(
         plot_velocity(ways, reference.step),
         "how fast the ground moves",

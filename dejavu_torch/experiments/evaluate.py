@@ -12,6 +12,7 @@ from torch import Tensor
 import dejavu_torch
 from dejavu_torch.data.truth import Shown, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
+from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import read_compressed
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
@@ -63,20 +64,19 @@ def evaluate(
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
     if truth is not None:
         check_truth_text(truth, interpolate)
-    queries, match, query_frame = read_matches(matches)
+    queries, match, query_frame, place_frame = read_matches(matches)
     places = None if reference is None or query_frame is not None else reference.length
-    place_frame = None
+    shown = None if query_frame is None else Shown(query_frame)
     if map is not None:
         stored = read_compressed(map)
-        places, place_frame = stored.places, stored.frame.long() if len(stored.frame) else None
-        if (place_frame is None) != (query_frame is None):
-            raise InputError(
-                f"{matches} has {'no ' if query_frame is None else ''}query_frame, the places of {map} are "
-                f"{'frames' if place_frame is None else 'evenly spaced'}; expected the map that was matched"
-            )
+        places = stored.places
+        _check_map(stored, map, matches, match, place_frame)
+        if query_frame is not None:
+            as_came = torch.equal(query_frame, queries)  # --as_is
+            frames = None if query is None else query.length
+            shown = Shown(None if as_came else query_frame, stored.frame, stored.place_of, frames)
     if places is not None and int(match.index.max()) >= places:
         raise InputError(f"{matches} reports place {int(match.index.max())}; expected one below {places}")
-    shown = None if query_frame is None else Shown(query_frame, place_frame)
     known = find_truth(truth, reference, query, places, queries, interpolate, shown)
     if known is None:
         raise InputError("there is no truth; expected one, or two traverses that carry their positions")
@@ -89,7 +89,7 @@ def evaluate(
         "recall_definition": RECALL_DEFINITION,
         "matches": str(matches),
         "places": places,
-        "truth": describe_truth(truth, interpolate, positions=True),
+        "truth": describe_truth(truth, interpolate, positions=True, spaced=shown is not None),
         "threshold_of_full_precision": threshold_of_full_precision(curve),
         "version": dejavu_torch.__version__,
         "torch": torch.__version__,
@@ -110,3 +110,19 @@ def evaluate(
         ),
     }
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
+
+
+def _check_map(
+    stored: CompressedMap, map: Path, matches: Path, match: Match, place_frame: Tensor | None
+) -> None:
+    """Refuse a map that is not the one that was matched."""
+    expected = "expected the map that was matched"
+    if len(stored.frame) and place_frame is None:
+        raise InputError(f"{matches} has no place_frame, the places of {map} are evenly spaced; {expected}")
+    if place_frame is not None and not len(stored.frame):
+        raise InputError(f"{matches} has place_frame, the places of {map} are frames; {expected}")
+    if place_frame is None:
+        return
+    told = (match.index >= 0) & (match.index < stored.places)
+    if not torch.equal(stored.frame[match.index[told]], place_frame[told]):
+        raise InputError(f"{matches} and {map} tell other frames of the same places; {expected}")

@@ -53,6 +53,7 @@ def feature_batches(
             bad = ~features.isfinite().all(1)
             if bad.any():
                 first = done + int(bad.nonzero()[0])
+                first = int(getattr(traverse, "frame", range(first + 1))[first])  # as the camera gave it
                 raise InputError(
                     f"{traverse.name}: frame {first} gives NaN or infinite features; expected finite numbers"
                 )

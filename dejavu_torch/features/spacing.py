@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 
 import torch
@@ -9,6 +10,12 @@ from torch import Tensor
 
 from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.types import InputError, Traverse
+
+log = logging.getLogger("dejavu_torch")
+
+NEAR = 1e-4  # steps: what is so near to a place has reached it
+MOST = 100  # steps a frame
+DOUBTFUL = 0.2  # steps backwards for each one forward
 
 
 class EvenlySpaced(Traverse):
@@ -23,16 +30,17 @@ class EvenlySpaced(Traverse):
         step: pixels of ground, in place of the normalizer's; as for the query of a map.
         progress: show a progress bar on a terminal.
 
-    Shape: frames (M,C,H,W). frame: (M,) int64, the nearest frame of the inner traverse. distance: (M,)
-        float64, pixels of ground. place: (M,) float64, the inner traverse's place of what is shown
-        (interpolated where frames are blended), None where it has none. way: (N,) float64, pixels of
-        ground at each frame of the inner traverse.
+    Shape: frames (M,C,H,W). frame: (M,) int64, the nearest frame of the inner traverse. way: (N,) float64,
+        how many steps each frame of the inner traverse is from the first. place_of: (N,) int64, the place
+        nearest to each, -1 behind the first. place: (M,) float64, the inner traverse's place of what is shown
+        (interpolated where frames are blended), None where it has none. step: pixels of ground.
 
     Convention: distances count from frame 0, in the direction in which the camera gets further from it. Each
         distance is taken where it is first reached: standing, and going back and forth, add no frames.
 
     Raises:
-        InputError: as `VelocityNormalizer.distances`, and footage that does not move, or less than a step.
+        InputError: as `VelocityNormalizer.distances`, and footage that does not move, or less than a step, or
+            over 100 steps a frame.
     """
 
     length: int
@@ -49,28 +57,24 @@ class EvenlySpaced(Traverse):
         way = normalizer.distances(traverse, batch_size, progress).distance
         if -way.min() > way.max():  # a camera that looks back
             way = -way
-        moved = way.diff().abs()
+        moved = way.diff()
         if not moved.any():
-            raise InputError(
-                f"{self.name} stands still in all of its {len(way)} frames; expected motion to space evenly"
-            )
+            wanted = "motion to space evenly" + ("" if step is None else ", or --as_is")
+            raise InputError(f"{self.name} stands still in all of its {len(way)} frames; expected {wanted}")
         step = normalizer.step if step is None else step
-        if step is None:
-            step = float(moved[moved > 0].median())
-        furthest = way.cummax(0).values
-        count = int(furthest[-1] / step + 1e-9) + 1
-        if count < 2:
+        self.step = float(moved.abs()[moved != 0].median()) if step is None else float(step)
+        _tell_doubtful(moved, self.name)
+        self.way = (way / self.step).float().double()  # as a map keeps it
+        most = float(self.way.max())
+        if not 1 <= most + NEAR < MOST * len(way):
             raise InputError(
-                f"{self.name} moves by {float(furthest[-1]):.3g} pixels of ground; "
-                f"expected at least one step, {step:g}"
+                f"{self.name} moves by {float(way.max()):.3g} pixels of ground in {len(way)} frames; "
+                f"expected at least one step, {self.step:g}, and at most {MOST} a frame"
             )
-        self.length, self.step, self.way = count, step, way
-        self.distance = torch.arange(count, dtype=torch.float64) * step
-        high = torch.searchsorted(furthest, self.distance).clamp(max=len(way) - 1)
-        low = (high - 1).clamp(min=0)
-        # also after a reversal the frame before the first to reach a distance lies short of it
-        share = ((self.distance - way[low]) / (way[high] - way[low]).clamp(min=1e-12)).clamp(0, 1)
+        low, high, share = first_reached(self.way)
+        self.length = len(low)
         self.frame = torch.where(share < 0.5, low, high)
+        self.place_of = nearest_places(self.way)
         self._low, self._high, self._share = low, high, share
         if not normalizer.blend:
             self._low, self._high, self._share = self.frame, self.frame, torch.zeros_like(share)
@@ -105,6 +109,39 @@ class EvenlySpaced(Traverse):
                 return
 
 
-def frames_of(traverse: Traverse) -> Tensor:
-    """The frame, as the camera gave them, that each frame of a traverse shows: (M,) int64."""
-    return traverse.frame if isinstance(traverse, EvenlySpaced) else torch.arange(traverse.length or 0)
+def first_reached(way: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where each whole number of steps is first reached: between two frames, and at what share of the way.
+
+    Args:
+        way: (N,) float64, steps from the first place of each frame.
+
+    Shape: -> low, high (M,) int64 frames, share (M,) in [0, 1]; M places.
+    """
+    furthest = way.cummax(0).values + NEAR
+    goal = torch.arange(int(furthest[-1]) + 1, dtype=torch.float64)
+    high = torch.searchsorted(furthest, goal).clamp(max=len(way) - 1)
+    low = (high - 1).clamp(min=0)
+    # also after a reversal the frame before the first to reach a distance lies short of it
+    return low, high, ((goal - way[low]) / (way[high] - way[low]).clamp(min=1e-12)).clamp(0, 1)
+
+
+def shown_frames(way: Tensor) -> Tensor:
+    """The frame nearest to each place, where it is first reached: (N,) steps -> (M,) int64."""
+    low, high, share = first_reached(way.double())
+    return torch.where(share < 0.5, low, high)
+
+
+def nearest_places(way: Tensor) -> Tensor:
+    """The place nearest to each frame, -1 behind the first: (N,) steps -> (N,) int64."""
+    last = int(float(way.max()) + NEAR)
+    return way.double().round().long().clamp(-1, last)
+
+
+def _tell_doubtful(moved: Tensor, name: str) -> None:
+    """Tell of footage in which hardly any step goes forward, as where the corners show no ground."""
+    forward, back = int((moved > 0).sum()), int((moved < 0).sum())
+    if back > DOUBTFUL * forward:
+        log.warning(
+            "%s: %d of %d steps go forward and %d backwards: do the corners show ground that comes nearer?",
+            *(name, forward, len(moved), back),
+        )

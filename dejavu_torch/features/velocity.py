@@ -101,7 +101,8 @@ class VelocityNormalizer(nn.Module):
             check_method(flow)
         self.corners = tuple((float(x), float(y)) for x, y in corners)
         self.size = (int(size[0]), int(size[1]))
-        self.step, self.least, self.still, self.blend, self.flow = step, least, still, blend, flow
+        self.step = None if step is None else float(step)
+        self.least, self.still, self.blend, self.flow = least, still, blend, flow
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         patches = ground_patch(frames, self.corners, self.size)
@@ -166,7 +167,7 @@ class VelocityNormalizer(nn.Module):
         seen, (rows, columns) = length_seen(self.corners, *batch.shape[2:]), self.size
         if rows <= 2 * seen:
             return
-        fits = f"size=({int(2 * seen)}, {columns})" if seen >= 16 else "larger frames, or a larger region,"
+        fits = f"size ({int(2 * seen)}, {columns})" if seen >= 16 else "larger frames, or a larger region,"
         log.warning(
             "%s: the patch has %d rows, its region only %.0f in frames of %d x %d pixels: slow motion is "
             "underestimated, %s would do",

@@ -39,7 +39,7 @@ def test_buffers_are_flat_rows(route: CompressedMap) -> None:
         "feature_ptr": (4,),
         "feature_index": (6,),
         "templates": (numbers,),
-        "frame": (0,),
+        "way": (0,),
     }
     assert route.size.tolist() == [300, 4]
     assert route.layers.tolist() == [[195, 2, 98, 0, 200], [7, 1, 7, 100, 250], [115, 1, 23, 100, 250]]
@@ -174,9 +174,9 @@ def changed(tensor: Tensor, row: int, column: int, value: int) -> Tensor:
         ("layers", lambda t: t.flatten(), r"layers .*\(15,\)"),
         ("layers", lambda t: t[:, :4], r"layers .*\(3, 4\)"),
         ("layers", lambda t: t[:2], r"feature_ptr does not rise from 0 over 2 layers"),
-        ("frame", lambda t: torch.arange(299), r"frame \(299,\); expected \(300,\), or \(0,\)"),
-        ("frame", lambda t: torch.arange(300).flip(0), r"frames of places that are negative or fall"),
-        ("frame", lambda t: torch.arange(300) - 1, r"frames of places that are negative or fall"),
+        ("way", lambda t: torch.arange(299.0), r"a way of 299 steps; expected 300"),
+        ("way", lambda t: torch.full((300,), torch.nan), r"way \(300,\) torch.float32; expected finite"),
+        ("way", lambda t: torch.arange(300), r"way \(300,\) torch.int64; expected finite"),
         ("layers", lambda t: changed(t, 0, 0, -195), r"period -195/2"),
         ("layers", lambda t: changed(t, 0, 1, 0), r"denominator"),
         ("layers", lambda t: changed(t, 0, 2, 0), r"0 phases"),
@@ -203,7 +203,7 @@ def test_buffers_that_do_not_fit_together_are_refused(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["size", "layers", "feature_ptr", "feature_index", "frame"])
+@pytest.mark.parametrize("name", ["size", "layers", "feature_ptr", "feature_index"])
 def test_indices_that_are_no_whole_numbers_are_refused(route: CompressedMap, name: str) -> None:
     state = route.state_dict()
     state[name] = state[name].float()

@@ -19,7 +19,9 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.mapfile import read_compressed, recipe_of
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer
@@ -211,7 +213,7 @@ def test_the_claimed_size_holds_with_any_features(path: Path, features: nn.Modul
 
 def test_metadata_names_format_version_plan_and_config(saved: Path) -> None:
     tensors, metadata = contents(saved)
-    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", 1)
+    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", 2)
     plan = json.loads(metadata["plan"])
     assert tensors[plan["tensor"]].tolist() == [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
     assert plan["columns"] == ["period_numerator", "period_denominator", "phases", "start", "stop"]
@@ -306,8 +308,35 @@ def test_a_missing_file_and_a_folder_are_refused(path: Path) -> None:
 
 
 def test_a_newer_format_is_refused(saved: Path) -> None:
-    craft(saved, metadata={"version": "2"})
-    with refused(str(saved), "format 2", "up to 1", "newer"):
+    craft(saved, metadata={"version": "3"})
+    with refused(str(saved), "format 3", "up to 2", "newer"):
+        DejaVu.load(saved)
+
+
+def test_a_map_of_the_first_format_is_read(saved: Path) -> None:
+    """It knew nothing of even steps."""
+    known = DejaVu.load(saved)
+    tensors, metadata = contents(saved)
+    config = json.loads(metadata["config"])
+    del tensors["map.way"], config["velocity"], config["step"]
+    safetensors.torch.save_file(tensors, saved, metadata | {"version": "1", "config": json.dumps(config)})
+    again = DejaVu.load(saved)
+    for one, other in zip(again.localize(waves()), known.localize(waves()), strict=True):
+        assert torch.equal(one, other)
+    assert read_compressed(saved).places == known.map.places
+
+
+@pytest.mark.parametrize(
+    ("tensors", "config"),
+    [({"map.way": torch.arange(64.0)}, {}), ({}, {"step": 2.0}), ({}, {"velocity": "ground", "step": 2.0})],
+)
+def test_a_map_that_is_half_evenly_spaced_is_refused(
+    saved: Path, tensors: dict[str, Tensor], config: dict[str, Any]
+) -> None:
+    if "velocity" in config:
+        config = config | {"velocity": recipe_of(VelocityNormalizer())._asdict()}
+    craft(saved, tensors, **config)
+    with refused(str(saved), "step", "frames"):
         DejaVu.load(saved)
 
 

@@ -37,7 +37,7 @@ def written(folder: Path, text: str | bytes) -> Path:
 
 def told(path: Path) -> list[tuple[int, int, float, bool]]:
     """The rows that were read, by query."""
-    queries, match, _ = read_matches(path)
+    queries, match, *_ = read_matches(path)
     assert [queries.dtype, match.index.dtype, match.score.dtype] == [torch.int64, torch.int64, torch.float64]
     assert match.accepted.dtype == torch.bool
     columns = (queries, *match)
@@ -55,7 +55,7 @@ def test_what_is_written_in_parts_is_read(
     parts = zip(*(column.split(size) for column in match), strict=True)
     path = scratch / "m.csv"
     assert write_matches(path, (Match(*part) for part in parts)) == (len(rows), int(match.accepted.sum()))
-    queries, read, _ = read_matches(path)
+    queries, read, *_ = read_matches(path)
     assert queries.tolist() == list(range(len(rows)))
     assert torch.equal(read.index, match.index)
     assert torch.equal(read.accepted, match.accepted)

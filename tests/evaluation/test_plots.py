@@ -69,7 +69,7 @@ def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
     figure, axis = plot_coverage(matched(0, 9, -1, 4), torch.arange(4)[:, None], tolerance=1, places=10)
     assert dots(axis) == {
         "1 wrong": [(1, 9)],
-        "2 right (within 1 frames)": [(0, 0), (3, 4)],
+        "2 right (within 1 places)": [(0, 0), (3, 4)],
         "1 not reported": [(2, 0)],
     }
     render(figure)
@@ -84,7 +84,7 @@ def test_coverage_leaves_grey_what_is_not_judged() -> None:
     assert dots(axis) == {
         "3 not judged": [(20, 1), (30, 7)],
         "1 wrong": [(50, 9)],
-        "1 right (within 0 frames)": [(10, 0)],
+        "1 right (within 0 places)": [(10, 0)],
     }
     assert axis.get_xlim() == (10, 50)
     assert "3 not judged" in told(figure)

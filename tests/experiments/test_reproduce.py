@@ -14,19 +14,18 @@ from helpers import refused
 from dejavu_torch.cli import commands, main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.truth import places_of_frames
 from dejavu_torch.evaluation.curves import judge
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.boundaries import BoundaryEffect
 from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.reproduce import (
+from dejavu_torch.experiments.reproduce import paper_model, reproduce, structure_cuts, structure_places
+from dejavu_torch.experiments.section_five import (
     PUBLISHED,
     Published,
     boundary_lines,
-    paper_model,
-    reproduce,
     route_lines,
     section_five,
-    structure_cuts,
 )
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -172,11 +171,22 @@ def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
     cuts = structure_cuts(open_source("sim:outdoor?frames=420"))
     assert cuts
     told = outdoor.report.facts["boundaries"]
-    assert told["cuts"] <= len(cuts)
+    places = places_of_frames(torch.tensor(cuts), outdoor.shown).unique()
+    assert (told["cuts"], structure_places(outdoor, cuts)) == (len(places), places.tolist())
+    metres = open_source("sim:outdoor?frames=420").distance
+    assert (metres[outdoor.model.map.frame[places]] - metres[cuts]).abs().max() < 0.8
     for name in ("comparable", "known_boundaries"):
         assert told[name]["queries_near"] + told[name]["queries_far"] == outdoor.report.facts["with_answer"]
     assert outdoor.report.as_json()["known_boundaries"]["bytes"] > 0
     assert {"velocity", "frames", "layers", "autocorrelogram"} < set(outdoor.pictures)
+
+
+def test_comparable_scores_are_means_on_the_same_map(outdoor: Comparison) -> None:
+    model = DejaVu(reduction="mean")
+    model.map = outdoor.model.map
+    comparable = judge(model.localize(outdoor.seen), outdoor.truth, 5)
+    assert outdoor.report.contenders["comparable"].scores == comparable
+    assert outdoor.report.ours.scores != comparable
 
 
 def test_other_lengths_store_the_frames_of_the_places_too(outdoor: Comparison) -> None:
