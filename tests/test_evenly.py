@@ -334,7 +334,8 @@ def test_compare_is_learn_localize_and_evaluate(folder: Path, tmp_path: Path) ->
         assert report[key] == pytest.approx(alone[key], rel=1e-6), key
     assert report["spacing"] == {"step": STEP, "reference_frames": len(REFERENCE), "query_frames": len(QUERY)}
     assert report["frames"] == report["queries"] == 101
-    assert (tmp_path / "c" / "velocity.png").stat().st_size > 1000
+    for picture in ("velocity", "ground"):
+        assert (tmp_path / "c" / f"{picture}.png").stat().st_size > 1000
     assert (tmp_path / "c" / "matches.csv").read_text() == (folder / "matches.csv").read_text()
     page = (tmp_path / "c" / "index.html").read_text()
     assert "right within 5 evenly spaced places" in page
@@ -389,9 +390,9 @@ def fails(*command: object) -> None:
         (["--velocity.size", "[8,8]"], "(8, 8)"),
         (["--velocity.step", "-1"], "step is -1"),
         (["--velocity.step", "4000", *CORNERS], "expected at least one step, 4000"),
-        (["--velocity.step", "1e-9", *CORNERS], "at most 100 a frame"),
-        (["--velocity.step", "1e-300", *CORNERS], "at most 100 a frame"),
-        (["--velocity", "true"], "--velocity"),
+        (["--velocity.step", "1e-9", *CORNERS], "at most 20 a frame"),
+        (["--velocity.step", "1e-300", *CORNERS], "at most 20 a frame"),
+        (["--velocity", "true"], "--velocity is true; expected the name of a class, see --velocity.help"),
     ],
 )
 def test_ground_that_cannot_be_is_refused(

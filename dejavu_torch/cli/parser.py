@@ -84,6 +84,9 @@ def _plainly(message: str) -> str:
     name = f"--{'.'.join(keys)}"
     if keys and text.startswith("--"):  # told of a part by the part's own parser
         return f"{name}.{text[2:]}"
+    path = re.match(r"Expected a dot import path string: (.*)", text)
+    if keys and path:
+        return f"{name} is {path[1][:80]}; expected the name of a class, see {name}.help"
     wrong = re.match(r"Expected an? (.*?)(?:\. Got value: (.*))?$", text)
     if keys and wrong:
         choices = re.search(r"Literal\[(.*)\]", wrong[1])

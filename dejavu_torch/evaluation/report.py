@@ -19,7 +19,7 @@ from dejavu_torch.types import Match, Truth
 
 PICTURES = (
     *("frames", "pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"),
-    *("autocorrelogram", "layers", "velocity"),
+    *("autocorrelogram", "layers", "velocity", "ground"),
 )
 LATE = 0.1  # recall at which a curve starts late
 

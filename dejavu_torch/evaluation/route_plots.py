@@ -50,6 +50,30 @@ def plot_frames(first: Tensor, second: Tensor, numbers: Sequence[int]) -> Plot:
     return figure, axes
 
 
+def plot_ground(frame: Tensor, corners: Sequence[Sequence[float]], patch: Tensor) -> Plot:
+    """Where on a frame ground is taken to be, and how it looks from above.
+
+    Args:
+        frame: (C,H,W) in [0,1]. corners: (x, y) in fractions of the frame. patch: (1,h,w) in [0,1].
+    """
+    height, width = frame.shape[-2:]
+    figure, (left, right) = canvas(3.4, 1, 2, width_ratios=(2, 1))
+    left.imshow(frame.expand(3, -1, -1).permute(1, 2, 0).clamp(0, 1).numpy())
+    around = [*corners, corners[0]]
+    left.plot(
+        [x * (width - 1) for x, _ in around],
+        [y * (height - 1) for _, y in around],
+        color=ORANGE,
+        linewidth=1.5,
+    )
+    right.imshow(patch[0].clamp(0, 1).numpy(), cmap="gray")
+    left.set_title("the ground in a frame", loc="left", fontsize=10)
+    right.set_title("from above", loc="left", fontsize=10)
+    left.set_axis_off()
+    right.set_axis_off()
+    return figure, (left, right)
+
+
 def plot_velocity(ways: Mapping[str, Tensor], step: float) -> Plot:
     """How fast the ground moves along traverses, and at which steps it is sampled (section IV-B).
 

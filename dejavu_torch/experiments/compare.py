@@ -24,10 +24,11 @@ from dejavu_torch.evaluation.curves import (
 )
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Contender, Report, contend
-from dejavu_torch.evaluation.route_plots import plot_velocity
+from dejavu_torch.evaluation.route_plots import plot_ground, plot_velocity
 from dejavu_torch.experiments.others import Other, others_of
 from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
+from dejavu_torch.features.ground import ground_patch
 from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
@@ -175,7 +176,8 @@ def compare(
     ours = _judged("this map", match, known, tolerance, size)
     pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, others)
     if isinstance(reference, EvenlySpaced):
-        pictures = {"velocity": _velocity(reference, query)} | pictures
+        motion = {"ground": _ground(reference), "velocity": _velocity(reference, query)}
+        pictures = motion | pictures
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     report = Report(ours, contenders, facts)
     return Comparison(report, match, model, pictures, stored, seen, known, reference, query, shown)
@@ -208,14 +210,27 @@ def _judged(
     return contend(name, match, truth, tolerance, bytes, k)
 
 
+def _ground(reference: EvenlySpaced) -> Picture:
+    velocity, place = reference.normalizer, reference.length // 2
+    frame = next(reference.between(place, place + 1)).cpu()
+    corners = velocity.corners
+    return Picture(
+        plot_ground(frame[0], corners, ground_patch(frame, corners, velocity.size)[0]),
+        "the ground that is measured",
+        "Right if what lies straight ahead runs straight down the view from above, and what repeats along "
+        "the way repeats at even distances there.",
+    )
+
+
 def _velocity(reference: EvenlySpaced, query: Traverse) -> Picture:
     pair = [("reference", reference), ("query", query)]
     ways = {f"{role}: {one.name}": one.way * one.step for role, one in pair if isinstance(one, EvenlySpaced)}
     return Picture(
         plot_velocity(ways, reference.step),
         "how fast the ground moves",
-        "The motion of the ground from frame to frame. Places are even steps along it: a camera that stands "
-        "adds none.",
+        "The motion of the ground from frame to frame, forward above the grey line. Places are even steps "
+        "along it: a camera that stands, or goes back and forth, adds none. A vehicle's speed changes "
+        "smoothly: a curve that jumps, or falls below the line, tells of corners that show no clear ground.",
     )
 
 

@@ -14,7 +14,7 @@ from dejavu_torch.types import InputError, Traverse
 log = logging.getLogger("dejavu_torch")
 
 NEAR = 1e-4  # steps: what is so near to a place has reached it
-MOST = 100  # steps a frame
+MOST = 20  # steps a frame, on average
 DOUBTFUL = 0.2  # steps backwards for each one forward
 
 
@@ -40,7 +40,7 @@ class EvenlySpaced(Traverse):
 
     Raises:
         InputError: as `VelocityNormalizer.distances`, and footage that does not move, or less than a step, or
-            over 100 steps a frame.
+            over 20 steps a frame.
     """
 
     length: int
@@ -53,7 +53,7 @@ class EvenlySpaced(Traverse):
         step: float | None = None,
         progress: bool = False,
     ) -> None:
-        self.traverse, self.name = traverse, traverse.name
+        self.traverse, self.normalizer, self.name = traverse, normalizer, traverse.name
         way = normalizer.distances(traverse, batch_size, progress).distance
         if -way.min() > way.max():  # a camera that looks back
             way = -way
