@@ -239,6 +239,9 @@ def test_matrices_as_large_as_the_traverses_are_of_frames(tmp_path: Path) -> Non
     found = find_truth(str(tmp_path / "places.npz"), None, None, 3, 2, shown=shown())
     assert found is not None
     assert found.right.tolist() == [[0], [1]]
+    np.savez(tmp_path / "number.npz", GThard=np.array(True))
+    with refused("number.npz", "expected a matrix"):
+        find_truth(str(tmp_path / "number.npz"), None, None, 3, 2, shown=shown())
     np.savez(tmp_path / "neither.npz", GThard=np.eye(5, 6, dtype=bool))
     with refused("(5, 6)", "(3, 2)"):
         find_truth(str(tmp_path / "neither.npz"), None, None, 3, 2, shown=shown())

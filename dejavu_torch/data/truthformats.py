@@ -191,11 +191,11 @@ def read_matrices(path: Path, places: int | None, queries: int | Tensor, shown: 
 
 def _of_frames(matrices: Mapping[str, np.ndarray], shown: Shown) -> bool:
     """Whether matrices are as large as the traverses are in frames."""
-    rows, *columns = next(iter(matrices.values())).shape
-    if shown.place_of is None or len(columns) != 1 or rows != len(shown.place_of):
+    shape = next(iter(matrices.values())).shape
+    if shown.place_of is None or len(shape) != 2 or shape[0] != len(shown.place_of):
         return False
     last = -1 if shown.query is None else int(shown.query.max())
-    return bool(columns[0] > last if shown.frames is None else columns[0] == shown.frames)
+    return bool(shape[1] > last if shown.frames is None else shape[1] == shown.frames)
 
 
 def _matrices(

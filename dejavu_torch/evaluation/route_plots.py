@@ -57,7 +57,7 @@ def plot_ground(frame: Tensor, corners: Sequence[Sequence[float]], patch: Tensor
         frame: (C,H,W) in [0,1]. corners: (x, y) in fractions of the frame. patch: (1,h,w) in [0,1].
     """
     height, width = frame.shape[-2:]
-    figure, (left, right) = canvas(3.4, 1, 2, width_ratios=(2, 1))
+    figure, (left, right) = canvas(0.65 * WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
     left.imshow(frame.expand(3, -1, -1).permute(1, 2, 0).clamp(0, 1).numpy())
     around = [*corners, corners[0]]
     left.plot(
