@@ -292,7 +292,7 @@ class DejaVu(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` gave."""
-        self.learnt_from, self.step = state["learnt_from"], state["step"]
+        self.learnt_from, self.step = state["learnt_from"], state.get("step")
 
     def _require_map(self) -> None:
         if not self.map.places:
