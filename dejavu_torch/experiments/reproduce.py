@@ -23,6 +23,7 @@ from dejavu_torch.experiments.boundaries import known_boundaries
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.pictures import best_explained, leading_layers
 from dejavu_torch.experiments.section_five import PUBLISHED
+from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -108,6 +109,9 @@ def reproduce(
         "published": PUBLISHED[dataset]._asdict(),
         "chunk_lengths": [row._asdict() for row in found],
     }
+    if isinstance(result.reference, EvenlySpaced) and isinstance(result.query, EvenlySpaced):
+        shares = {"reference": way_share(result.reference), "query": way_share(result.query)}
+        facts["way_measured"] = shares
     cuts = structure_places(result, structure_cuts(reference))
     if cuts and result.truth is not None:
         known = known_boundaries(result, cuts, tolerance)
@@ -165,6 +169,15 @@ def structure_cuts(reference: Traverse) -> list[int]:
     return sorted(
         set(torch.searchsorted(distance.double(), torch.tensor(inside, dtype=torch.float64)).tolist())
     )
+
+
+def way_share(even: EvenlySpaced) -> float | None:
+    """How far the ground says that a simulated train came, as a share of how far it did; None elsewhere."""
+    span, metres = (getattr(even.traverse, name, None) for name in ("ground_span", "distance"))
+    if span is None or metres is None:
+        return None
+    rows = float(even.way[-1]) * even.step
+    return rows * float(span) / (even.normalizer.size[0] - 1) / float(metres[-1] - metres[0])
 
 
 def structure_places(result: Comparison, cuts: Sequence[int]) -> list[int]:

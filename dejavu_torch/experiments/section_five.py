@@ -36,10 +36,13 @@ def route_lines(reports: Mapping[str, Report]) -> list[str]:
         facts = report.facts
         periods = facts["periods"]
         told = f"{len(periods)} periods from {periods[0]:g} to {periods[-1]:g}" if periods else "no periods"
+        way = [share for share in facts.get("way_measured", {}).values() if share is not None]
+        ground = f"; the way measured is {' and '.join(f'{share:.3f}' for share in way)} of the true one"
         lines.append(
             f"{dataset}: {facts['frames']} places, {facts['queries']} queries; {told} in "
             f"{len(facts['chunks'])} chunks, {facts['templates']} templates, {facts['map_bytes']} bytes; "
             f"learning took {facts['seconds_learn']:.0f} s, localizing {facts['seconds_localize']:.0f} s"
+            + (ground if way else "")
         )
     return lines
 

@@ -97,6 +97,7 @@ def test_every_picture_of_the_paper_is_there(aerial: Comparison) -> None:
 def test_each_dataset_tells_what_its_map_holds(aerial: Comparison) -> None:
     facts = aerial.report.facts
     (line,) = route_lines({"aerial": aerial.report})
+    assert "way" not in line
     assert f"{len(facts['periods'])} periods from {facts['periods'][0]} to {facts['periods'][-1]}" in line
     nothing = aerial.report._replace(facts={**facts, "periods": [], "chunks": []})
     assert "no periods in 0 chunks" in route_lines({"aerial": nothing})[0]
@@ -153,6 +154,15 @@ def test_train_footage_is_spaced_evenly(outdoor: Comparison) -> None:
 
     assert bend(came) > 15  # the train speeds up all the way
     assert bend(came[shown.place]) < 2.5
+
+
+def test_the_way_that_was_measured_is_told(outdoor: Comparison) -> None:
+    way = outdoor.report.facts["way_measured"]
+    assert list(way.values()) == pytest.approx([1, 1], abs=0.05)
+    (line,) = route_lines({"outdoor": outdoor.report})
+    assert line.endswith(
+        f"; the way measured is {way['reference']:.3f} and {way['query']:.3f} of the true one"
+    )
 
 
 def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> None:
