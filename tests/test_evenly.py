@@ -422,6 +422,17 @@ def test_a_truth_of_frames_needs_the_frames_of_the_places(
     assert "expected the map (--map)" in capsys.readouterr().err
 
 
+def test_even_steps_at_constant_speed_may_be_judged_by_an_offset(tmp_path: Path) -> None:
+    """Every step shows the frame of its own number, in the map as in the matches."""
+    np.save(tmp_path / "even.npy", (255 * footage(positions((STEP, 80)))[:, 0]).byte().numpy())
+    source, map_ = f"{tmp_path}/even.npy", f"{tmp_path}/m.safetensors"
+    main(["learn", source, "--map", map_, *OPTIONS])
+    main(["localize", map_, source, "--out", f"{tmp_path}/matches.csv"])
+    rows = list(csv.DictReader((tmp_path / "matches.csv").open()))
+    assert [row["query"] for row in rows] == [row["query_frame"] for row in rows]
+    assert evaluate(tmp_path, "0", tmp_path / "e", "--map", map_)["judged"] == len(rows)
+
+
 def test_a_map_that_was_not_matched_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

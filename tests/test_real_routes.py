@@ -126,6 +126,18 @@ def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_d
     assert moved == pytest.approx(still, rel=0.02)
 
 
+def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
+    pytest.importorskip("cv2")
+    clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
+    found = re.search(r"Optical flow does worse(.*?)Even spacing", section("The same motorway"), re.S)
+    assert found is not None
+    lk_lost, _, lk_mean, dis_lost, dis_mean = numbers(found[1].replace("stood still:", ""))[:5]
+    for flow, lost, mean in (("lk", lk_lost, lk_mean), ("dis", dis_lost, dis_mean)):
+        ground = VelocityNormalizer(corners=ROAD, flow=flow).distances(clip)
+        assert int((ground.confidence < 0.4).sum()) == pytest.approx(lost, abs=8)
+        assert float(ground.distance.diff().mean()) == pytest.approx(mean, rel=0.03)
+
+
 @pytest.mark.parametrize("places", ["221 frames as they came", "220 even steps"])
 def test_even_steps_leave_the_periods_of_a_constant_speed(
     places: str, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -178,7 +178,6 @@ def truth_of_places(truth: Truth, shown: Shown) -> Truth:
     Raises:
         InputError: see `places_of_frames`.
     """
-
     shows = torch.zeros(0) if shown.place is None else shown.place
 
     def among_places(table: Tensor) -> Tensor:

@@ -72,7 +72,9 @@ def evaluate(
         places = stored.places
         _check_map(stored, map, matches, match, place_frame)
         if query_frame is not None:
-            as_came = torch.equal(query_frame, queries)  # --as_is
+            # --as_is; at a constant speed even steps may be frames as well
+            varies = not torch.equal(stored.frame, torch.arange(stored.places))
+            as_came = varies and torch.equal(query_frame, queries)
             frames = None if query is None else query.length
             shown = Shown(None if as_came else query_frame, stored.frame, stored.place_of, frames)
     if places is not None and int(match.index.max()) >= places:
