@@ -27,11 +27,12 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.distance import Metric
 from dejavu_torch.recognition.scores import Matcher, Reduction
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
+SETTINGS = ("metric", "reduction", "threshold", "batch_size", "temperature")
 MANY_FEATURES = 50_000  # per frame: worth a word
 
 
@@ -48,6 +49,7 @@ class DejaVu(nn.Module):
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
         velocity: makes places and queries even steps along the ground (section IV-B), see `evenly`;
             None takes the frames as they come.
+        temperature: scores are then those of `log_posterior`; None leaves S as it is.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
@@ -68,6 +70,7 @@ class DejaVu(nn.Module):
         batch_size: int = 64,
         preprocess: Preprocess | None = None,
         velocity: VelocityNormalizer | None = None,
+        temperature: float | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1:
@@ -78,13 +81,14 @@ class DejaVu(nn.Module):
         self.features = HOG() if features is None else features
         self.periods = SpectrogramAnalysis() if periods is None else periods
         self.templates = PhaseTemplates()
-        self.matcher = Matcher(metric, reduction)
+        self.matcher = Matcher(metric, reduction, temperature)
         self.threshold = threshold
         self.batch_size = batch_size
         self.velocity = velocity
         self.map = CompressedMap()
         self.step: float | None = None  # pixels of ground from one place of the map to the next
         self.learnt_from: tuple[int, ...] | None = None  # a frame's (C,H,W), or (D,) of ready features
+        self.trained: Training | None = None
 
     def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
         """Section III-A: features, their periods, layers, and the templates of eq. 1.
@@ -146,7 +150,7 @@ class DejaVu(nn.Module):
             self.step, way = traverse.step, traverse.way
         places, dimension = features.shape
         self.map = CompressedMap(plan, templates, places, dimension, way).to(features.device)
-        self.learnt_from = shape or None
+        self.learnt_from, self.trained = shape or None, None
         return self
 
     def forward(self, queries: Tensor) -> Tensor:
@@ -227,10 +231,8 @@ class DejaVu(nn.Module):
         tensors, header = read_map(Path(path))
         try:
             parts = build_parts(header, features)
-            settings = {name: header[name] for name in ("metric", "reduction", "threshold", "batch_size")}
-            model = cls(**parts, **settings)
-            model.learnt_from = header["learnt_from"] and tuple(header["learnt_from"])
-            model.step = header["step"]
+            model = cls(**parts, **{name: header[name] for name in SETTINGS})
+            model.set_extra_state(header)
             loaded = model.load_state_dict(tensors, strict=False)
             not_kept = ("periods.", "_extra_state")
             missing = [name for name in loaded.missing_keys if not name.startswith(not_kept)]
@@ -263,14 +265,10 @@ class DejaVu(nn.Module):
 
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         metric = self.matcher.metric
-        header = part_recipes(self) | {
-            "metric": metric if isinstance(metric, str) else getattr(metric, "__name__", "callable"),
-            "reduction": self.matcher.reduction,
-            "threshold": self.threshold,
-            "batch_size": self.batch_size,
-            "learnt_from": self.learnt_from,
-            "step": self.step,
-        }
+        header = part_recipes(self) | self.get_extra_state()
+        header |= {name: getattr(self.matcher, name) for name in ("reduction", "temperature")}
+        header |= {"threshold": self.threshold, "batch_size": self.batch_size}
+        header["metric"] = metric if isinstance(metric, str) else getattr(metric, "__name__", "callable")
         # what found the periods is not needed any more
         tensors = {f"map.{name}": t for name, t in self.map.state_dict().items()}
         weights = {f"features.{n}": t for n, t in self.features.state_dict().items() if isinstance(t, Tensor)}
@@ -288,11 +286,14 @@ class DejaVu(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the state_dict holds beside the tensors."""
-        return {"learnt_from": self.learnt_from, "step": self.step}
+        trained = self.trained and self.trained._asdict()
+        return {"learnt_from": self.learnt_from, "step": self.step, "trained": trained}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` gave."""
-        self.learnt_from, self.step = state["learnt_from"], state.get("step")
+        shape, trained = state["learnt_from"], state.get("trained")
+        self.learnt_from, self.step = shape and tuple(shape), state.get("step")
+        self.trained = trained and Training(**trained)
 
     def _require_map(self) -> None:
         if not self.map.places:

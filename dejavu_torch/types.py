@@ -118,6 +118,17 @@ class Match(NamedTuple):
     accepted: Tensor
 
 
+class Training(NamedTuple):
+    """How a map was trained; None of it where it was learnt by eq. 1.
+
+    steps: of the optimiser. seconds: they took. seed: of the run, None where none was set.
+    """
+
+    steps: int
+    seconds: float
+    seed: int | None
+
+
 class Truth(NamedTuple):
     """The right places of each query, and what is not to be judged.
 

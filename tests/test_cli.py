@@ -13,8 +13,10 @@ import pytest
 import torch
 from PIL import Image
 
-from dejavu_torch import DejaVu
-from dejavu_torch.cli import main
+from dejavu_torch import DejaVu, SpectrogramAnalysis, open_source
+from dejavu_torch.cli import COMMANDS, main
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.types import Training
 
 SMALL = "sim:aerial?frames=256"
 QUERY = "sim:aerial?frames=256&traverse=1"
@@ -75,8 +77,6 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     run("localize", small_map, QUERY, "--out", tmp_path / "m.csv")
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
     model = DejaVu.load(small_map)
-    from dejavu_torch import open_source
-
     match = model.localize(open_source(QUERY))
     assert list(rows[0]) == ["query", "place", "score", "accepted"]
     assert [int(row["query"]) for row in rows] == list(range(256))
@@ -231,7 +231,7 @@ def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> No
     out = capsys.readouterr().out
     assert stop.value.code == 0
     assert "known subclasses" not in out
-    assert len(out.splitlines()) < 95
+    assert len(out.splitlines()) < 100
     assert out.splitlines()[0].startswith("usage: dejavu")
 
 
@@ -247,6 +247,100 @@ def test_quiet_where_not_a_terminal(tmp_path: Path) -> None:
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert [line for line in done.stderr.splitlines() if "window shrunk" not in line] == []
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run("--help")
+    out = capsys.readouterr().out
+    assert stop.value.code == 0
+    told = {line.split()[0] for line in out.splitlines() if line.startswith("    ") and line.split()}
+    assert told >= {*COMMANDS, "train"}
+    assert "dejavu train fit --help" in out
+
+
+# a map that is judged as it is
+
+
+@pytest.fixture
+def trained_map(tmp_path: Path) -> Path:
+    """Arrays a.npy and b.npy, and a map of the first as training leaves it."""
+    np.save(tmp_path / "a.npy", frames(96, size=8))
+    np.save(tmp_path / "b.npy", frames(96, seed=5, size=8))
+    periods = SpectrogramAnalysis(window=96, strongest=1)
+    model = DejaVu(torch.nn.Flatten(), periods, "l2", temperature=0.2, threshold=2.5)
+    model.learn(open_source(str(tmp_path / "a.npy")))
+    model.map.templates *= 0.9
+    model.trained = Training(steps=30, seconds=1000.0, seed=3)
+    model.save(tmp_path / "trained.safetensors")
+    return tmp_path / "trained.safetensors"
+
+
+def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, before = trained_map.parent, trained_map.read_bytes()
+    pair = folder / "a.npy", folder / "b.npy", "--truth", "0", "--features", "torch.nn.Flatten"
+    # options that make a map, and the metric, are the map's own
+    run("compare", *pair, "--map", trained_map, "--out", folder / "r", "--metric", "cosine")
+    report = json.loads((folder / "r" / "report.json").read_text())
+    assert report["trained"] == {"steps": 30, "seconds": 1000.0, "seed": 3}
+    assert report["seconds_learn"] > 1000
+    assert report["map_bytes"] == len(before)
+    assert report["threshold"] == 2.5
+    assert {"null", "uncompressed", "stride"} <= report.keys()
+    assert "null_same_plan" not in report
+    assert trained_map.read_bytes() == before
+    match = DejaVu.load(trained_map, torch.nn.Flatten()).localize(open_source(str(folder / "b.npy")))
+    rows = list(csv.DictReader((folder / "r" / "matches.csv").open()))
+    assert [int(row["place"]) for row in rows] == match.index.tolist()
+    assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-4)
+    assert report["accepted"] == int(match.accepted.sum())
+    run("compare", *pair, "--map", trained_map, "--out", folder / "r", "--threshold", "0.5")
+    assert json.loads((folder / "r" / "report.json").read_text())["threshold"] == 0.5
+
+
+def test_compare_builds_features_of_this_package_by_itself(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", frames(64, size=16))
+    np.save(tmp_path / "b.npy", frames(64, seed=5, size=16))
+    features = SmallCNN(dimension=8, channels=1, resize=(16, 16), widths=(4,), squeeze=2)
+    model = DejaVu(features, SpectrogramAnalysis(window=64, strongest=1))
+    model.learn(open_source(str(tmp_path / "a.npy"))).save(tmp_path / "a.safetensors")
+    pair = tmp_path / "a.npy", tmp_path / "b.npy"
+    run("compare", *pair, "--map", tmp_path / "a.safetensors", "--out", tmp_path / "r")
+    report = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert report["trained"] is None
+    assert report["map_bytes"] == (tmp_path / "a.safetensors").stat().st_size
+    assert {"hog", "hog_stride_coarsest"} <= report.keys()
+
+
+def test_info_tells_how_a_map_was_trained(trained_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run("info", trained_map, "--features", "torch.nn.Flatten")
+    out = capsys.readouterr().out
+    assert "trained for 30 steps in 1000 s, seed 3" in out
+    assert "temperature=0.2" in out
+
+
+def test_a_map_that_cannot_be_judged(trained_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = trained_map.parent
+    np.save(folder / "short.npy", frames(95, size=8))
+
+    def told(reference: str, *options: str | Path) -> str:
+        out = "--features", "torch.nn.Flatten", "--out", folder / "r"
+        return fails(capsys, "compare", folder / reference, folder / "b.npy", *out, *options)
+
+    error = told("short.npy", "--map", trained_map)
+    assert "short.npy gives 95 places, the map holds 96" in error
+    assert "not there" in told("a.npy", "--map", folder / "nowhere.safetensors")
+    assert "trained templates" in told("a.npy", "--map", trained_map, "--leave_out", "2")
+    assert "Flatten" in fails(
+        capsys,
+        "compare",
+        folder / "a.npy",
+        folder / "b.npy",
+        "--map",
+        trained_map,
+        "--out",
+        folder / "r",
+    )
 
 
 # what is refused

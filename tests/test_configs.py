@@ -24,7 +24,7 @@ def settings(model: DejaVu) -> dict[str, object]:
     return {
         "features": recipe_of(model.features),
         "periods": recipe_of(model.periods),
-        "matcher": (model.matcher.metric, model.matcher.reduction),
+        "matcher": (model.matcher.metric, model.matcher.reduction, model.matcher.temperature),
         "threshold": model.threshold,
         "batch_size": model.batch_size,
     }
@@ -58,6 +58,7 @@ def test_convention_3_paper_yaml_is_the_letter() -> None:
     assert recipe_of(model.periods).init_args == letter
     assert model.matcher.reduction == "sum"
     assert model.matcher.metric == "l1"
+    assert model.matcher.temperature is None
 
 
 def test_reproduce_uses_the_papers_letter() -> None:

@@ -21,8 +21,9 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.scores import log_posterior
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import FrequencyLayer, Match, Traverse
+from dejavu_torch.types import FrequencyLayer, Match, Training, Traverse
 
 SIZE = 16
 
@@ -495,7 +496,14 @@ def test_a_backbone_that_makes_no_features_is_refused(make: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"batch_size": 0}, {"threshold": torch.nan}, {"metric": "l7"}, {"reduction": "median"}]
+    "arguments",
+    [
+        {"batch_size": 0},
+        {"threshold": torch.nan},
+        {"metric": "l7"},
+        {"reduction": "median"},
+        {"temperature": 0.0},
+    ],
 )
 def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
     with refused("expected"):
@@ -518,3 +526,32 @@ def test_what_a_map_was_learnt_from_is_part_of_its_state() -> None:
     again = wave_model()
     again.load_state_dict(model.state_dict())
     assert again.learnt_from == model.learnt_from == (waves().shape[1],)
+
+
+def test_a_temperature_makes_scores_of_how_likely_a_place_is() -> None:
+    plain, model = wave_model().learn(waves()), wave_model(temperature=0.3).learn(waves())
+    query = waves() + 0.3 * torch.rand(72, 2)
+    torch.testing.assert_close(model(query), log_posterior(plain(query), 0.3))
+    match = model.localize(query)
+    assert torch.equal(match.index, plain.localize(query).index)
+    torch.testing.assert_close(match.score, model(query).amin(1))
+
+
+def test_how_a_map_was_trained_is_part_of_its_state() -> None:
+    model, again = wave_model().learn(waves()), wave_model()
+    assert model.trained is None
+    again.load_state_dict(model.state_dict())
+    assert again.trained is None
+    model.trained = Training(7, 1.5, None)
+    again.load_state_dict(model.state_dict())
+    assert again.trained == Training(7, 1.5, None)
+    older = model.state_dict()
+    del older["_extra_state"]["trained"]
+    again.load_state_dict(older)
+    assert again.trained is None
+
+
+def test_learning_anew_forgets_the_training() -> None:
+    model = wave_model().learn(waves())
+    model.trained = Training(7, 1.5, None)
+    assert model.learn(waves()).trained is None

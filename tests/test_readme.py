@@ -5,8 +5,12 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from dejavu_torch.cli import train
+from dejavu_torch.cli.parser import UsageError, build_parser
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -35,13 +39,46 @@ def test_every_linked_file_is_there() -> None:
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
-def test_every_command_shown_is_understood() -> None:
-    from dejavu_torch.cli.parser import build_parser
+class Understood(Exception):
+    """A command line of `dejavu train` has been parsed."""
 
+
+class ParseOnly(train.TrainCLI):
+    """Reads a command line, and neither seeds, instantiates nor runs anything."""
+
+    def parse_arguments(self, parser: Any, args: Any) -> None:
+        super().parse_arguments(parser, args)
+        raise Understood
+
+
+def understand(line: str) -> None:
+    """Parse a command as it is shown, without running it."""
+    words = shlex.split(line, comments=True)[1:]
+    if words[0] != "train":
+        build_parser().parse_args(words)
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)  # where the configs lie
+        patch.setattr(train, "TrainCLI", ParseOnly)
+        with pytest.raises(Understood):
+            train.run_train(words[1:])
+
+
+def test_every_command_shown_is_understood() -> None:
     shown = re.findall(r"^dejavu .*$", README.replace("\\\n", " "), re.MULTILINE)
     assert len(shown) >= 4
     for line in shown:
-        build_parser().parse_args(shlex.split(line, comments=True)[1:])
+        understand(line)
+
+
+def test_a_training_that_is_shown_would_be_understood() -> None:
+    config = "dejavu train fit --config configs/train_road.yaml"
+    understand(f"{config} --data.source sim:aerial --trainer.default_root_dir out --trainer.max_steps 50")
+    for wrong in ("--data.colour red", "--trainer.max_steps many", "--model.periods.bin 0.5"):
+        with pytest.raises(UsageError):
+            understand(f"{config} --data.source sim:aerial {wrong}")
+    with pytest.raises(UsageError):
+        understand("dejavu train dance")
 
 
 def test_ci_calls_the_readmes_test_command() -> None:

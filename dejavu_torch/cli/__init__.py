@@ -35,6 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     parser = build_parser()
     try:
+        if given[:1] == ["train"]:  # Lightning, which takes seconds to import, is loaded for it alone
+            from dejavu_torch.cli.train import run_train
+
+            run_train(given[1:])
+            return
         parsed = parser.parse_args(_config_first(given))
         if parsed.command is None:
             parser.print_help()

@@ -31,6 +31,7 @@ from dejavu_torch.experiments.section_five import (
     section_five,
 )
 from dejavu_torch.features.ground import check_corners
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
@@ -99,14 +100,21 @@ def run_compare(
     tolerance: int,
     interpolate: bool,
     leave_out: int | None,
+    map: Path | None,
     out: Path,
     model: DejaVu,
     command: str,
 ) -> None:
-    """Learn, localize and judge; report beside baselines and null control."""
+    """Learn, or take a map; localize and judge; report beside baselines and null control."""
+    if map is not None:  # features of this package build themselves
+        threshold = model.threshold
+        model = DejaVu.load(map, None if isinstance(model.features, HOG) else model.features)
+        model.threshold = model.threshold if threshold is None else threshold
     pair = open_source(reference), open_source(query)
     _make_report_folder(out, reference, query)
-    result = compare(*pair, truth, model, tolerance, leave_out, interpolate=interpolate, progress=True)
+    result = compare(
+        *pair, truth, model, tolerance, leave_out, interpolate=interpolate, progress=True, learn=map is None
+    )
     _publish(result, out, f"{query} found on {reference}", command)
 
 
@@ -162,6 +170,9 @@ def run_info(map: Path, features: Any) -> None:
         parts.append(model.velocity)
     for part in parts:
         print(f"{type(part).__name__}: {part.extra_repr()}")
+    if model.trained is not None:
+        steps, seconds, seed = model.trained
+        print(f"trained for {steps} steps in {seconds:.0f} s, seed {seed}")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 from typing import Any, NoReturn
@@ -19,7 +20,7 @@ SOURCE = (
     "folder of images, video (clip.mp4?width=160), .npy of frames or features, sim:NAME?seed=0&traverse=0, "
     "or strip:IMAGE?width=96"
 )
-MODEL = ("features", "periods", "metric", "reduction", "threshold", "batch_size", "preprocess", "velocity")
+MODEL = tuple(inspect.signature(DejaVu).parameters)
 TRUTH = (
     "offset (place = query + offset), csv of query,place[,place...] or query_frame,place_frame[,...], npz "
     "with GThard, or utm:25 for coordinates in image names"
@@ -68,10 +69,10 @@ class Parser(jsonargparse.ArgumentParser):
         # of a union's complaints the first is the one about what the user wrote
         union = re.search(r"Errors:\n\s*- (.*?)(?=\n\s*- |\n  Given|\Z)", message, re.DOTALL)
         complaint = f"{message.partition(':')[0]}: {union[1]}" if union else message
-        raise UsageError(_plainly(complaint)) from ex
+        raise UsageError(plainly(complaint)) from ex
 
 
-def _plainly(message: str) -> str:
+def plainly(message: str) -> str:
     """jsonargparse's complaint as a user would put it: options by their names, types in words."""
     head, _, names = message.partition("required: ")
     if names:
@@ -149,6 +150,11 @@ def build_parser() -> Parser:
     compare_.add_argument("reference", help=SOURCE)
     compare_.add_argument("query", help=SOURCE)
     compare_.add_argument(
+        "--map",
+        type=Path | None,
+        help="judge this map of the reference, with its own settings, instead of learning one",
+    )
+    compare_.add_argument(
         "--leave_out", type=int | None, help="diagnostic: the reference on itself, W left out"
     )
 
@@ -183,6 +189,12 @@ def build_parser() -> Parser:
     reproduce.add_argument(
         "--tolerance", type=int, default=5, help="right within this many places, inclusive"
     )
+
+    train = command(
+        "train",
+        "train features that repeat, end to end: fit, validate or test; see `dejavu train fit --help`",
+    )
+    train.add_argument("arguments", nargs="*", help="fit, validate or test, and their options")
 
     bench = command("bench", "time this package beside what a user would pick instead")
     bench.add_argument("what", choices=list(BENCHES), nargs="?", default="matcher", help="HOG, L1 distances")

@@ -27,13 +27,16 @@ class ImageFolder(Traverse):
         width, height: pixels to resize each image to as it is read, antialiased; 0 keeps the image's
             own, or its aspect ratio where only the other is given.
         step: every step-th image, from the first.
+        start, stop: the images [start, stop) only, counted from 0; a stop of 0 is the end.
 
     Raises:
-        InputError: width, height or step out of range; no such folder, or no images in it; while
+        InputError: width, height, step, start or stop out of range; no such folder, or no images in it; while
             reading, an image that cannot be read or that has another size than the first.
     """
 
-    def __init__(self, path: str | Path, width: int = 0, height: int = 0, step: int = 1) -> None:
+    def __init__(
+        self, path: str | Path, width: int = 0, height: int = 0, step: int = 1, start: int = 0, stop: int = 0
+    ) -> None:
         folder = Path(path)
         if width < 0 or height < 0 or step < 1:
             raise InputError(
@@ -52,9 +55,14 @@ class ImageFolder(Traverse):
                 (f"; it has folders such as {file.name}" for file in folder.iterdir() if file.is_dir()), ""
             )
             raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
-        self.files = sorted(files, key=lambda file: _natural(file.name))[::step]
+        stop = stop or len(files)
+        if not 0 <= start < stop <= len(files):
+            raise InputError(
+                f"{path}: start={start}, stop={stop}; expected start < stop within its {len(files)} images"
+            )
+        self.files = sorted(files, key=lambda file: _natural(file.name))[start:stop:step]
         self.width, self.height = width, height
-        self.name = str(folder)
+        self.name = str(folder) if stop - start == len(files) else f"{folder}?start={start}&stop={stop}"
         self.length = len(self.files)
 
     def batches(self, size: int) -> Iterator[Tensor]:

@@ -25,6 +25,7 @@ class CompressedMap(nn.Module):
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
         way: (frames of the reference,) float32, how many steps of evenly spaced places each is from the first
             place; (0,) where place i is frame i.
+        weights: (D,) float, what a difference in each feature counts in eq. 3; (0,) where all count alike.
 
     Args:
         plan: the layers.
@@ -33,9 +34,11 @@ class CompressedMap(nn.Module):
         places: N, frames of the reference traverse.
         dimension: D, features per frame.
         way: see above; None where place i is frame i.
+        weights: see above; None where all features count alike.
 
-    Convention: places are 0..N-1. `load_state_dict` takes the shapes of what it loads, so an empty
-        `CompressedMap()` can receive any map.
+    Convention: templates are of `weighted` features: |w H - w mu| = w |H - mu|. Places are 0..N-1.
+        `load_state_dict` takes the shapes of what it loads, so an empty `CompressedMap()` can
+        receive any map.
     """
 
     size: Tensor
@@ -44,6 +47,7 @@ class CompressedMap(nn.Module):
     feature_index: Tensor
     templates: Tensor
     way: Tensor
+    weights: Tensor
 
     def __init__(
         self,
@@ -52,6 +56,7 @@ class CompressedMap(nn.Module):
         places: int = 0,
         dimension: int = 0,
         way: Tensor | None = None,
+        weights: Tensor | None = None,
     ) -> None:
         super().__init__()
         for layer, block in zip(plan, templates, strict=True):
@@ -71,6 +76,8 @@ class CompressedMap(nn.Module):
         self.register_buffer("feature_index", torch.tensor(index, dtype=torch.int32, device=device))
         self.register_buffer("templates", flat)
         self.register_buffer("way", torch.zeros(0, device=device) if way is None else way.float().to(device))
+        alike = torch.zeros(0, device=device) if weights is None else weights.float().to(device)
+        self.register_buffer("weights", alike)
         self._plan: Plan | None = None
         self.check()
 
@@ -110,6 +117,53 @@ class CompressedMap(nn.Module):
         sizes = [layer.phases * len(layer.features) for layer in self.plan]
         parts = self.templates.split(sizes) if sizes else ()
         return [part.view(layer.phases, -1) for part, layer in zip(parts, self.plan, strict=True)]
+
+    def weighted(self, features: Tensor) -> Tensor:
+        """Features as the templates are made of and compared with: times `weights`. (n,D) -> (n,D)."""
+        return features * self.weights if len(self.weights) else features
+
+    def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
+        """Make parameters of the templates, of the weights, or of both, until `settle`.
+
+        Args:
+            start: (D,) the weights to go on from where the map has none; None or (0,) is 1 for every feature.
+
+        Raises:
+            InputError: a start of another shape.
+        """
+        self.settle()
+        if weights and not len(self.weights):
+            own = self.templates.new_ones(self.dimension)
+            if start is not None and len(start):
+                if start.shape != own.shape:
+                    raise InputError(f"the weights start as {tuple(start.shape)}; expected ({len(own)},)")
+                own = start.detach().clone()
+            self.templates = self._times(own)  # they are of weighted features
+            self.weights = own
+        for name, asked in (("templates", templates), ("weights", weights)):
+            if asked:
+                value = getattr(self, name).detach().clone()
+                delattr(self, name)
+                self.register_parameter(name, nn.Parameter(value))
+
+    def settle(self) -> None:
+        """Make buffers of what was trained.
+
+        Convention: |w H - mu| is the same with both signs turned, so that no weight is below 0.
+        """
+        for name, parameter in list(self.named_parameters()):
+            delattr(self, name)
+            self.register_buffer(name, parameter.detach().clone())
+        if (self.weights < 0).any():
+            self.templates = self._times(torch.where(self.weights < 0, -1, 1))
+            self.weights = self.weights.abs()
+        self.check()
+
+    def _times(self, factors: Tensor) -> Tensor:
+        """The templates, those of each feature times its factor (D,)."""
+        pairs = zip(self.blocks(), self.layer_features(), strict=True)
+        scaled = [(block * factors[features]).flatten() for block, features in pairs]
+        return torch.cat(scaled) if scaled else self.templates
 
     def layer_features(self) -> list[Tensor]:
         """Feature indices of each layer, (F,) int64."""
@@ -157,6 +211,10 @@ class CompressedMap(nn.Module):
             return f"templates {tuple(self.templates.shape)}; expected ({numbers},)"
         if not self.templates.is_floating_point() or not self.templates.isfinite().all():
             return "templates that are not finite floats"
+        if tuple(self.weights.shape) not in ((0,), (self.dimension,)):
+            return f"weights {tuple(self.weights.shape)}; expected ({self.dimension},) or none"
+        if not self.weights.is_floating_point() or not self.weights.isfinite().all():
+            return "weights that are not finite floats"
         return ""
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:

@@ -20,7 +20,7 @@ from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import InputError
 
-FORMAT = 2  # 1 knew no even steps
+FORMAT = 3  # 1 knew no even steps, 2 neither weights nor temperature
 PACKAGE = "dejavu_torch"
 PARTS: dict[str, type[nn.Module]] = {  # what a header holds recipes of
     "preprocess": Preprocess,
@@ -48,6 +48,9 @@ def recipe_of(module: nn.Module) -> Recipe:
     path = f"{cls.__module__}.{cls.__qualname__}"
     names = inspect.signature(cls).parameters if path.startswith(PACKAGE + ".") else ()
     arguments = {name: getattr(module, name) for name in names}
+    for name, value in arguments.items():
+        if isinstance(value, nn.Module):
+            arguments[name] = recipe_of(value)._asdict()
     # as JSON gives it back, so that a recipe read from a file equals the module's own
     return Recipe(path, json.loads(json.dumps(arguments)))
 
@@ -68,7 +71,10 @@ def build(recipe: Recipe, kind: type[M]) -> M:
         cls = getattr(importlib.import_module(module_name), class_name)
         if not (isinstance(cls, type) and issubclass(cls, kind)):
             raise TypeError(f"{class_name} is no {kind.__name__}")
-        module = cls(**recipe.init_args)
+        parts = {
+            n: Recipe(**v) for n, v in recipe.init_args.items() if isinstance(v, dict) and "class_path" in v
+        }
+        module = cls(**recipe.init_args | {name: build(part, nn.Module) for name, part in parts.items()})
     except (ImportError, AttributeError, TypeError) as error:
         raise InputError(f"the map names {recipe.class_path}, which cannot be built: {error}") from error
     return module
@@ -167,10 +173,13 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             if int(metadata["version"]) == 1:
                 header |= {"velocity": None, "step": None}
                 tensors["map.way"] = torch.zeros(0)
+            if int(metadata["version"]) < 3:
+                header |= {"temperature": None, "trained": None}
+                tensors["map.weights"] = torch.zeros(0)
             return tensors, header
     except InputError:
         raise
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
 
 

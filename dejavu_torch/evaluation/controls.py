@@ -9,7 +9,7 @@ from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.features.gather import gather
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.distance import Metric, phase_distances
-from dejavu_torch.recognition.scores import combine_layers
+from dejavu_torch.recognition.scores import combine_layers, log_posterior
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match
 
@@ -26,6 +26,7 @@ def same_settings(model: DejaVu) -> DejaVu:
         model.batch_size,
         model.preprocess,
         model.velocity,
+        matcher.temperature,
     )
 
 
@@ -57,8 +58,10 @@ def null_control(
     parts = order.to(reference.device).split(256)
     shuffled, null = gather(reference[part] for part in parts), same_settings(model)
     if same_plan:
-        templates = null.templates(shuffled, model.map.plan)
-        null.map = CompressedMap(model.map.plan, templates, *shuffled.shape).to(shuffled.device)
+        plan, weights = model.map.plan, model.map.weights if len(model.map.weights) else None
+        templates = null.templates(model.map.weighted(shuffled), plan)
+        null.map = CompressedMap(plan, templates, len(order), shuffled.shape[1], weights=weights)
+        null.map.to(shuffled.device)
     else:
         null.learn_features(shuffled)
     match = null.localize(query, progress)
@@ -83,10 +86,12 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
             f"leave-out got width {width} and features {tuple(reference.shape)}; "
             f"expected width >= 0 and ({model.map.places}, {model.map.dimension})"
         )
+    if model.trained is not None:
+        raise InputError("leave-out got trained templates, no means; expected a map that was learnt")
     plan, blocks, matcher = model.map.plan, model.map.blocks(), model.matcher
     if not plan:
         return model.localize(reference)
-    matches = []
+    matches, reference = [], model.map.weighted(reference)
     with torch.no_grad():
         for frames in torch.arange(len(reference), device=reference.device).split(256):
             distances = [
@@ -94,6 +99,8 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
                 for layer, block, index in zip(plan, blocks, model.map.layer_features(), strict=True)
             ]
             scores = combine_layers(distances, plan, len(reference), matcher.metric, matcher.reduction)
+            if matcher.temperature is not None:
+                scores = log_posterior(scores, matcher.temperature)
             match = best_match(scores, model.threshold)
             matches.append(Match(*(column.cpu() for column in match)))
     return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))

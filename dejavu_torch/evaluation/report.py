@@ -137,7 +137,7 @@ def shown(report: Report) -> list[Contender]:
     """What a table lists: ours, and the others without those that store the same frames as one before."""
     kept: list[Contender] = []
     for contender in report.contenders.values():
-        if contender.k is None or contender.k not in [other.k for other in kept]:
+        if contender.k is None or (contender.k, contender.bytes) not in [(o.k, o.bytes) for o in kept]:
             kept.append(contender)
     return [report.ours, *kept]
 
@@ -238,6 +238,11 @@ anew, and reports nothing where no frequency passes the test for noise. The seco
 what it recognises comes from how much the map stores, not from periods.
 """
 
+_TRAINED_NOTE = """
+The null control keeps the trained backbone and makes templates of the reference in shuffled order, where
+nothing repeats: what it recognises does not come from periods.
+"""
+
 _STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
@@ -255,7 +260,8 @@ def _page(report: Report, pictures: str, title: str, command: str, plan: str | N
     table = _row("th", head) + "".join(
         _row("td", row, " class=ours" if j == 0 else "") for j, row in enumerate(rows)
     )
-    note = _NOTE + (_NULL_NOTE if "null" in report.contenders else "")
+    note = _NOTE + (_NULL_NOTE if "null_same_plan" in report.contenders else "")
+    note += _TRAINED_NOTE if facts.get("trained") else ""
     return f"""{_top(title)}<p>{html.escape(summary(report))}</p>
 <div class="wide"><table>{table}</table></div>
 <p class="note">recall = {html.escape(facts["recall_definition"])}. {note}</p>

@@ -25,10 +25,11 @@ from dejavu_torch.evaluation.curves import (
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Contender, Report, contend
 from dejavu_torch.evaluation.route_plots import plot_ground, plot_velocity
-from dejavu_torch.experiments.others import Other, others_of
+from dejavu_torch.experiments.others import Other, hog_others, others_of
 from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
 from dejavu_torch.features.ground import ground_patch
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.stft import BACKEND
@@ -68,6 +69,7 @@ def compare(
     seed: int = 0,
     interpolate: bool = False,
     progress: bool = False,
+    learn: bool = True,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and judge that against what else could be stored.
 
@@ -81,12 +83,17 @@ def compare(
         seed: of the shuffle of the null control.
         interpolate: see `read_truth`.
         progress: show progress bars on a terminal.
+        learn: False judges the map that the model has, of this very reference, as training made it.
 
     Raises:
-        InputError: bad input of any of the stages.
+        InputError: bad input of any of the stages, or a map of another number of places.
     """
     if tolerance < 0 or (leave_out is not None and leave_out < 0):
         raise InputError(f"tolerance is {tolerance}, leave_out {leave_out}; expected at least 0")
+    if leave_out is not None and not learn and model is not None and model.trained is not None:
+        raise InputError(
+            f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"
+        )
     if truth is not None:
         check_truth_text(truth, interpolate)
     known = None
@@ -94,7 +101,7 @@ def compare(
     _check_sizes(model, reference, query)
     came, shown, clock = (reference, query), None, Clock()
     with clock("learn"):
-        reference = model.evenly(reference, progress=progress)
+        reference = model.evenly(reference, None if learn else model.step, progress)
     if isinstance(reference, EvenlySpaced):
         with clock("localize"):
             query = model.evenly(query, reference.step, progress)
@@ -103,13 +110,18 @@ def compare(
     early = reference.length is not None and query.length is not None
     if early:  # a truth that does not fit is told before the long work
         known = find_truth(truth, *came, reference.length, query.length or 0, interpolate, shown)
+        if not learn:
+            _check_places(model, reference, reference.length or 0)
     if reference.name == query.name:
         log.warning(
             "%s is matched with itself, every frame with its own; judge on a second traverse", query.name
         )
     with clock("learn"):
         stored = model.extract_all(reference, "learning" if progress else None)
-        model.learn_features(stored, reference)
+        if learn:
+            model.learn_features(stored, reference)
+        else:
+            _check_places(model, reference, len(stored))
     with clock("localize"):
         seen = model.extract_all(query, "localizing" if progress else None)
         model.check_queries(frame_shape(query), seen.shape[1], query.name)
@@ -118,6 +130,8 @@ def compare(
     if not early:
         known = find_truth(truth, *came, len(stored), len(seen), interpolate, shown)
     others = others_of(model, stored, seen, tolerance, seed, progress)
+    if not isinstance(model.features, HOG) and len(frame_shape(reference)) == 3:
+        others |= hog_others(reference, query, model.batch_size, tolerance, progress)
     if leave_out is not None:
         itself = leave_out_match(model, stored, leave_out)
         others["leave_out"] = Other(f"reference on itself, +-{leave_out} left out", itself)
@@ -151,12 +165,13 @@ def compare(
             }
             for c in chunks
         ],
-        "seconds_learn": clock.seconds["learn"],
+        "seconds_learn": clock.seconds["learn"] + (model.trained.seconds if model.trained else 0.0),
         "seconds_localize": clock.seconds["localize"],
         "accepted": int(match.accepted.sum()),
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
         "threshold": model.threshold,
+        "trained": model.trained and model.trained._asdict(),
         "reference": reference.name,
         "query": query.name,
         "version": dejavu_torch.__version__,
@@ -243,6 +258,14 @@ def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
         told.append(f"{traverse.name} gives {counts[-1]} features a frame of {size}")
     if counts[0] != counts[1]:
         raise InputError(f"{' and '.join(told)}; expected as many, as ?width= and ?height= behind both make")
+
+
+def _check_places(model: DejaVu, reference: Traverse, places: int) -> None:
+    if places != model.map.places:
+        raise InputError(
+            f"{reference.name} gives {places} places, the map holds {model.map.places}; "
+            "expected the reference that it was made of"
+        )
 
 
 def _plain(period: object) -> int | float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import NamedTuple
 
 from torch import Tensor
@@ -9,7 +10,9 @@ from torch import Tensor
 from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import Match
+from dejavu_torch.types import InputError, Match, Traverse
+
+log = logging.getLogger("dejavu_torch")
 
 
 class Other(NamedTuple):
@@ -48,11 +51,38 @@ def others_of(
         key: Other(names[key], match, stride_bytes(frames, dimension, itemsize, k), k)
         for (key, k), match in zip(strides.items(), nearest, strict=True)
     }
-    null = null_control(model, stored, seen, seed, progress=progress)
-    others["null"] = Other("null: all learnt shuffled", null)
+    if model.trained is None:
+        null = null_control(model, stored, seen, seed, progress=progress)
+        others["null"] = Other("null: all learnt shuffled", null)
     null = null_control(model, stored, seen, seed, same_plan=True, progress=progress)
-    others["null_same_plan"] = Other("null: this map's layers, shuffled", null)
+    if model.trained is None:
+        others["null_same_plan"] = Other("null: this map's layers, shuffled", null)
+    else:  # training anew is a run of its own
+        others["null"] = Other("null: templates of shuffled frames", null)
     return others
+
+
+def hog_others(
+    reference: Traverse, query: Traverse, batch_size: int, tolerance: int, progress: bool
+) -> dict[str, Other]:
+    """What a map of other features is set beside: HOG of all frames, and of every k-th, k = 2 x tolerance.
+
+    Nothing where frames are too small for HOG.
+    """
+    plain = DejaVu(batch_size=batch_size)
+    try:
+        stored = plain.extract_all(reference, "HOG of the reference" if progress else None)
+        seen = plain.extract_all(query, "HOG of the queries" if progress else None)
+    except InputError as error:
+        log.info("no HOG to compare with: %s", error)
+        return {}
+    steps = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
+    nearest = nearest_frames(stored, seen, tuple(steps.values()), progress=progress)
+    frames, dimension = stored.shape
+    return {
+        key: Other(f"HOG, {_every(k)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k)
+        for (key, k), match in zip(steps.items(), nearest, strict=True)
+    }
 
 
 def _every(k: int) -> str:

@@ -140,6 +140,8 @@ def draw_features(model: DejaVu, reference: Traverse, stored: Tensor) -> dict[st
         return {}
     pictures = {}
     layer, templates = plan[leading[0]], model.map.blocks()[leading[0]].detach().cpu()
+    if len(model.map.weights):  # in the units of the features
+        templates = templates / model.map.weights.detach().cpu()[list(layer.features)].clamp(min=1e-6)
     chosen = best_explained(stored, layer, templates)
     feature = layer.features[chosen]
     values = stored[:, feature : feature + 1].cpu()
@@ -159,7 +161,8 @@ def draw_features(model: DejaVu, reference: Traverse, stored: Tensor) -> dict[st
         plot_templates(layer, values[layer.start : layer.stop, 0], templates, chosen),
         "frames of equal phase become templates",
         "Above, the same feature cut into cycles of one period and laid over each other; their mean is "
-        "what the map stores. Below, such means for the layer's features, a row each.",
+        f"what {'training starts from' if model.trained else 'the map stores'}. Below, the "
+        f"{'trained templates' if model.trained else 'means'} of the layer's features, a row each.",
     )
     features = model.features
     if type(features) is HOG:
@@ -228,6 +231,8 @@ def layer_distances(model: DejaVu, queries: Tensor, j: int) -> Tensor:
     """Eq. 3 for one layer of the map: (Q,D) -> (Q,P)."""
     block, features = model.map.blocks()[j], model.map.layer_features()[j]
     chosen = queries.index_select(1, features.to(queries.device)).to(block.device)
+    if len(model.map.weights):
+        chosen = chosen * model.map.weights[features]
     return phase_distances(chosen, block, model.matcher.metric)
 
 

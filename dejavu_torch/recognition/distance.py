@@ -67,9 +67,10 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
     dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
     with torch.autocast(query.device.type, enabled=False):
         distances = function(query.to(dtype), templates.to(dtype))
-    if distances.shape != (len(query), len(templates)):
+    expected = (query.shape[0], templates.shape[0])  # len() would fix the batch of an exported program
+    if distances.shape != expected:
         raise InputError(
-            f"the metric gave {tuple(distances.shape)} for {len(query)} queries and {len(templates)} "
-            f"phases; expected ({len(query)}, {len(templates)})"
+            f"the metric gave {tuple(distances.shape)} for {expected[0]} queries and {expected[1]} phases; "
+            f"expected {expected}"
         )
     return distances

@@ -75,42 +75,79 @@ def combine_layers(
     return torch.cat(parts, 1)
 
 
+def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
+    """How unlikely each place is: -log softmax(-S / T) over places.
+
+    It orders the places of a query as S does, and makes the scores of different queries comparable: S grows
+    with all that a frame has in no template, this only with what fits other places as well.
+
+    Args:
+        scores: S, lower is better. temperature: T, in units of S.
+
+    Shape: (Q,N) -> (Q,N), in nats, lower is better, at least 0.
+
+    Convention: a place that scores +inf has no probability and stays +inf.
+
+    Example:
+        >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()
+        [[0.6931471824645996, 0.6931471824645996, inf]]
+    """
+    closed = scores.isinf()
+    reachable = ~closed.all(1, keepdim=True)
+    # what is +inf must not meet T: its gradient would be NaN
+    logits = (-scores.masked_fill(closed, 0) / temperature).masked_fill(closed & reachable, -math.inf)
+    return -logits.log_softmax(1).masked_fill(closed, -math.inf)
+
+
 class Matcher(nn.Module):
     """Scores of every place of a map for every query (section III-B).
 
     Args:
         metric: see `phase_distances`.
         reduction: see `combine_layers`; "sum" is the paper's letter.
+        temperature: scores are those of `log_posterior`; None, the paper's letter, leaves S as it is.
 
     Shape: query features (Q,D), map of N places -> scores (Q,N), lower is better, uncovered +inf.
 
     Convention: gradients reach the query features and the map's templates.
 
     Raises:
-        InputError: features of another dimension than the map's, an unknown metric or reduction.
+        InputError: features of another dimension than the map's, an unknown metric or reduction, a
+            temperature of 0 or less.
     """
 
-    def __init__(self, metric: Metric = "l1", reduction: Reduction = "mean") -> None:
+    def __init__(
+        self, metric: Metric = "l1", reduction: Reduction = "mean", temperature: float | None = None
+    ) -> None:
         super().__init__()
         check_metric(metric)
         if reduction not in ("mean", "sum"):
             raise InputError(f"reduction {reduction!r} is unknown; expected 'mean' or 'sum'")
+        if temperature is not None and not 0 < temperature < math.inf:
+            raise InputError(f"the temperature is {temperature}; expected a number above 0")
         self.metric = metric
         self.reduction: Reduction = reduction
+        self.temperature = temperature
 
-    def forward(self, features: Tensor, route: CompressedMap) -> Tensor:
+    def distances(self, features: Tensor, route: CompressedMap) -> list[Tensor]:
+        """Eq. 3 for every layer: (Q,D) -> L tensors (Q,P)."""
         if features.ndim != 2 or features.shape[1] != route.dimension:
             raise InputError(
                 f"the query features are {tuple(features.shape)}; the map expects (Q, {route.dimension})"
             )
-        if not route.plan:
-            dtype = torch.promote_types(features.dtype, torch.float32)
-            return features.new_full((len(features), route.places), math.inf, dtype=dtype)
-        distances = [
+        features = route.weighted(features)
+        return [
             phase_distances(features.index_select(1, index), block, self.metric)
             for index, block in zip(route.layer_features(), route.blocks(), strict=True)
         ]
-        return combine_layers(distances, route.plan, route.places, self.metric, self.reduction)
+
+    def forward(self, features: Tensor, route: CompressedMap) -> Tensor:
+        distances = self.distances(features, route)
+        if not distances:
+            dtype = torch.promote_types(features.dtype, torch.float32)
+            return features.new_full((len(features), route.places), math.inf, dtype=dtype)
+        scores = combine_layers(distances, route.plan, route.places, self.metric, self.reduction)
+        return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
     def extra_repr(self) -> str:
-        return f"metric={self.metric!r}, reduction={self.reduction!r}"
+        return f"metric={self.metric!r}, reduction={self.reduction!r}, temperature={self.temperature}"

@@ -215,3 +215,20 @@ def test_a_folder_of_folders_is_told(tmp_path: Path) -> None:
     (tmp_path / "day").mkdir()
     with refused("holds no images", "it has folders such as day"):
         ImageFolder(tmp_path)
+
+
+def test_a_part_of_a_folder_is_a_traverse(tmp_path: Path) -> None:
+    for i in range(10):
+        Image.new("L", (4, 4), i * 10).save(tmp_path / f"{i}.png")
+    whole, part = all_of(ImageFolder(tmp_path)), ImageFolder(tmp_path, start=3, stop=8, step=2)
+    assert (part.length, part.name) == (3, f"{tmp_path}?start=3&stop=8")
+    assert torch.equal(all_of(part), whole[3:8:2])
+    assert torch.equal(all_of(ImageFolder(tmp_path, start=7)), whole[7:])
+
+
+@pytest.mark.parametrize(("start", "stop"), [(-1, 0), (0, 11), (5, 5), (6, 5), (10, 0), (0, -1)])
+def test_a_part_that_is_not_there_is_refused(tmp_path: Path, start: int, stop: int) -> None:
+    for i in range(10):
+        Image.new("L", (4, 4)).save(tmp_path / f"{i}.png")
+    with refused(f"start={start}", "10 images"):
+        ImageFolder(tmp_path, start=start, stop=stop)

@@ -7,10 +7,12 @@ from fractions import Fraction
 import pytest
 import reference
 import torch
+from helpers import refused
 from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from dejavu_torch import CompressedMap, FrequencyLayer, InputError, PhaseTemplates
+from dejavu_torch import CompressedMap, FrequencyLayer, InputError, Matcher, PhaseTemplates
 from dejavu_torch.types import Plan
 
 PLAN: Plan = (
@@ -40,6 +42,7 @@ def test_buffers_are_flat_rows(route: CompressedMap) -> None:
         "feature_index": (6,),
         "templates": (numbers,),
         "way": (0,),
+        "weights": (0,),
     }
     assert route.size.tolist() == [300, 4]
     assert route.layers.tolist() == [[195, 2, 98, 0, 200], [7, 1, 7, 100, 250], [115, 1, 23, 100, 250]]
@@ -191,6 +194,11 @@ def changed(tensor: Tensor, row: int, column: int, value: int) -> Tensor:
         ("feature_index", lambda t: t + 1, r"feature 4; expected it inside"),
         ("templates", lambda t: t[:-1], r"271.*expected \D*272"),
         ("templates", lambda t: t[None], r"templates .*\(1, 272\)"),
+        ("weights", lambda t: torch.ones(3), r"weights \(3,\); expected \(4,\) or none"),
+        ("weights", lambda t: torch.ones(4, 1), r"weights \(4, 1\); expected \(4,\) or none"),
+        ("weights", lambda t: torch.tensor([1, 1, 1, torch.nan]), r"weights that are not finite"),
+        ("weights", lambda t: torch.tensor([1, 1, 1, torch.inf]), r"weights that are not finite"),
+        ("weights", lambda t: torch.ones(4, dtype=torch.int64), r"weights that are not finite floats"),
     ],
 )
 def test_buffers_that_do_not_fit_together_are_refused(
@@ -217,3 +225,183 @@ def test_templates_that_are_not_finite_are_refused(route: CompressedMap, bad: fl
     state["templates"][5] = bad
     with pytest.raises(InputError, match="not finite"):
         CompressedMap().load_state_dict(state)
+
+
+# weights, and training
+
+WEIGHTS = torch.tensor([0.5, -1.5, 0.0, 2.0])
+
+
+def scores(route: CompressedMap, metric: str = "l1") -> Tensor:
+    queries = torch.rand(5, DIMENSION, generator=torch.Generator().manual_seed(1))
+    return Matcher(metric)(queries, route)
+
+
+def same(one: Tensor, other: Tensor) -> None:
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
+
+
+def parameters(route: CompressedMap) -> set[str]:
+    return {name for name, _ in route.named_parameters()}
+
+
+def test_a_weight_says_what_a_difference_in_its_feature_counts() -> None:
+    plan = (FrequencyLayer(Fraction(2), 2, 0, 4, (0, 1)),)
+    weights = torch.tensor([3.0, 0.5])
+    values = torch.tensor([[1.0, 8.0], [5.0, 2.0], [1.0, 8.0], [5.0, 2.0]])
+    blocks = PhaseTemplates()(values * weights, plan)
+    route = CompressedMap(plan, blocks, 4, 2, weights=weights)
+    query = torch.tensor([[2.0, 2.0]])
+    assert route.weighted(query).tolist() == [[6.0, 1.0]]
+    distances = [3 * 1 + 0.5 * 6, 3 * 3 + 0.5 * 0]
+    assert Matcher(reduction="sum")(query, route).tolist() == [2 * distances]
+
+
+def test_without_weights_features_stay_as_they_are(route: CompressedMap) -> None:
+    features = torch.rand(3, DIMENSION)
+    assert torch.equal(route.weighted(features), features)
+
+
+@given(drawn=reference.routes(), seed=st.integers(0, 2**16))
+def test_weights_and_templates_scale_alike(drawn: reference.Route, seed: int) -> None:
+    """The map of weighted features, given weighted queries, is the map with weights."""
+    generator = torch.Generator().manual_seed(seed)
+    weights = torch.rand(drawn.values.shape[1], generator=generator)
+    queries = torch.randn(3, len(weights), generator=generator, dtype=torch.float64)
+    route = make(drawn.values, drawn.plan)
+    route.trainable(weights=True, start=weights)
+    expected = Matcher()(queries * weights, make(drawn.values * weights, drawn.plan))
+    torch.testing.assert_close(Matcher()(queries, route), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("weights", [False, True])
+@pytest.mark.parametrize("templates", [False, True])
+def test_training_is_asked_for_and_settled_without_a_change_of_scores(
+    route: CompressedMap, templates: bool, weights: bool
+) -> None:
+    before = scores(route)
+    route.trainable(templates, weights)
+    assert parameters(route) == {n for n, on in (("templates", templates), ("weights", weights)) if on}
+    assert torch.equal(scores(route), before)
+    route.settle()
+    assert parameters(route) == set()
+    assert torch.equal(scores(route), before)
+    assert route.weights.tolist() == [1.0] * DIMENSION * weights
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+def test_trained_weights_settle_to_none_below_0(route: CompressedMap, metric: str) -> None:
+    route.trainable(weights=True)
+    with torch.no_grad():
+        route.weights.copy_(WEIGHTS)
+        route.templates.add_(torch.randn_like(route.templates))
+    before = scores(route, metric)
+    route.settle()
+    assert torch.equal(route.weights, WEIGHTS.abs())
+    same(scores(route, metric), before)
+
+
+def test_settling_twice_changes_nothing(route: CompressedMap) -> None:
+    route.trainable(weights=True, start=WEIGHTS)
+    route.settle()
+    before = route.templates.clone()
+    route.settle()
+    assert torch.equal(route.templates, before)
+
+
+def test_gradients_reach_templates_and_weights(route: CompressedMap) -> None:
+    route.trainable(weights=True)
+    found = scores(route)
+    found[found.isfinite()].sum().backward()
+    for name, parameter in route.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all()
+        assert parameter.grad.abs().max() > 0
+
+
+def test_training_goes_on_from_weights(route: CompressedMap) -> None:
+    """The templates, made of plain features, become those of weighted ones; once only."""
+    plain = [block.clone() for block in route.blocks()]
+    route.trainable(weights=True, start=WEIGHTS)
+    assert torch.equal(route.weights, WEIGHTS)
+    for block, old, layer in zip(route.blocks(), plain, PLAN, strict=True):
+        assert torch.equal(block, old * WEIGHTS[list(layer.features)])
+    before = scores(route)
+    route.trainable(weights=True, start=torch.ones(DIMENSION))
+    assert torch.equal(route.weights, WEIGHTS.abs())
+    same(scores(route), before)
+
+
+def test_the_start_is_copied_and_an_empty_one_is_none(route: CompressedMap) -> None:
+    start = torch.ones(DIMENSION)
+    route.trainable(weights=True, start=start)
+    start.zero_()
+    assert route.weights.tolist() == [1.0] * DIMENSION
+    other = make(torch.rand(PLACES, DIMENSION), PLAN)
+    other.trainable(weights=True, start=torch.zeros(0))
+    assert other.weights.tolist() == [1.0] * DIMENSION
+
+
+def test_weights_can_be_trained_after_the_templates(route: CompressedMap) -> None:
+    before = scores(route)
+    route.trainable()
+    route.trainable(templates=False, weights=True)
+    assert parameters(route) == {"weights"}
+    assert torch.equal(scores(route), before)
+
+
+@pytest.mark.parametrize("shape", [(3,), (5,), (4, 1)])
+def test_a_start_of_another_shape_is_refused(route: CompressedMap, shape: tuple[int, ...]) -> None:
+    with refused(f"weights start as {shape}", "expected (4,)"):
+        route.trainable(weights=True, start=torch.ones(shape))
+
+
+def test_training_that_ended_in_nan_is_not_settled(route: CompressedMap) -> None:
+    route.trainable(weights=True)
+    with torch.no_grad():
+        route.weights[1] = torch.nan
+    with refused("weights that are not finite"):
+        route.settle()
+
+
+def test_a_map_without_layers_can_be_trained_and_settled() -> None:
+    route = CompressedMap((), (), 20, DIMENSION)
+    route.trainable(weights=True, start=WEIGHTS)
+    route.settle()
+    assert route.weights.tolist() == WEIGHTS.abs().tolist()
+    assert scores(route).isposinf().all()
+
+
+@pytest.mark.parametrize("settled", [True, False])
+def test_trained_weights_go_into_an_empty_map(route: CompressedMap, settled: bool) -> None:
+    route.trainable(weights=True, start=WEIGHTS)
+    if settled:
+        route.settle()
+    other = CompressedMap()
+    other.load_state_dict(route.state_dict())
+    assert torch.equal(other.weights, route.weights)
+    assert torch.equal(scores(other), scores(route))
+
+
+def test_a_state_goes_into_a_map_that_trains(route: CompressedMap) -> None:
+    """As a checkpoint does; weights may be below 0 on the way."""
+    route.trainable(weights=True, start=WEIGHTS)
+    other = make(torch.rand(PLACES, DIMENSION), PLAN)
+    other.trainable(weights=True)
+    parameter = other.weights
+    other.load_state_dict(route.state_dict())
+    assert other.weights is parameter
+    assert parameters(other) == {"templates", "weights"}
+    assert torch.equal(scores(other), scores(route))
+
+
+def test_a_state_of_other_layers_does_not_go_into_a_map_that_trains(route: CompressedMap) -> None:
+    route.trainable()
+    other = make(torch.rand(20, 1), (FrequencyLayer(Fraction(5), 5, 0, 20, (0,)),))
+    with pytest.raises((RuntimeError, InputError), match="templates"):
+        route.load_state_dict(other.state_dict())
+
+
+def test_double_weights_follow_the_templates(route: CompressedMap) -> None:
+    route.double().trainable(weights=True)
+    assert route.weights.dtype == torch.float64

@@ -20,11 +20,13 @@ from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.mapfile import read_compressed, recipe_of
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer
+from dejavu_torch.types import FrequencyLayer, Training
 
 WINDOW = SpectrogramAnalysis(window=64, strongest=1)
 
@@ -213,7 +215,7 @@ def test_the_claimed_size_holds_with_any_features(path: Path, features: nn.Modul
 
 def test_metadata_names_format_version_plan_and_config(saved: Path) -> None:
     tensors, metadata = contents(saved)
-    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", 2)
+    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", 3)
     plan = json.loads(metadata["plan"])
     assert tensors[plan["tensor"]].tolist() == [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
     assert plan["columns"] == ["period_numerator", "period_denominator", "phases", "start", "stop"]
@@ -308,19 +310,24 @@ def test_a_missing_file_and_a_folder_are_refused(path: Path) -> None:
 
 
 def test_a_newer_format_is_refused(saved: Path) -> None:
-    craft(saved, metadata={"version": "3"})
-    with refused(str(saved), "format 3", "up to 2", "newer"):
+    craft(saved, metadata={"version": "4"})
+    with refused(str(saved), "format 4", "up to 3", "newer"):
         DejaVu.load(saved)
 
 
-def test_a_map_of_the_first_format_is_read(saved: Path) -> None:
-    """It knew nothing of even steps."""
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_map_of_an_older_format_is_read(saved: Path, version: int) -> None:
+    """The second knew neither weights nor temperature nor training, the first nor even steps."""
     known = DejaVu.load(saved)
     tensors, metadata = contents(saved)
     config = json.loads(metadata["config"])
-    del tensors["map.way"], config["velocity"], config["step"]
-    safetensors.torch.save_file(tensors, saved, metadata | {"version": "1", "config": json.dumps(config)})
+    del tensors["map.weights"], config["temperature"], config["trained"]
+    if version == 1:
+        del tensors["map.way"], config["velocity"], config["step"]
+    old = metadata | {"version": str(version), "config": json.dumps(config)}
+    safetensors.torch.save_file(tensors, saved, old)
     again = DejaVu.load(saved)
+    assert (again.trained, again.matcher.temperature, len(again.map.weights)) == (None, None, 0)
     for one, other in zip(again.localize(waves()), known.localize(waves()), strict=True):
         assert torch.equal(one, other)
     assert read_compressed(saved).places == known.map.places
@@ -349,6 +356,14 @@ def test_damaged_metadata_is_refused(saved: Path, metadata: dict[str, str | None
         DejaVu.load(saved)
 
 
+@pytest.mark.parametrize("version", ["1", "2"])
+@pytest.mark.parametrize("config", ["[]", "3", "{}"])
+def test_damaged_metadata_of_an_older_format_is_refused(saved: Path, version: str, config: str) -> None:
+    craft(saved, metadata={"version": version, "config": config})
+    with refused(str(saved)):
+        DejaVu.load(saved)
+
+
 def test_a_version_that_is_no_number_is_refused(saved: Path) -> None:
     craft(saved, metadata={"version": "one"})
     with refused(str(saved)):
@@ -373,6 +388,10 @@ def test_a_version_that_is_no_number_is_refused(saved: Path) -> None:
         {"velocity": 3},
         {"step": 2.0},
         {"step": "far"},
+        {"temperature": 0.0},
+        {"temperature": "warm"},
+        {"trained": 3},
+        {"trained": {"steps": 3}},
     ],
     ids=str,
 )
@@ -432,6 +451,8 @@ LAYERS = [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
         ("templates", [0.0] * 16),
         ("templates", [0.0] * 18),
         ("templates", [[0.0] * 17]),
+        ("weights", [1.0]),
+        ("weights", [1.0, float("nan")]),
     ],
 )
 def test_buffers_that_do_not_fit_together_are_refused(saved: Path, name: str, value: list[Any]) -> None:
@@ -456,7 +477,7 @@ def test_buffers_of_another_type_are_refused(saved: Path, name: str, value: Tens
         DejaVu.load(saved)
 
 
-@pytest.mark.parametrize("name", ["size", "layers", "feature_ptr", "feature_index", "templates"])
+@pytest.mark.parametrize("name", ["size", "layers", "feature_ptr", "feature_index", "templates", "weights"])
 def test_a_missing_buffer_is_refused(saved: Path, name: str) -> None:
     tensors, metadata = contents(saved)
     del tensors[f"map.{name}"]
@@ -538,6 +559,134 @@ def test_a_map_made_with_a_period_finder_of_its_own_state_can_be_read(path: Path
     DejaVu.load(path)
 
 
+# an Embedding: features of this package around a network that may be from elsewhere
+
+
+class Patch(nn.Module):
+    """A network from elsewhere, of as many channels as it is told."""
+
+    def __init__(self, channels: int = 2) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(1, channels, 3)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return self.convolution(frames)
+
+
+def embedding(network: nn.Module, **settings: Any) -> Embedding:
+    return Embedding(network, **{"dimension": 5, "channels": 1, "resize": (8, 8)} | settings)
+
+
+def learnt_with(features: nn.Module, path: Path) -> DejaVu:
+    model = DejaVu(features, Fixed(FrequencyLayer(Fraction(8), 8, 0, 64, (0, 1, 2)))).learn(pictures())
+    model.save(path)
+    return model
+
+
+def test_recipes_of_nested_modules() -> None:
+    own = embedding(SmallCNN(dimension=4, channels=1, widths=(2, 3)), grid=2)
+    recipe = recipe_of(own)
+    assert recipe.class_path == "dejavu_torch.features.embedding.Embedding"
+    network = recipe.init_args.pop("network")
+    assert recipe.init_args == {"dimension": 5, "channels": 1, "resize": [8, 8], "grid": 2, "cell": 0}
+    assert network["class_path"] == "dejavu_torch.features.cnn.SmallCNN"
+    assert (network["init_args"]["dimension"], network["init_args"]["widths"]) == (4, [2, 3])
+    foreign = recipe_of(embedding(Patch())).init_args["network"]
+    assert foreign == {"class_path": f"{__name__}.Patch", "init_args": {}}
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SmallCNN(dimension=4, channels=1, resize=(8, 8), widths=(2,), squeeze=2),
+        lambda: embedding(SmallCNN(dimension=4, channels=1, resize=(8, 8), widths=(2,))),
+        lambda: embedding(embedding(SmallCNN(dimension=4, channels=1, widths=(2, 3))), cell=4),
+    ],
+    ids=["SmallCNN", "Embedding", "Embedding of an Embedding"],
+)
+def test_learnt_features_of_this_package_load_by_themselves(path: Path, make: Any) -> None:
+    torch.manual_seed(0)
+    model = learnt_with(make(), path)
+    query = pictures(5)
+    for again in (DejaVu.load(path), DejaVu.load(path, make())):
+        assert recipe_of(again.features) == recipe_of(model.features)
+        assert torch.equal(again.localize(query).score, model.localize(query).score)
+    assert model.backbone_bytes > 0
+    assert path.stat().st_size == model.map_bytes
+
+
+def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> None:
+    torch.manual_seed(0)
+    model, query = learnt_with(embedding(Patch()), path), pictures(5)
+    with refused(str(path), "Patch", "only the caller can load", "--features", "features=... in Python"):
+        DejaVu.load(path)
+    torch.manual_seed(1)
+    given = embedding(Patch())
+    again = DejaVu.load(path, given)
+    assert again.features is given
+    assert torch.equal(given.network.convolution.weight, model.features.network.convolution.weight)
+    assert torch.equal(again.localize(query).score, model.localize(query).score)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: embedding(Patch(), grid=2), ("'grid': 1", "'grid': 2")),
+        (lambda: embedding(Small()), ("Patch", "Small")),
+        (Patch, ("Embedding", "Patch")),
+        (lambda: embedding(Patch(3)), ("does not fit",)),
+    ],
+)
+def test_another_embedding_is_refused(path: Path, make: Any, words: tuple[str, ...]) -> None:
+    learnt_with(embedding(Patch()), path)
+    with refused(str(path), *words):
+        DejaVu.load(path, make())
+
+
+# what training leaves in the file
+
+
+@pytest.fixture
+def trained(path: Path) -> DejaVu:
+    """As training leaves a model: templates, weights and temperature that no eq. 1 gives."""
+    model = DejaVu(periods=WINDOW, temperature=0.07).learn(waves())
+    model.map.trainable(weights=True, start=torch.tensor([0.5, -2.0]))
+    with torch.no_grad():
+        model.map.templates.add_(0.1)
+    model.map.settle()
+    model.trained = Training(steps=12, seconds=3.5, seed=4)
+    model.save(path)
+    return model
+
+
+def test_a_trained_map_comes_back(path: Path, trained: DejaVu) -> None:
+    again, query = DejaVu.load(path), waves() + 0.3 * torch.rand(64, 2)
+    assert torch.equal(again(query), trained(query))
+    assert again.map.weights.tolist() == [0.5, 2.0]
+    assert again.matcher.temperature == 0.07
+    assert again.trained == Training(12, 3.5, 4)
+    assert isinstance(again.trained, Training)
+    assert path.stat().st_size == trained.map_bytes == again.map_bytes
+    assert torch.equal(read_compressed(path).weights, again.map.weights)
+
+
+def test_the_header_tells_of_training(path: Path, trained: DejaVu, tmp_path: Path) -> None:
+    config = json.loads(contents(path)[1]["config"])
+    assert config["trained"] == {"steps": 12, "seconds": 3.5, "seed": 4}
+    assert config["temperature"] == 0.07
+    trained.learn(waves())  # by eq. 1 again
+    trained.save(tmp_path / "learnt.safetensors")
+    again = DejaVu.load(tmp_path / "learnt.safetensors")
+    assert (again.trained, len(again.map.weights)) == (None, 0)
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+def test_training_of_any_seed_comes_back(path: Path, trained: DejaVu, seed: int | None) -> None:
+    trained.trained = Training(0, 0.0, seed)
+    trained.save(path)
+    assert DejaVu.load(path).trained == Training(0, 0.0, seed)
+
+
 # no file names code to import
 
 
@@ -570,10 +719,14 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     ],
 )
 @pytest.mark.parametrize("init_args", [{}, {"command": "touch mark"}])
+@pytest.mark.parametrize("nested", [False, True])
 def test_no_foreign_class_path_is_imported(
-    saved: Path, trap: Path, class_path: str, init_args: dict[str, str]
+    saved: Path, trap: Path, class_path: str, init_args: dict[str, str], nested: bool
 ) -> None:
-    foreign = {"class_path": class_path, "init_args": init_args}
+    foreign: dict[str, Any] = {"class_path": class_path, "init_args": init_args}
+    if nested:
+        outer = "dejavu_torch.features.embedding.Embedding"
+        foreign = {"class_path": outer, "init_args": {"network": foreign}}
     craft(saved, features=foreign)
     with refused():
         DejaVu.load(saved)

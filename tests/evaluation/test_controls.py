@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import Fixed
+from helpers import Fixed, refused
 from torch import Tensor
 
 from dejavu_torch.evaluation.controls import leave_out_match, null_control, same_settings
 from dejavu_torch.evaluation.curves import judge
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, InputError, Match, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Match, Plan, Training
 
 
 def layer(
@@ -88,8 +88,10 @@ def test_same_settings_and_no_map(metric: str) -> None:
         periods=Fixed(layer(8, 0, 64, 0, 1)), metric=metric, reduction="sum", threshold=0.1, batch_size=5
     )
     model.learn(torch.rand(64, 2))
+    model.matcher.temperature = 0.2
     other = same_settings(model)
-    assert (other.matcher.metric, other.matcher.reduction) == (metric, "sum")
+    matcher = other.matcher
+    assert (matcher.metric, matcher.reduction, matcher.temperature) == (metric, "sum", 0.2)
     assert (other.threshold, other.batch_size, other.map.places) == (0.1, 5, 0)
     assert (other.features, other.periods) == (model.features, model.periods)
 
@@ -112,6 +114,20 @@ def test_the_null_of_the_same_plan_tells_a_store_of_frames_from_periods() -> Non
     query = reference + 0.01 * torch.rand(100, 30)
     match = null_control(model, reference, query, same_plan=True)
     assert match.index.tolist() == list(range(100))
+
+
+def test_the_null_of_the_same_plan_keeps_the_weights_of_the_features() -> None:
+    """A template a frame: every frame is found at 0 only where both sides are weighted."""
+    reference = torch.rand(30, 4)
+    model = DejaVu(periods=Fixed(layer(30, 0, 30, 0, 1, 2, 3))).learn_features(reference)
+    model.map.trainable(weights=True, start=torch.tensor([0.0, 1.0, 2.0, 5.0]))
+    model.map.settle()
+    templates = model.map.templates.clone()
+    query = reference + torch.tensor([9.0, 0.0, 0.0, 0.0])  # what differs counts nothing
+    match = null_control(model, reference, query, same_plan=True)
+    assert match.index.tolist() == list(range(30))
+    assert match.score.abs().max() < 1e-6
+    assert torch.equal(model.map.templates, templates)
 
 
 # leave out
@@ -236,3 +252,30 @@ def test_other_features_than_the_map_s_are_refused(shape: tuple[int, int], width
     model = DejaVu(periods=Fixed(layer(4, 0, 40, 0, 1, 2))).learn(torch.rand(40, 3))
     with pytest.raises(InputError, match=r"\Aleave-out got width [^\n]*expected width >= 0 and \(40, 3\)\Z"):
         leave_out_match(model, torch.rand(*shape), width)
+
+
+def test_leave_out_scores_as_the_model_does() -> None:
+    """With its temperature, and with the weights of the features."""
+    features = torch.rand(40, 3, dtype=torch.float64)
+    model = DejaVu(periods=Fixed(layer(4, 0, 40, 0, 1, 2), layer(5, 0, 30, 0, 1))).learn(features)
+    plain = leave_out_match(model, features, 2)
+    model.matcher.temperature = 0.1
+    likely = leave_out_match(model, features, 2)
+    assert torch.equal(likely.index, plain.index)
+    assert not torch.allclose(likely.score, plain.score)
+    weights = torch.tensor([0.5, 2.0, 0.0], dtype=torch.float64)
+    weighted = DejaVu(periods=model.periods, temperature=0.1).learn(features * weights)
+    expected = leave_out_match(weighted, features * weights, 2)
+    model.map.trainable(weights=True, start=weights)
+    model.map.settle()
+    found = leave_out_match(model, features, 2)
+    assert torch.equal(found.index, expected.index)
+    torch.testing.assert_close(found.score, expected.score, rtol=0, atol=1e-9)
+
+
+def test_leave_out_of_trained_templates_is_refused() -> None:
+    features = torch.rand(40, 3)
+    model = DejaVu(periods=Fixed(layer(4, 0, 40, 0, 1, 2))).learn(features)
+    model.trained = Training(10, 1.0, None)
+    with refused("trained templates", "expected a map that was learnt"):
+        leave_out_match(model, features)

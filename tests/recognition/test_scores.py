@@ -25,7 +25,7 @@ from dejavu_torch import (
 )
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import common_period
-from dejavu_torch.recognition.scores import combine_layers, segments
+from dejavu_torch.recognition.scores import combine_layers, log_posterior, segments
 from dejavu_torch.types import Plan
 
 METRICS = ["l1", "l2", "cosine"]
@@ -356,8 +356,128 @@ def test_queries_of_another_dimension_are_refused(shape: tuple[int, ...]) -> Non
     [
         ({"metric": "manhattan"}, r"metric 'manhattan' is unknown; expected l1, l2, cosine"),
         ({"reduction": "max"}, r"reduction 'max' is unknown; expected 'mean' or 'sum'"),
+        ({"temperature": 0.0}, r"temperature is 0.0; expected a number above 0"),
+        ({"temperature": -1.0}, r"temperature is -1.0; expected a number above 0"),
+        ({"temperature": math.inf}, r"temperature is inf; expected a number above 0"),
+        ({"temperature": math.nan}, r"temperature is nan; expected a number above 0"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Matcher(**arguments)
+
+
+# ------------------------------------------------------------------ temperature
+
+
+def literal_posterior(row: list[float], temperature: float) -> list[float]:
+    likely = [math.exp(-score / temperature) for score in row]
+    return [-math.log(one / sum(likely)) if one else math.inf for one in likely]
+
+
+@given(
+    rows=st.lists(
+        st.lists(st.floats(0, 20) | st.just(math.inf), min_size=4, max_size=4), min_size=1, max_size=3
+    ),
+    temperature=st.floats(0.1, 5),
+)
+def test_log_posterior_equals_the_loops(rows: list[list[float]], temperature: float) -> None:
+    found = log_posterior(torch.tensor(rows, dtype=torch.float64), temperature)
+    none = [math.inf] * 4
+    expected = [none if row == none else literal_posterior(row, temperature) for row in rows]
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-12)
+
+
+def test_log_posterior_in_closed_form() -> None:
+    """Two places D apart: log(1 + exp(-D / T)) and that of -D; n equal ones: log n."""
+    low, high = log_posterior(torch.tensor([[1.0, 1.5]], dtype=torch.float64), 0.25)[0].tolist()
+    assert low == pytest.approx(math.log1p(math.exp(-2)))
+    assert high == pytest.approx(math.log1p(math.exp(2)))
+    equal = log_posterior(torch.full((2, 7), 3.0), 0.1)
+    torch.testing.assert_close(equal, torch.full((2, 7), math.log(7)))
+    assert log_posterior(torch.tensor([[math.inf, 5.0]]), 0.1).tolist() == [[math.inf, 0.0]]
+
+
+def test_log_posterior_survives_scores_far_beyond_the_temperature() -> None:
+    found = log_posterior(torch.tensor([[3000.0, 3001.0, math.inf]]), 1e-3)
+    assert found.tolist() == [[0.0, pytest.approx(1000.0), math.inf]]
+
+
+def test_log_posterior_does_not_see_what_fits_no_place() -> None:
+    """What raises S at all places alike changes nothing: that is what makes queries comparable."""
+    scores = torch.rand(3, 8, dtype=torch.float64)
+    shifted = scores + torch.tensor([[0.0], [5.0], [50.0]])
+    torch.testing.assert_close(log_posterior(shifted, 0.3), log_posterior(scores, 0.3), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+def test_a_temperature_leaves_the_order_of_places(reduction: str) -> None:
+    values = torch.rand(60, 4, dtype=torch.float64)
+    route, queries = make(values, MIXED), torch.rand(7, 4, dtype=torch.float64)
+    plain = Matcher(reduction=reduction)(queries, route)  # type: ignore[arg-type]
+    scores = Matcher(reduction=reduction, temperature=0.2)(queries, route)  # type: ignore[arg-type]
+    torch.testing.assert_close(scores, log_posterior(plain, 0.2))
+    assert torch.equal(scores.argsort(dim=1, stable=True), plain.argsort(dim=1, stable=True))
+    assert torch.equal(best_match(scores).index, best_match(plain).index)
+    assert (scores >= 0).all()
+    torch.testing.assert_close((-scores).exp().sum(1), torch.ones(7, dtype=torch.float64))
+
+
+def test_convention_2_a_temperature_leaves_uncovered_places_at_inf() -> None:
+    values = torch.rand(60, 4)
+    plain, scores = (Matcher(temperature=t)(values[:5], make(values, MIXED)) for t in (None, 0.1))
+    assert plain.isposinf().any()
+    assert torch.equal(scores.isposinf(), plain.isposinf())
+    nowhere = Matcher(temperature=0.1)(torch.rand(3, 4), CompressedMap((), (), 20, 4))
+    assert nowhere.isposinf().all()
+    assert best_match(log_posterior(torch.full((2, 3), math.inf), 0.1)).index.tolist() == [-1, -1]
+
+
+def test_gradients_of_log_posterior_are_right_towards_scores_and_temperature() -> None:
+    scores = torch.rand(3, 5, dtype=torch.float64, requires_grad=True)
+    temperature = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(log_posterior, (scores, temperature))
+    closed = torch.tensor([[0, 1, 0, 0, 1], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1]], dtype=torch.bool)
+
+    def reachable(scores: Tensor, temperature: Tensor) -> Tensor:
+        return log_posterior(scores.masked_fill(closed, math.inf), temperature)[~closed]
+
+    assert torch.autograd.gradcheck(reachable, (scores, temperature))
+
+
+def test_places_at_inf_leave_gradients_finite() -> None:
+    inf = math.inf
+    scores = torch.tensor([[1.0, inf, 2.0], [inf, inf, inf], [0.0, 0.0, 0.0]], requires_grad=True)
+    temperature = torch.tensor(0.1, requires_grad=True)
+    (-log_posterior(scores, temperature)).exp().square().sum().backward()
+    assert scores.grad is not None
+    assert temperature.grad is not None
+    assert scores.grad.isfinite().all()
+    assert temperature.grad.isfinite()
+    assert scores.grad[0, 1] == 0
+    assert scores.grad[1].tolist() == [0, 0, 0]
+    assert scores.grad[0, 0] != 0
+
+
+def test_gradients_reach_queries_and_templates_through_a_temperature() -> None:
+    plan = (whole(3, 8, (0, 2)), FrequencyLayer(Fraction(5, 2), 2, 4, 10, (0, 1)))
+    queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    blocks = [torch.randn(x.phases, len(x.features), dtype=torch.float64, requires_grad=True) for x in plan]
+
+    def covered(queries: Tensor, *blocks: Tensor) -> Tensor:
+        return Matcher(temperature=0.5)(queries, CompressedMap(plan, blocks, 10, 3))
+
+    assert torch.autograd.gradcheck(covered, (queries, *blocks))
+
+
+def test_distances_are_those_of_each_layer_and_combine_to_the_scores() -> None:
+    values, queries, matcher = torch.rand(60, 4), torch.rand(3, 4), Matcher()
+    route = make(values, MIXED)
+    distances = matcher.distances(queries, route)
+    assert [tuple(part.shape) for part in distances] == [(3, 4), (3, 3), (3, 7)]
+    for part, layer, block in zip(distances, MIXED, route.blocks(), strict=True):
+        torch.testing.assert_close(part, (queries[:, None, list(layer.features)] - block).abs().sum(2))
+    assert torch.equal(combine_layers(distances, MIXED, 60), matcher(queries, route))
+    assert matcher.distances(queries, CompressedMap((), (), 20, 4)) == []
+    with pytest.raises(InputError, match=r"query features are \(3, 5\); the map expects \(Q, 4\)"):
+        matcher.distances(torch.rand(3, 5), route)

@@ -1,0 +1,135 @@
+"""A small CNN that can be trained to repeat: the learned counterpart of HOG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from kornia.geometry.transform import resize as antialiased_resize
+from torch import Tensor, nn
+
+from dejavu_torch.types import InputError
+
+FLAT = 2 / 255  # contrast below which nothing is blown up
+
+
+def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
+    """Each pixel minus the mean around it, divided by the contrast around it.
+
+    Mean and contrast are those of square cells, interpolated between the cells' centres: one pass instead
+    of a window at every pixel (`normalise_patches`), and gradients everywhere.
+
+    Args:
+        frames: in [0, 1]; all channels share the contrast, so that colours stay comparable.
+        cell: side of a cell, pixels.
+
+    Shape: (B,C,H,W) -> (B,C,H,W), mean about 0.
+
+    Convention: a gain or an offset of brightness changes almost nothing; contrast below 2/255 is
+        not blown up.
+
+    Raises:
+        InputError: a cell below 1.
+
+    Example:
+        >>> import torch
+        >>> frames = torch.rand(1, 3, 32, 32)
+        >>> bool((local_contrast(frames) - local_contrast(0.5 * frames + 0.2)).abs().max() < 0.01)
+        True
+    """
+    if cell < 1:
+        raise InputError(f"local_contrast got a cell of {cell} pixels; expected at least 1")
+    height, width = frames.shape[-2:]
+    grid = (-(-height // cell), -(-width // cell))
+
+    def around(values: Tensor) -> Tensor:
+        cells = nn.functional.adaptive_avg_pool2d(values, grid)
+        return nn.functional.interpolate(cells, (height, width), mode="bilinear", align_corners=False)
+
+    centred = frames - around(frames)
+    return centred * (around(centred.square().mean(1, keepdim=True)) + FLAT**2).rsqrt()
+
+
+class SmallCNN(nn.Module):
+    """Local contrast, strided convolutions, and one linear layer that still knows where things are.
+
+    The last layer's outputs are standardised by their running mean and deviation over the training
+    frames, so that features, and with them L1 distances, share one scale.
+
+    Args:
+        dimension: D, number of features.
+        channels: of the frames, 3 or 1.
+        resize: (height, width) in pixels that frames are brought to, antialiased.
+        widths: channels after each convolution; each halves height and width.
+        squeeze: channels ahead of the linear layer.
+        cell: of `local_contrast`, pixels; 0 leaves the contrast as it is.
+
+    Shape: (B,C,H,W) float in [0, 1] -> (B,D).
+
+    Raises:
+        InputError: settings below 1; forward: frames of another number of channels.
+
+    Example:
+        >>> import torch
+        >>> net = SmallCNN(dimension=96)
+        >>> net(torch.rand(2, 3, 96, 96)).shape, sum(p.numel() for p in net.parameters())
+        (torch.Size([2, 96]), 193744)
+    """
+
+    def __init__(
+        self,
+        dimension: int = 96,
+        channels: int = 3,
+        resize: tuple[int, int] = (96, 96),
+        widths: Sequence[int] = (16, 32, 64, 96),
+        squeeze: int = 32,
+        cell: int = 8,
+    ) -> None:
+        super().__init__()
+        sizes = [dimension, channels, squeeze, *resize, *widths]
+        if len(resize) != 2 or not widths or min(sizes) < 1 or cell < 0:
+            raise InputError(
+                f"SmallCNN got dimension={dimension}, channels={channels}, resize={tuple(resize)}, "
+                f"widths={tuple(widths)}, squeeze={squeeze}, cell={cell}; expected at least 1 each, "
+                "cell 0 or more"
+            )
+        self.dimension = dimension
+        self.channels = channels
+        self.resize = (int(resize[0]), int(resize[1]))  # a map gives lists
+        self.widths = tuple(int(width) for width in widths)
+        self.squeeze = squeeze
+        self.cell = cell
+        layers: list[nn.Module] = []
+        height, width = self.resize
+        for before, after in zip((channels, *self.widths), self.widths, strict=False):
+            side = 3 if layers else 5
+            layers += [
+                nn.Conv2d(before, after, side, stride=2, padding=side // 2, bias=False),
+                nn.BatchNorm2d(after),
+                nn.ReLU(inplace=True),
+            ]
+            height, width = -(-height // 2), -(-width // 2)
+        self.convolutions = nn.Sequential(
+            *layers, nn.Conv2d(self.widths[-1], squeeze, 1), nn.ReLU(inplace=True)
+        )
+        self.linear = nn.Linear(squeeze * height * width, dimension)
+        self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        if frames.ndim != 4 or frames.shape[1] != self.channels:
+            raise InputError(
+                f"SmallCNN got frames {tuple(frames.shape)}; expected (B,{self.channels},H,W), "
+                f"as channels={self.channels} says"
+            )
+        if tuple(frames.shape[-2:]) != self.resize:
+            frames = antialiased_resize(frames, self.resize, antialias=True)
+        if self.cell:
+            frames = local_contrast(frames, self.cell)
+        features: Tensor = self.linear(self.convolutions(frames).flatten(1))
+        standardised: Tensor = self.standardise(features.float())
+        return standardised
+
+    def extra_repr(self) -> str:
+        return (
+            f"dimension={self.dimension}, channels={self.channels}, resize={self.resize}, "
+            f"widths={self.widths}, squeeze={self.squeeze}, cell={self.cell}"
+        )

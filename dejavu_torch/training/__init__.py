@@ -1,0 +1,1 @@
+"""Feature learning: losses, task, data, metrics."""

@@ -1,0 +1,103 @@
+"""Place recognition as a metric of torchmetrics: `judge` over all the batches of an epoch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities.data import dim_zero_cat
+
+from dejavu_torch.data.truth import as_truth, counted, is_right
+from dejavu_torch.evaluation.curves import Scores, check_truth, judge
+from dejavu_torch.types import InputError, Match, Truth
+
+
+class PlaceRecognition(Metric):
+    """What `judge` says of all queries of an epoch, whatever the batches and processes (section IV-C).
+
+    Args:
+        tolerance: in the unit of the places (frames, or evenly spaced places), inclusive.
+        figure: the one figure to compute, a field of `Scores` such as "auc", as `trainer.log` wants it; None
+            computes all.
+
+    Shape: update(match of (Q,), truth (Q,R) int64 with -1 as padding, or a `Truth`); R may differ from
+        batch to batch. compute() -> float64 scalars: a dict, or the one of `figure`.
+
+    Convention: a query that `judge` leaves out (nothing known, or a soft place reported) is left out here.
+        Where none is left, before the first update for example, every figure is NaN: nothing was measured.
+        Three numbers are kept of each query, on the device of the metric.
+
+    Raises:
+        InputError: an unknown figure, a negative tolerance, matches that are no index and score a query,
+            a NaN score, or a truth that does not fit the matches.
+
+    Example:
+        >>> metric = PlaceRecognition(tolerance=0, figure="recall_at_1")
+        >>> found = Match(torch.tensor([0, 7]), torch.tensor([0.1, 0.2]), torch.tensor([True, True]))
+        >>> metric.update(found, torch.tensor([[0], [1]]))
+        >>> metric.compute().item()
+        0.5
+    """
+
+    is_differentiable = False
+    higher_is_better = True
+    full_state_update = False
+    plot_lower_bound = 0.0
+    plot_upper_bound = 1.0
+
+    score: list[Tensor]
+    found: list[Tensor]
+    right: list[Tensor]
+
+    def __init__(self, tolerance: int, figure: str | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        if figure is not None and figure not in Scores._fields:
+            known = ", ".join(Scores._fields)
+            raise InputError(f"figure {figure!r} is unknown; expected None or one of {known}")
+        if tolerance < 0:
+            raise InputError(f"the tolerance is {tolerance}; expected at least 0")
+        self.tolerance, self.figure = tolerance, figure
+        # one number a query in each, so that batches and processes join whatever their R; and all float64,
+        # which is then also what a process that saw no query gives
+        self.set_dtype(torch.float64)
+        for state in ("score", "found", "right"):
+            self.add_state(state, [], dist_reduce_fx="cat")
+
+    def update(self, match: Match, truth: Tensor | Truth) -> None:
+        """Add the queries of a batch."""
+        _check_match(match)
+        check_truth(match, truth, self.tolerance)
+        index, score = match.index.cpu(), match.score.detach().cpu()
+        truth = as_truth(truth.cpu() if isinstance(truth, Tensor) else Truth(*(part.cpu() for part in truth)))
+        good, answerable = is_right(index, truth.right, self.tolerance), (truth.right >= 0).any(1)
+        kept = counted(index, truth, self.tolerance)
+        # the same queries in a world of two places: what is reported is place 0, and it or place 1 is right
+        rows = torch.stack([score, (index >= 0).double() - 1, torch.where(answerable, (~good).double(), -1)])
+        for state, row in zip((self.score, self.found, self.right), rows[:, kept], strict=True):
+            state.append(row.to(self.device))
+
+    def compute(self) -> Tensor | dict[str, Tensor]:
+        """The figure, or all of them by name."""
+        figures = Scores(*[float("nan")] * len(Scores._fields))
+        score, found, right = (
+            dim_zero_cat(state).cpu() if len(state) else torch.zeros(0)
+            for state in (self.score, self.found, self.right)
+        )
+        if len(score):
+            match = Match(found.long(), score, found >= 0)
+            figures = judge(match, right.long()[:, None], tolerance=0)
+        values = torch.tensor(figures, dtype=torch.float64, device=self.device)
+        named = dict(zip(Scores._fields, values, strict=True))
+        return named if self.figure is None else named[self.figure]
+
+
+def _check_match(match: Match) -> None:
+    """Refuse matches that are no place and score a query."""
+    index, score = match.index, match.score
+    if index.ndim != 1 or index.dtype != torch.int64 or score.shape != index.shape:
+        shapes = f"{tuple(index.shape)} {index.dtype} and {tuple(score.shape)}"
+        raise InputError(f"index and score are {shapes}; expected (Q,) int64 and (Q,)")
+    if score.isnan().any():
+        raise InputError("a score is NaN; expected numbers or +inf")

@@ -1,0 +1,170 @@
+"""Local contrast against literal loops, and the small CNN."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from torch import Tensor
+
+from dejavu_torch.features.cnn import FLAT, SmallCNN, local_contrast
+
+
+def small(**settings: Any) -> SmallCNN:
+    return SmallCNN(**{"dimension": 6, "resize": (16, 24), "widths": (4, 6), "squeeze": 3} | settings)
+
+
+# local contrast
+
+
+def literal_around(image: Tensor, cell: int) -> Tensor:
+    """Means of the cells of one channel, interpolated between their centres; loops only, whole cells."""
+    height, width = image.shape
+    rows, columns = height // cell, width // cell
+    means = [
+        [image[r * cell : (r + 1) * cell, c * cell : (c + 1) * cell].mean() for c in range(columns)]
+        for r in range(rows)
+    ]
+
+    def between(at: int, count: int) -> tuple[int, int, float]:
+        centre = min(max((at + 0.5) / cell - 0.5, 0.0), count - 1.0)
+        low = min(int(centre), count - 1)
+        return low, min(low + 1, count - 1), centre - low
+
+    out = torch.zeros_like(image)
+    for y in range(height):
+        r, below, v = between(y, rows)
+        for x in range(width):
+            c, right, u = between(x, columns)
+            upper = (1 - u) * means[r][c] + u * means[r][right]
+            lower = (1 - u) * means[below][c] + u * means[below][right]
+            out[y, x] = (1 - v) * upper + v * lower
+    return out
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_local_contrast_equals_the_loops(channels: int) -> None:
+    frame = torch.rand(channels, 12, 20, dtype=torch.float64)
+    centred = torch.stack([channel - literal_around(channel, 4) for channel in frame])
+    contrast = (literal_around(centred.square().mean(0), 4) + FLAT**2).sqrt()
+    torch.testing.assert_close(local_contrast(frame[None], 4)[0], centred / contrast, rtol=0, atol=1e-12)
+
+
+def test_gain_and_offset_change_almost_nothing() -> None:
+    frames = torch.rand(2, 3, 32, 40, dtype=torch.float64)
+    plain = local_contrast(frames)
+    torch.testing.assert_close(local_contrast(frames + 0.3), plain, rtol=0, atol=1e-12)
+    torch.testing.assert_close(local_contrast(0.5 * frames), plain, rtol=0, atol=0.01)
+    assert plain.mean().abs() < 0.05
+    assert 0.5 < plain.std() < 1.5
+
+
+def test_a_flat_frame_stays_flat_and_faint_noise_faint() -> None:
+    assert torch.equal(local_contrast(torch.full((1, 1, 16, 16), 0.5)), torch.zeros(1, 1, 16, 16))
+    noise = 0.5 + 0.1 * FLAT * torch.randn(1, 1, 32, 32, dtype=torch.float64)
+    assert local_contrast(noise).std() < 0.2
+
+
+def test_gradients_of_local_contrast_are_right_and_finite_on_a_flat_frame() -> None:
+    frames = torch.rand(1, 2, 5, 7, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: local_contrast(x, 3), frames)
+    flat = torch.full((1, 1, 8, 8), 0.5, requires_grad=True)
+    local_contrast(flat, 4).square().sum().backward()
+    assert flat.grad is not None
+    assert flat.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("cell", [0, -1])
+def test_a_cell_below_1_is_refused(cell: int) -> None:
+    with refused(f"cell of {cell}", "at least 1"):
+        local_contrast(torch.rand(1, 1, 8, 8), cell)
+
+
+# the network
+
+
+@pytest.mark.parametrize("size", [(16, 24), (40, 31)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_frames_of_any_size_give_d_features(channels: int, size: tuple[int, int]) -> None:
+    features = small(channels=channels)(torch.rand(5, channels, *size))
+    assert (features.shape, features.dtype) == ((5, 6), torch.float32)
+
+
+@pytest.mark.parametrize("resize", [(17, 23), (1, 1)])
+def test_any_resize_fits_the_linear_layer(resize: tuple[int, int]) -> None:
+    assert small(resize=resize).eval()(torch.rand(2, 3, 30, 30)).shape == (2, 6)
+
+
+def test_features_of_the_training_frames_are_standardised() -> None:
+    features = small().train()(torch.rand(40, 3, 16, 24))
+    torch.testing.assert_close(features.mean(0), torch.zeros(6), rtol=0, atol=1e-5)
+    torch.testing.assert_close(features.var(0, correction=0), torch.ones(6), rtol=0, atol=1e-2)
+
+
+def test_in_eval_mode_a_batch_is_its_frames_one_by_one() -> None:
+    net = small()
+    frames = torch.rand(6, 3, 20, 20)
+    net(frames)
+    net.eval()
+    alone = torch.cat([net(frame[None]) for frame in frames])
+    torch.testing.assert_close(net(frames), alone, rtol=0, atol=1e-5)
+
+
+def test_light_changes_little_unless_the_contrast_is_left_as_it_is() -> None:
+    frames, net, change = torch.rand(4, 3, 16, 24), small().eval(), {}
+    for net.cell in (8, 0):
+        with torch.no_grad():
+            before, after = net(frames), net(0.5 * frames + 0.2)
+        change[net.cell] = (after - before).norm() / (before - before.mean(0)).norm()
+    assert change[8] < 0.02
+    assert change[0] > 0.2
+
+
+def test_features_know_where_things_are() -> None:
+    frames = torch.rand(2, 3, 16, 24)
+    net = small().eval()
+    assert not torch.allclose(net(frames.flip(3)), net(frames), atol=1e-3)
+
+
+def test_gradients_reach_every_parameter_and_the_frames() -> None:
+    net, frames = small(), torch.rand(4, 3, 20, 20, requires_grad=True)
+    net(frames)[:, 0].square().mul(torch.arange(4.0)).sum().backward()
+    assert frames.grad is not None
+    for value in (frames.grad, *(parameter.grad for parameter in net.convolutions.parameters())):
+        assert value.isfinite().all()
+        assert value.abs().max() > 0
+
+
+def test_state_dict_round_trip() -> None:
+    net, other, frames = small(), small(), torch.rand(4, 3, 16, 24)
+    net(frames)
+    other.load_state_dict(net.state_dict())
+    assert torch.equal(other.eval()(frames), net.eval()(frames))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"dimension": 0},
+        {"channels": 0},
+        {"resize": (0, 24)},
+        {"resize": (16,)},
+        {"widths": ()},
+        {"widths": (4, 0)},
+        {"squeeze": 0},
+        {"cell": -1},
+    ],
+    ids=str,
+)
+def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any]) -> None:
+    name, value = next(iter(settings.items()))
+    with refused(f"{name}={value}", "at least 1 each"):
+        small(**settings)
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 16, 24), (2, 4, 16, 24), (3, 16, 24)])
+def test_frames_of_other_channels_are_refused(shape: tuple[int, ...]) -> None:
+    with refused(str(shape), "(B,3,H,W)", "channels=3"):
+        small()(torch.rand(shape))

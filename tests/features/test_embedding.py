@@ -1,0 +1,194 @@
+"""Any network as a backbone: kornia's, our own, a plain convolution; and what cannot be one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from kornia.contrib import TinyViT
+from kornia.feature import HardNet
+from torch import Tensor, nn
+
+from dejavu_torch.features.cnn import SmallCNN, local_contrast
+from dejavu_torch.features.embedding import Embedding
+
+
+class Maker(nn.Module):
+    """Gives what it is told to, for each frame."""
+
+    def __init__(self, make: Callable[[Tensor], Any]) -> None:
+        super().__init__()
+        self.make = make
+
+    def forward(self, frames: Tensor) -> Any:
+        return self.make(frames)
+
+
+class Picky(nn.Module):
+    """Objects to every frame."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        raise AssertionError(f"frames of {frames.shape[-1]} are not\nwhat I want")
+
+
+def tiny_vit() -> nn.Module:
+    sizes = {"embed_dims": [8] * 4, "depths": [1] * 4, "num_heads": [1] * 4, "window_sizes": [2] * 4}
+    return TinyViT(img_size=32, num_classes=10, **sizes)
+
+
+def plain(**settings: Any) -> Embedding:
+    return Embedding(nn.Conv2d(3, 4, 3), **{"dimension": 5, "resize": (12, 16)} | settings)
+
+
+@pytest.mark.parametrize(
+    ("make", "settings"),
+    [
+        (lambda: HardNet(pretrained=False), {"channels": 1, "resize": (32, 32)}),
+        (tiny_vit, {"resize": (32, 32)}),
+        (lambda: nn.Conv2d(3, 4, 3), {"grid": 2}),
+        (lambda: SmallCNN(dimension=7, resize=(16, 16), widths=(4,)), {"cell": 8}),
+    ],
+    ids=["HardNet", "TinyViT", "Conv2d", "SmallCNN"],
+)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_networks_of_all_kinds(
+    make: Callable[[], nn.Module], settings: dict[str, Any], channels: int
+) -> None:
+    net = Embedding(make(), dimension=12, **settings)
+    frames = torch.rand(3, channels, 40, 36)
+    features = net(frames)
+    assert (features.shape, features.dtype) == ((3, 12), torch.float32)
+    features[:, 0].square().mul(torch.arange(3.0)).sum().backward()
+    assert any(p.grad is not None and p.grad.abs().max() > 0 for p in net.network.parameters())
+    net.eval()
+    alone = torch.cat([net(frame[None]) for frame in frames])
+    torch.testing.assert_close(net(frames), alone, rtol=0, atol=1e-4)
+
+
+def test_the_features_are_the_pooled_maps_projected_and_standardised() -> None:
+    net = plain(grid=2)
+    frames = torch.rand(8, 3, 12, 16)
+    maps = net.network(frames)  # 10 x 14, so that a cell of the grid is 5 x 7
+    cells = [maps[:, :, y : y + 5, x : x + 7].mean((2, 3)) for y in (0, 5) for x in (0, 7)]
+    projected = net.linear(torch.stack(cells, 2).flatten(1))
+    expected = (projected - projected.mean(0)) / (projected.var(0, correction=0) + 1e-5).sqrt()
+    torch.testing.assert_close(net(frames), expected, rtol=0, atol=1e-4)
+
+
+def test_vectors_are_projected_as_they_are() -> None:
+    net = Embedding(Maker(lambda frames: frames.mean((2, 3))), dimension=2, resize=(4, 4), grid=3)
+    assert net.linear.in_features == 3
+    frames = torch.rand(5, 3, 4, 4)
+    expected = net.linear(frames.mean((2, 3)))
+    torch.testing.assert_close(net.eval()(frames), expected, rtol=0, atol=1e-4)
+
+
+def test_grey_is_repeated_and_colour_becomes_luminance() -> None:
+    grey = torch.rand(2, 1, 12, 16)
+    net = plain().eval()
+    assert torch.equal(net(grey), net(grey.expand(-1, 3, -1, -1)))
+    one = Embedding(nn.Conv2d(1, 4, 3), dimension=5, channels=1, resize=(12, 16)).eval()
+    torch.testing.assert_close(one(grey.expand(-1, 3, -1, -1)), one(grey), rtol=0, atol=1e-5)
+    red = torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(1, 3, 12, 16)
+    torch.testing.assert_close(one(red), one(torch.full((1, 1, 12, 16), 0.299)), rtol=0, atol=1e-5)
+
+
+def test_the_contrast_is_that_of_local_contrast() -> None:
+    frames = torch.rand(2, 3, 12, 16)
+    net = plain(cell=4).eval()
+    cell, net.cell = net.cell, 0
+    expected = net(local_contrast(frames, cell))
+    net.cell = cell
+    assert torch.equal(net(frames), expected)
+
+
+def test_making_one_changes_nothing_of_the_network() -> None:
+    """Neither running statistics nor the mode of any part."""
+    network = nn.Sequential(nn.BatchNorm2d(3), nn.Conv2d(3, 4, 3), nn.Dropout())
+    network[0].eval()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    Embedding(network)
+    assert [module.training for module in network.modules()] == [True, False, True, True]
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+def test_state_dict_round_trip() -> None:
+    net, other, frames = plain(), plain(), torch.rand(4, 3, 12, 16)
+    net(frames)
+    other.load_state_dict(net.state_dict())
+    assert torch.equal(other.eval()(frames), net.eval()(frames))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"dimension": 0},
+        {"channels": 2},
+        {"resize": (0, 8)},
+        {"resize": (8, 8, 8)},
+        {"grid": 0},
+        {"cell": -1},
+    ],
+    ids=str,
+)
+def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any]) -> None:
+    name, value = next(iter(settings.items()))
+    with refused(f"{name}={value}", "expected 1 or 3 channels"):
+        plain(**settings)
+
+
+@pytest.mark.parametrize(
+    ("make", "settings", "words"),
+    [
+        (lambda: HardNet(pretrained=False), {"channels": 1}, ("HardNet", "(1, 1, 96, 96)", "32")),
+        (lambda: nn.Conv2d(1, 4, 3), {}, ("Conv2d", "(1, 3, 96, 96)", "channels")),
+        (lambda: nn.Linear(5, 4), {}, ("Linear", "(1, 3, 96, 96)")),
+        (Picky, {}, ("Picky", "frames of 96 are not what I want")),
+    ],
+    ids=["HardNet", "Conv2d", "Linear", "Picky"],
+)
+def test_a_network_that_does_not_take_the_frames_is_refused(
+    make: Callable[[], nn.Module], settings: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    network = make().train()
+    with refused(*words, "does not take frames"):
+        Embedding(network, **settings)
+    assert network.training
+
+
+def test_of_tokens_the_mean_counts() -> None:
+    def tokens(frames: Tensor) -> Tensor:
+        return frames.flatten(2).transpose(1, 2)
+
+    frames = torch.rand(4, 3, 96, 96)
+    net, means = (
+        Embedding(Maker(tokens), dimension=5),
+        Embedding(Maker(lambda f: f.mean((2, 3))), dimension=5),
+    )
+    means.load_state_dict(net.state_dict())
+    torch.testing.assert_close(net(frames), means(frames))
+
+
+@pytest.mark.parametrize(
+    ("make", "seen"),
+    [
+        (lambda frames: frames[..., None], "(1, 3, 96, 96, 1)"),
+        (lambda frames: frames.mean(), "()"),
+        (lambda frames: [frames], "list"),
+        (lambda frames: {"maps": frames}, "dict"),
+    ],
+)
+def test_a_network_that_makes_neither_maps_nor_vectors_is_refused(
+    make: Callable[[Tensor], Any], seen: str
+) -> None:
+    with refused(f"Maker made {seen}", "expected maps (B,K,h,w) or vectors (B,K)"):
+        Embedding(Maker(make))
+
+
+@pytest.mark.parametrize("shape", [(2, 2, 8, 8), (2, 4, 8, 8), (3, 8, 8)])
+def test_frames_neither_grey_nor_colour_are_refused(shape: tuple[int, ...]) -> None:
+    with refused(str(shape), "(B,1,H,W) or (B,3,H,W)"):
+        plain()(torch.rand(shape))

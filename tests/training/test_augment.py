@@ -1,0 +1,250 @@
+"""Each strength changes what it says and no more; a clip is one day."""
+
+from __future__ import annotations
+
+import copy
+import json
+from inspect import signature
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from torch import Tensor
+
+from dejavu_torch.training.augment import LARGEST, Augmentation
+
+OFF: dict[str, Any] = {name: 0.0 if len(most) == 1 else (0.0, 0.0) for name, most in LARGEST.items()}
+DEFAULTS = {name: argument.default for name, argument in signature(Augmentation).parameters.items()}
+ALONE: dict[str, Any] = {**DEFAULTS, "perspective": 0.1}
+EACH = pytest.mark.parametrize("name", ALONE)
+
+
+def only(**strengths: Any) -> Augmentation:
+    return Augmentation(**{**OFF, **strengths})
+
+
+def flat(value: float, clips: int = 200, side: int = 12, channels: int = 1) -> Tensor:
+    return torch.full((clips, channels, side, side), value)
+
+
+def changed(before: Tensor, after: Tensor) -> Tensor:
+    """Which entries of the batch changed at all."""
+    return (before != after).flatten(1).any(1)
+
+
+def dots(clips: int = 200, height: int = 40, width: int = 60) -> Tensor:
+    frames = torch.zeros(clips, 1, height, width)
+    frames[:, :, height // 2, width // 2] = 1
+    return frames
+
+
+def centre_of(frames: Tensor) -> tuple[Tensor, Tensor]:
+    """(x, y) of the light of each frame, pixels."""
+    light = frames[:, 0] / frames[:, 0].sum((1, 2), keepdim=True)
+    height, width = light.shape[1:]
+    return light.sum(1) @ torch.arange(width).float(), light.sum(2) @ torch.arange(height).float()
+
+
+def test_eval_gives_the_input_itself_and_training_leaves_it_alone() -> None:
+    frames = torch.rand(2, 3, 9, 11, requires_grad=True)
+    before = frames.detach().clone()
+    assert Augmentation().eval()(frames) is frames
+    assert not Augmentation()(frames).requires_grad
+    off = only()(frames)
+    assert torch.equal(off, frames)
+    off.zero_()
+    assert torch.equal(frames, before)
+
+
+@EACH
+def test_each_alone_acts_on_some_or_all_clips(name: str) -> None:
+    frames = torch.rand(300, 1, 16, 16) * 0.5 + 0.25
+    share = changed(frames, only(**{name: ALONE[name]})(frames)).float().mean().item()
+    half, most = ("perspective", "illumination", "blur", "occlusion"), ("rotation", "shift", "scale")
+    chance = 0.5 if name in half else 0.9 if name in most else 0.7 if name in ("gamma", "noise") else 1.0
+    assert share == pytest.approx(chance, abs=0.1)
+
+
+@EACH
+def test_a_clip_of_equal_frames_stays_one_but_for_noise(name: str) -> None:
+    clips = torch.rand(8, 1, 3, 16, 16).expand(8, 4, 3, 16, 16)
+    after = only(**{name: ALONE[name]})(clips)
+    assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6) == (name != "noise")
+
+
+def test_a_clip_is_one_day_and_clips_differ() -> None:
+    clips = torch.rand(1, 1, 3, 16, 16).expand(6, 5, 3, 16, 16)
+    after = Augmentation(**{**ALONE, "noise": 0.0})(clips)
+    assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6)
+    first = after[:, 0].flatten(1)
+    assert (torch.cdist(first, first) > 0.1).sum() == 6 * 5
+
+
+def test_noise_is_of_the_frame_and_whether_there_is_any_is_of_the_clip() -> None:
+    clips = torch.full((100, 6, 1, 16, 16), 0.5)
+    spread = (only(noise=0.03)(clips) - clips).flatten(2).std(2)
+    noisy = spread[:, 0] > 0
+    assert 50 < noisy.sum() < 90
+    assert (spread[~noisy] == 0).all()
+    assert spread[noisy].sub(0.03).abs().max() < 0.01
+    assert spread.std(1)[noisy].min() > 0
+
+
+def test_range_and_type_at_the_largest_strengths() -> None:
+    wild = Augmentation(**{name: most if len(most) > 1 else most[0] for name, most in LARGEST.items()})
+    frames = torch.rand(40, 3, 24, 28)
+    after = wild(frames)
+    assert after.dtype == torch.float32
+    assert after.isfinite().all()
+    assert 0 <= after.min() < after.max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(6, 3, 16, 20), (2, 3, 3, 16, 20), (6, 1, 16, 20), (1, 1, 1, 2, 2)])
+def test_the_seed_repeats_it(shape: tuple[int, ...]) -> None:
+    frames, augmentation = torch.rand(shape), Augmentation()
+    torch.manual_seed(3)
+    first, second = augmentation(frames), augmentation(frames)
+    torch.manual_seed(3)
+    channels_last = frames.transpose(-1, -3).contiguous().transpose(-1, -3)
+    assert torch.allclose(Augmentation()(channels_last), first, atol=1e-5)
+    assert not torch.allclose(second, first, atol=1e-2)
+    assert first.shape == shape
+
+
+def test_entries_do_not_see_each_other() -> None:
+    frames, other = torch.rand(8, 3, 16, 16).expand(2, 8, 3, 16, 16).clone()
+    other[3] = torch.rand(3, 16, 16)
+    torch.manual_seed(5)
+    first = Augmentation()(frames)
+    torch.manual_seed(5)
+    second = Augmentation()(other)
+    assert changed(first, second).tolist() == [entry == 3 for entry in range(8)]
+
+
+def test_colour_is_of_the_channel() -> None:
+    after = only(colour=(0.2, 0.0))(flat(0.5, channels=3))
+    assert (after.amax((2, 3)) == after.amin((2, 3))).all()
+    level = after[:, :, 0, 0] / 0.5
+    assert 0.8 <= level.min() < 0.82 < 1.18 < level.max() <= 1.2
+    assert level.std(1).min() > 0
+    offset = only(colour=(0.0, 0.05))(flat(0.5, channels=3))[:, :, 0, 0] - 0.5
+    assert -0.0501 <= offset.min() < -0.04 < 0.04 < offset.max() <= 0.0501
+
+
+def test_exposure_is_of_all_channels() -> None:
+    torch.manual_seed(1)
+    low = only(exposure=(0.4, 0.0))(flat(0.1, channels=3))
+    torch.manual_seed(1)
+    high = only(exposure=(0.4, 0.0))(flat(0.4, channels=3))
+    gain = low.mean((1, 2, 3)) / 0.1
+    assert 0.6 <= gain.min() < 0.65 < 1.35 < gain.max() <= 1.401
+    assert torch.allclose(high, 4 * low)
+    assert torch.equal(low[:, 0], low[:, 2])
+    offset = only(exposure=(0.0, 0.3))(flat(0.5))[:, 0, 0, 0] - 0.5
+    assert -0.301 <= offset.min() < -0.25 < 0.25 < offset.max() <= 0.301
+
+
+def test_gamma_is_a_power() -> None:
+    after = only(gamma=0.5)(flat(0.25))[:, 0, 0, 0]
+    power = after.log() / torch.tensor(0.25).log()
+    assert 0.66 <= power.min() < 0.75 < 1.4 < power.max() <= 1.501
+    ends = torch.tensor([0.0, 1.0]).expand(50, 1, 2, 2)
+    assert torch.allclose(only(gamma=0.5)(ends), ends)
+
+
+def test_illumination_falls_evenly_from_one_side() -> None:
+    change = only(illumination=0.25)(flat(0.5))[:, 0] - 0.5
+    change = change[changed(torch.zeros_like(change), change)]
+    assert 0.15 < change.abs().amax((1, 2)).max() <= 0.251
+    assert change.abs().amin((1, 2)).max() < 1e-6
+    for axis in (1, 2):
+        assert change.diff(n=2, dim=axis).abs().max() < 1e-6
+
+
+def test_blur_takes_variance_keeps_the_mean_and_reaches_as_far_as_sigma() -> None:
+    frames = torch.rand(60, 1, 32, 32)
+    blurred = only(blur=3.0)(frames)
+    assert (blurred.var((1, 2, 3)) < 1.001 * frames.var((1, 2, 3))).all()  # a tiny sigma leaves it as it is
+    assert blurred.var((1, 2, 3)).min() < 0.2 * frames.var((1, 2, 3)).min()
+    assert (blurred - frames).mean((1, 2, 3)).abs().max() < 0.02
+    for sigma, reach in ((0.3, 1), (1.2, 1), (2.0, 2), (2.6, 3)):
+        row = only(blur=sigma)(dots(clips=60))[:, 0, 20].amax(0)
+        lit = (row > 0).nonzero().flatten() - 30
+        assert lit.abs().max() == reach
+
+
+def test_shift_moves_by_at_most_its_fractions() -> None:
+    for pair, x_most, y_most in (((0.1, 0.0), 6.0, 0.0), ((0.0, 0.05), 0.0, 2.0), ((0.1, 0.05), 6.0, 2.0)):
+        x, y = centre_of(only(shift=pair)(dots()))
+        for moved, most in (((x - 30).abs().max().item(), x_most), ((y - 20).abs().max().item(), y_most)):
+            assert 0.9 * most <= moved <= most + 1e-3
+
+
+def test_rotation_turns_and_scale_stretches_by_at_most_theirs() -> None:
+    frames = torch.zeros(200, 1, 61, 61)
+    frames[:, :, 30, 50] = 1  # 20 pixels right of the centre
+    x, y = centre_of(only(rotation=10.0)(frames))
+    assert 9 < torch.atan2(y - 30, x - 30).rad2deg().abs().max() < 10.3
+    assert torch.hypot(y - 30, x - 30).sub(20).abs().max() < 0.3
+    x, y = centre_of(only(scale=0.2)(frames))
+    factor = (x - 30) / 20
+    assert 0.78 < factor.min() < 0.83 < 1.17 < factor.max() < 1.22
+    assert (y - 30).abs().max() < 1e-3
+
+
+def test_perspective_moves_corners_by_at_most_its_fraction() -> None:
+    ramp = torch.linspace(0, 1, 41).expand(200, 1, 41, 41)
+    move = only(perspective=0.1)(ramp) - ramp  # in fractions of the side
+    corners = move[:, 0, ::40, ::40]
+    assert 0.08 < corners.abs().max() < 0.13  # what is looked up lies a little beyond
+    assert (corners[:, 0] - corners[:, 1]).abs().max() > 0.03
+    assert only(perspective=1e-6)(ramp).sub(ramp).abs().max() < 1e-3
+    moved = only(rotation=30.0, shift=(0.3, 0.3), scale=0.5, perspective=0.3)(flat(0.7))
+    assert torch.allclose(moved, flat(0.7), atol=1e-5)  # nothing black comes in
+
+
+@pytest.mark.parametrize("most", [0.01, 0.15, 0.6])
+def test_occlusion_covers_one_rectangle_of_at_most_its_fraction(most: float) -> None:
+    side = 60
+    frames = flat(0.5, side=side, channels=2)
+    after = only(occlusion=most)(frames)
+    black = after == 0
+    assert torch.equal(after[~black], frames[~black])
+    assert torch.equal(black[:, 0], black[:, 1])
+    height, width = black[:, 0].any(2).sum(1), black[:, 0].any(1).sum(1)
+    covered = black[:, 0].sum((1, 2))
+    assert torch.equal(covered, height * width)
+    assert ((height - 0.5).clamp(min=0) * (width - 0.5).clamp(min=0)).max() <= most * side**2
+    assert covered.max() > 0.6 * most * side**2
+    assert covered[covered > 0].min() >= min(0.02, most) * side**2 * 0.7
+
+
+def test_it_is_plain_numbers_with_nothing_to_save() -> None:
+    strengths = json.loads(json.dumps(ALONE))
+    frames, augmentation = torch.rand(3, 3, 16, 16), Augmentation(**strengths)
+    augmentation(frames)
+    assert not augmentation.state_dict()
+    assert copy.deepcopy(augmentation)(frames).shape == frames.shape
+    assert "shift=(0.02, 0.04), scale=0.05" in repr(augmentation)
+
+
+@EACH
+@pytest.mark.parametrize("wrong", [-0.01, float("nan"), 181.0, "much", None])
+def test_a_wrong_strength_is_refused(name: str, wrong: object) -> None:
+    pair = isinstance(ALONE[name], tuple)
+    with refused(f"{name} is", "expected a number from 0 to"):
+        only(**{name: (wrong, 0.0) if pair else wrong})
+    with refused(f"{name} is"):
+        only(**{name: 0.1 if pair else (0.1, 0.1)})
+
+
+def test_wrong_frames_are_refused() -> None:
+    with refused("(3, 16, 16) torch.float32", "(B,C,H,W)", "(B,T,C,H,W)"):
+        Augmentation()(torch.rand(3, 16, 16))
+    with refused("torch.float64", "expected float32"):
+        Augmentation()(torch.rand(2, 3, 16, 16, dtype=torch.float64))
+    with refused("(2, 3, 4, 16)", "more than 4 pixels"):
+        only(blur=4.0)(torch.rand(2, 3, 4, 16))
+    with refused("(0, 3, 16, 16)", "expected some"):
+        Augmentation()(torch.rand(0, 3, 16, 16))

@@ -1,0 +1,226 @@
+"""Frames and their right places, in batches: what is drawn, how often, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.training.augment import Augmentation
+from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.frames import Clips, as_frames, store
+from dejavu_torch.types import Truth
+
+
+def numbered(frames: int, first: int = 0, side: int = 8) -> ArrayTraverse:
+    """Frames that tell their number: all pixels of frame i are first + i."""
+    numbers = torch.arange(first, first + frames, dtype=torch.uint8)
+    return ArrayTraverse(numbers[:, None, None].expand(frames, side, side), f"from {first}")
+
+
+def route(frames: int = 24, stage: str = "fit", **settings: Any) -> RouteData:
+    """A route that is read; its loaders give the frames as they are."""
+    data = RouteData(numbered(frames), **{"tolerance": 2, "batch_size": 8} | settings)
+    data.setup(stage)
+    return data
+
+
+def drawn(data: RouteData) -> dict[int, list[list[int]]]:
+    """For each frame number the right places it came with, once for each time it was drawn."""
+    seen: dict[int, list[list[int]]] = {}
+    for frames, truth in data.train_dataloader():
+        assert frames.dtype == torch.float32
+        for frame, right in zip(frames, truth.right.tolist(), strict=True):
+            assert frame.unique().numel() == 1
+            seen.setdefault(round(float(frame[0, 0, 0]) * 255), []).append([p for p in right if p >= 0])
+    return seen
+
+
+# right places --------------------------------------------------------------------------------------------
+
+
+def test_every_reference_frame_is_its_own_place_once_an_epoch() -> None:
+    assert drawn(route()) == {i: [[i]] for i in range(24)}
+
+
+def test_a_second_traverse_shares_the_places() -> None:
+    seen = drawn(route(second=numbered(16, 100), second_truth="3"))
+    assert seen == {i: [[i]] for i in range(24)} | {100 + i: [[i + 3]] for i in range(16)}
+
+
+def test_frames_of_unknown_place_are_there_without_one(tmp_path: Path) -> None:
+    (tmp_path / "truth.csv").write_text("0,5\n1\n2,7,9,11\n3,-1\n")  # 4 and on are not known
+    seen = drawn(route(second=numbered(8, 100), second_truth=str(tmp_path / "truth.csv")))
+    found = [seen[100 + i] for i in range(8)]
+    assert found == [[[5]], [[]], [[7, 9, 11]], [[]], [[]], [[]], [[]], [[]]]
+
+
+def test_what_is_known_and_soft_reaches_the_judge(tmp_path: Path) -> None:
+    hard, soft = np.zeros((24, 6), bool), np.zeros((24, 6), bool)
+    hard[[3, 4], 1] = soft[9, 2] = hard[8, 2] = True
+    np.savez(tmp_path / "truth.npz", GThard=hard, GTsoft=soft)
+    data = route(stage="test", query=numbered(6, 100), truth=str(tmp_path / "truth.npz"), batch_size=4)
+    batches = [batch.truth for batch in data.test_dataloader()]
+    truth = Truth(*(torch.cat(column) for column in zip(*batches, strict=True)))
+    assert truth.right[1].tolist() == [3, 4]
+    assert truth.soft[2].tolist() == [9]
+    assert truth.known.tolist() == [True] * 6
+    (tmp_path / "truth.csv").write_text("0,5\n1\n2,7\n")
+    data = route(stage="test", query=numbered(6, 100), truth=str(tmp_path / "truth.csv"))
+    (batch,) = data.test_dataloader()
+    assert batch.truth.known.tolist() == [True] * 3 + [False] * 3
+    assert batch.truth.right.tolist() == [[5], [-1], [7], [-1], [-1], [-1]]
+
+
+def test_validation_and_query_come_in_order_as_they_are() -> None:
+    data = route(validation=numbered(24, 100))
+    data.setup("test") if data.others["query"][0] else None
+    frames = torch.cat([batch.frames for batch in data.val_dataloader()])
+    assert torch.equal(frames, as_frames(store(numbered(24, 100))))
+    assert len(route(20, batch_size=8).val_dataloader()) == 3  # the last one is not full, and counts
+
+
+# batches -------------------------------------------------------------------------------------------------
+
+
+@given(
+    lengths=st.lists(st.integers(0, 40), min_size=1, max_size=3),
+    clip=st.integers(1, 5),
+    clips=st.integers(1, 8),
+    seed=st.integers(0, 99),
+)
+def test_clips(lengths: list[int], clip: int, clips: int, seed: int) -> None:
+    if max(lengths) < clip:
+        lengths = [*lengths, clip]
+    sampler = Clips(lengths, clip * clips, clip)
+    torch.manual_seed(seed)
+    batches = list(sampler)
+    there = sum(length // clip for length in lengths)
+    size = clip * min(clips, there)
+    assert [len(batch) for batch in batches] == [size] * len(sampler)
+    assert 0 <= there * clip - len(batches) * size < size  # what is left makes no batch
+    frames = torch.tensor(batches).reshape(-1, clip)
+    assert frames.unique().numel() == frames.numel()
+    assert int(frames.min()) >= 0
+    assert int(frames.max()) < sum(lengths)
+    assert (frames.diff(dim=1) == 1).all()
+    traverse = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))[frames]
+    assert (traverse == traverse[:, :1]).all()
+    torch.manual_seed(seed)
+    assert list(sampler) == batches
+
+
+def test_clips_differ_from_epoch_to_epoch_and_reach_every_frame() -> None:
+    sampler = Clips([10, 7], 8, 4)
+    epochs = [list(sampler) for _ in range(60)]
+    assert epochs[0] != epochs[1]
+    assert {frame for epoch in epochs for batch in epoch for frame in batch} == set(range(17))
+
+
+# augmentation --------------------------------------------------------------------------------------------
+
+
+def augmented(data: RouteData, stage: str, frames: Tensor, first: int = 0) -> Tensor:
+    data.trainer = SimpleNamespace(  # type: ignore[assignment]  # what the hook asks of it
+        training=stage == "fit", validating=stage == "validate", sanity_checking=False
+    )
+    batch = next(iter(data.val_dataloader()))
+    right = torch.arange(first, first + len(frames))[:, None]
+    return data.on_after_batch_transfer(
+        batch._replace(frames=frames, truth=batch.truth._replace(right=right)), 0
+    )[0]
+
+
+def test_a_clip_gets_one_change_and_clips_differ() -> None:
+    data = route(clip=4, augmentation=Augmentation(noise=0.0))
+    clips = augmented(data, "fit", torch.rand(1, 1, 8, 8).expand(8, 1, 8, 8)).unflatten(0, (2, 4))
+    torch.testing.assert_close(clips, clips[:, :1].expand_as(clips))
+    assert not torch.allclose(clips[0], clips[1], atol=1e-3)
+
+
+def test_the_reference_is_validated_under_the_same_changes_each_time() -> None:
+    data, frames = route(), torch.rand(8, 1, 8, 8)
+    state = torch.get_rng_state()
+    one = augmented(data, "validate", frames)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.rand(5)
+    assert torch.equal(augmented(data, "validate", frames), one)
+    assert not torch.allclose(augmented(data, "validate", frames, first=8), one, atol=1e-3)
+    assert not torch.allclose(one, frames, atol=1e-3)
+    assert torch.equal(augmented(data, "test", frames), frames)
+    assert torch.equal(augmented(route(validation=numbered(24, 100)), "validate", frames), frames)
+
+
+def test_ready_features_are_left_as_they_are() -> None:
+    features = torch.randn(24, 5, dtype=torch.float64)
+    data = RouteData(ArrayTraverse(features), tolerance=2, batch_size=24)
+    data.setup("fit")
+    (batch,) = data.train_dataloader()
+    assert torch.equal(batch.frames, features[batch.truth.right[:, 0]])
+    assert torch.equal(augmented(data, "fit", features), features)
+
+
+# what is kept --------------------------------------------------------------------------------------------
+
+
+def test_frames_are_kept_as_bytes_and_resized() -> None:
+    values = store(numbered(70, side=24), (12, 16))
+    assert (values.shape, values.dtype) == ((70, 1, 12, 16), torch.uint8)
+    assert values[:, 0, 5, 5].tolist() == list(range(70))
+    assert store(ArrayTraverse(torch.full((2, 3, 4, 4), 0.5))).unique().tolist() == [128]
+
+
+# bad input -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"tolerance": -1}, ("tolerance is -1",)),
+        ({"clip": 0}, ("clip 0",)),
+        ({"batch_size": 1}, ("batch_size 1", "at least 2 frames")),
+        ({"batch_size": 10, "clip": 4}, ("batch_size 10, clip 4", "whole clips")),
+        ({"tolerance": 24}, ("from 0 has 24 frames", "tolerance is 24", "longer")),
+        ({"frames": 1, "tolerance": 0}, ("from 0 has 1 frame and", "longer")),
+        ({"validation": numbered(2, 100)}, ("from 100 has 2 frames", "tolerance is 2")),
+        ({"validation": numbered(20, 100)}, ("24 places", "20 frames of from 100", "data.validation_truth")),
+        ({"second": numbered(20, 100)}, ("expected data.second_truth",)),
+        ({"stage": "test", "query": numbered(20, 100)}, ("expected data.truth",)),
+        ({"stage": "test"}, ("nothing to test on", "data.query")),
+        ({"second": numbered(24, 100, side=9)}, ("(1, 9, 9)", "(1, 8, 8)", "data.resize")),
+        ({"second": numbered(24, 100), "second_truth": "nix"}, ("truth 'nix'", "offset")),
+        ({"second": numbered(24, 100), "second_truth": "24"}, ("no query has a right answer",)),
+        ({"second": "nowhere"}, ("nowhere is not there",)),
+    ],
+    ids=str,
+)
+def test_what_does_not_fit_is_refused(settings: dict[str, Any], words: tuple[str, ...]) -> None:
+    with refused(*words):
+        route(**settings)
+
+
+def test_a_clip_longer_than_the_route_is_refused() -> None:
+    with refused("clip is 32", "24 frames"):
+        route(clip=32, batch_size=32).train_dataloader()
+
+
+def test_values_that_are_no_frames_are_refused() -> None:
+    with refused("the array holds NaN"):
+        store(ArrayTraverse(torch.full((3, 1, 4, 4), torch.nan)))
+
+    class Mixed(ArrayTraverse):
+        def batches(self, size: int) -> Any:
+            yield torch.rand(2, 1, 4, 4)
+            yield torch.rand(2, 1, 4, 5)
+
+    with refused("(1, 4, 4) and of (1, 4, 5)", "data.resize"):
+        store(Mixed(torch.rand(4, 1, 4, 4)))

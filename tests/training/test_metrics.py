@@ -1,0 +1,249 @@
+"""The metric is `judge` over everything it saw, however that came."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from pytorch_lightning import LightningModule, Trainer
+from torch import Tensor
+from torch.utils.data import DataLoader
+from torchmetrics import MetricCollection
+
+from dejavu_torch.data.truth import as_truth
+from dejavu_torch.evaluation.curves import Scores, judge
+from dejavu_torch.training.metrics import PlaceRecognition
+from dejavu_torch.types import Match, Truth
+
+INF = float("inf")
+# score, reported place, right places, known, soft places; few values, so that scores tie
+QUERY = st.tuples(
+    st.sampled_from([-1.5, 0.0, 0.5, 1.0, INF]),
+    st.integers(-1, 6),
+    st.lists(st.integers(-1, 6), max_size=3),
+    st.booleans(),
+    st.lists(st.integers(0, 6), max_size=2),
+)
+BATCHES = st.lists(st.lists(QUERY, max_size=6), min_size=1, max_size=5)
+
+
+def table(rows: Sequence[list[int]]) -> Tensor:
+    """As wide as the widest row: batches differ."""
+    width = max((len(row) for row in rows), default=0)
+    padded = [row + [-1] * (width - len(row)) for row in rows]
+    return torch.tensor(padded, dtype=torch.int64).reshape(len(rows), width)
+
+
+def batch_of(queries: list[Any]) -> tuple[Match, Truth]:
+    score, index, right, known, soft = zip(*queries, strict=True) if queries else ((),) * 5
+    scores = torch.tensor(score, dtype=torch.float32)
+    match = Match(torch.tensor(index, dtype=torch.int64), scores, scores < 1)
+    return match, Truth(table(right), torch.tensor(known, dtype=torch.bool), table(soft))
+
+
+def same(figures: dict[str, Tensor], scores: Scores) -> bool:
+    return {name: value.item() for name, value in figures.items()} == scores._asdict()
+
+
+def some(queries: int = 40, rights: int = 2) -> tuple[Match, Tensor]:
+    index = torch.randint(-1, 9, (queries,))
+    score = torch.where(index < 0, INF, torch.rand(queries))
+    return Match(index, score, score < 0.5), torch.randint(-1, 9, (queries, rights))
+
+
+def fed(*batches: tuple[Match, Tensor], **arguments: Any) -> PlaceRecognition:
+    metric = PlaceRecognition(tolerance=1, **arguments)
+    for match, truth in batches:
+        metric.update(match, truth)
+    return metric
+
+
+@given(BATCHES, st.integers(0, 2))
+def test_it_is_judge_on_all_data_whatever_the_batches(batches: list[Any], tolerance: int) -> None:
+    metric = PlaceRecognition(tolerance)
+    for queries in batches:
+        metric.update(*batch_of(queries))
+    match, truth = batch_of([query for queries in batches for query in queries])
+    near = (match.index[:, None] - truth.right).abs() <= tolerance
+    right = (near & (truth.right >= 0) & (match.index >= 0)[:, None]).any(1)
+    soft = ((match.index[:, None] == truth.soft) & (truth.soft >= 0)).any(1)
+    figures = metric.compute()
+    assert isinstance(figures, dict)
+    if (truth.known & (right | ~soft)).any():
+        assert same(figures, judge(match, truth, tolerance))
+    else:
+        assert set(figures) == set(Scores._fields)
+        assert all(value.isnan() for value in figures.values())
+
+
+def test_by_hand() -> None:
+    metric = PlaceRecognition(tolerance=0)
+    metric.update(Match(torch.tensor([3]), torch.tensor([0.1]), torch.tensor([True])), torch.tensor([[3]]))
+    two = Match(torch.tensor([4, -1]), torch.tensor([0.2, INF]), torch.tensor([True, False]))
+    metric.update(two, torch.tensor([[5, 3], [6, -1]]))
+    figures = {name: round(value.item(), 6) for name, value in metric.compute().items()}
+    assert figures == {
+        "auc": 0.0,  # both points lie at recall 1/3
+        "auc_reported": 0.125,  # from (1/3, 1) to (1/2, 1/2)
+        "recall_at_100_precision": round(1 / 3, 6),
+        "recall_at_100_precision_reported": round(1 / 3, 6),
+        "precision_at_100_recall": 0.5,
+        "recall_at_1": round(1 / 3, 6),
+    }
+
+
+def test_close_scores_in_double_precision_stay_apart() -> None:
+    index, score = torch.tensor([0, 1]), torch.tensor([1.0, 1.0 + 1e-12], dtype=torch.float64)
+    match = Match(index, score, score.isfinite())
+    truth = torch.tensor([[0], [5]])
+    metric = PlaceRecognition(tolerance=0)
+    metric.update(match, truth)
+    assert same(metric.compute(), judge(match, truth, 0))
+    assert metric.compute()["recall_at_100_precision"] == 0.5
+
+
+def test_reset_forgets() -> None:
+    first, second = some(), some()
+    metric = fed(first)
+    metric.reset()
+    assert all(value.isnan() for value in metric.compute().values())
+    metric.update(*second)
+    assert same(metric.compute(), judge(*second, tolerance=1))
+
+
+def test_calling_it_judges_the_batch_and_adds_it() -> None:
+    first, second = some(), some()
+    metric = fed(first)
+    assert same(metric.compute(), judge(*first, tolerance=1))
+    assert same(metric(*second), judge(*second, tolerance=1))
+    assert same(metric.compute(), fed_scores(first, second))
+
+
+def fed_scores(*batches: tuple[Match, Tensor]) -> Scores:
+    """`judge` of the batches joined by hand."""
+    matches, truths = zip(*batches, strict=True)
+    width = max(truth.shape[1] for truth in truths)
+    rows = [torch.nn.functional.pad(truth, (0, width - truth.shape[1]), value=-1) for truth in truths]
+    joined = Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
+    return judge(joined, torch.cat(rows), tolerance=1)
+
+
+def test_merged_states_are_one() -> None:
+    first, second = some(rights=1), some(rights=4)
+    metric = fed(first)
+    metric.merge_state(fed(second))
+    assert same(metric.compute(), fed_scores(first, second))
+
+
+@pytest.mark.parametrize("elsewhere", [(), (some(30, 3),), (some(30, 3), some(5, 1))], ids=len)
+def test_processes_are_joined(elsewhere: tuple[tuple[Match, Tensor], ...]) -> None:
+    """As torchmetrics syncs: a tensor a state from each process, in the order of the states."""
+    here, other = (some(), some(rights=1)), fed(*elsewhere)
+    states = [torch.cat(state) if state else torch.zeros(0) for state in other.metric_state.values()]
+    theirs = iter(states)
+
+    def gather(mine: Tensor, group: object) -> list[Tensor]:
+        assert mine.ndim == 1  # processes exchange only tensors of the same type and number of dimensions
+        assert mine.dtype == torch.float64
+        return [mine, next(theirs).to(mine.dtype)]
+
+    metric = fed(*here, dist_sync_fn=gather, distributed_available_fn=lambda: True)
+    assert same(metric.compute(), fed_scores(*here, *elsewhere))
+    assert same(fed(*here).compute(), fed_scores(*here))
+
+
+def test_a_process_that_saw_nothing_sends_what_the_others_send() -> None:
+    sent = []
+
+    def gather(mine: Tensor, group: object) -> list[Tensor]:
+        sent.append((mine.ndim, mine.dtype))
+        return [mine, torch.zeros(1, dtype=torch.float64)]
+
+    fed(dist_sync_fn=gather, distributed_available_fn=lambda: True).compute()
+    assert sent == [(1, torch.float64)] * 3
+
+
+def test_it_survives_a_pickle_a_copy_and_a_checkpoint() -> None:
+    metric = fed(some(), some(rights=3))
+    expected = metric.compute()
+    metric.persistent(True)
+    restored = PlaceRecognition(tolerance=1)
+    restored.persistent(True)
+    restored.load_state_dict(metric.state_dict())
+    for other in (pickle.loads(pickle.dumps(metric)), copy.deepcopy(metric), restored):
+        other._computed = None  # what was kept, not what was computed
+        assert other.compute() == expected
+    assert PlaceRecognition(tolerance=1).state_dict() == {}
+
+
+def test_in_a_collection_the_figures_stand_by_name() -> None:
+    batch = some()
+    collection = MetricCollection({"near": PlaceRecognition(0, "auc"), "far": PlaceRecognition(2, "auc")})
+    collection.update(*batch)
+    near, far = judge(*batch, tolerance=0).auc, judge(*batch, tolerance=2).auc
+    assert {name: value.item() for name, value in collection.compute().items()} == {"near": near, "far": far}
+    assert near != far
+    assert same(MetricCollection(PlaceRecognition(0))(*batch), judge(*batch, tolerance=0))
+
+
+class Validated(LightningModule):
+    """Logs as a task does: one figure as a metric, all of them as a dict."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.one, self.every = PlaceRecognition(1, "auc"), PlaceRecognition(1)
+
+    def validation_step(self, batch: Any, index: int) -> None:
+        for metric in (self.one, self.every):
+            metric.update(*batch)
+        self.log("one", self.one)
+
+    def on_validation_epoch_end(self) -> None:
+        self.log_dict(self.every.compute())
+        self.every.reset()
+
+
+def test_a_trainer_logs_it() -> None:
+    batches = [some(), some(rights=3)]
+    trainer = Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
+    logged = trainer.validate(Validated(), DataLoader(batches, batch_size=None), verbose=False)[0]
+    scores = fed_scores(*batches)
+    assert logged == pytest.approx({"one": scores.auc, **scores._asdict()})
+
+
+def test_higher_is_better_and_gradients_stop() -> None:
+    match, truth = some()
+    metric = fed((match._replace(score=match.score.requires_grad_()), truth))
+    assert metric.higher_is_better
+    assert not any(value.requires_grad for value in metric.compute().values())
+
+
+def test_errors() -> None:
+    match, truth = some(queries=3)
+    metric = PlaceRecognition(tolerance=1)
+    with refused("figure 'area'", "auc, auc_reported"):
+        PlaceRecognition(1, figure="area")
+    with refused("tolerance is -1", "at least 0"):
+        PlaceRecognition(-1)
+    with refused("(3, 1) torch.int64", "(3,)", "expected (Q,) int64"):
+        metric.update(match._replace(index=match.index[:, None]), truth)
+    with refused("torch.float32", "expected (Q,) int64"):
+        metric.update(match._replace(index=match.index.float()), truth)
+    with refused("(3,) torch.int64 and (2,)"):
+        metric.update(match._replace(score=match.score[:2]), truth)
+    with refused("a score is NaN"):
+        metric.update(match._replace(score=match.score * float("nan")), truth)
+    with refused("the truth is (2, 2)", "(3, R)"):
+        metric.update(match, truth[:2])
+    with refused("the truth is (3,)"):
+        metric.update(match, truth[:, 0])
+    with refused("(2,) and (3, 0)", "expected (3,)"):
+        metric.update(match, as_truth(truth)._replace(known=torch.ones(2, dtype=torch.bool)))
+    assert not metric.score  # nothing of a refused batch is kept
