@@ -9,7 +9,6 @@ from kornia.augmentation import (
     RandomAffine,
     RandomBrightness,
     RandomContrast,
-    RandomErasing,
     RandomGamma,
     RandomGaussianBlur,
     RandomLinearIllumination,
@@ -36,6 +35,7 @@ LARGEST: dict[str, tuple[float, ...]] = {
     "noise": (1,),
 }
 NOISY = 0.7  # the chance that a clip gets noise
+OCCLUDED = 0.7  # and that something stands in its way
 
 
 class _Perspective(RandomPerspective):  # type: ignore[misc]  # kornia's types are not read
@@ -73,8 +73,10 @@ class Augmentation(nn.Module):
             opposite side; at most 1. Acts on 1 clip of 2.
         blur: sigma of a Gaussian, pixels, cut off at the whole number of pixels nearest to it (at least
             1). Acts on 1 clip of 2.
-        occlusion: fraction of the frame's area that a black rectangle covers, at least 0.02 of it where
-            that is less; its sides are rounded to whole pixels, at least 1. Acts on 1 clip of 2.
+        occlusion: fraction of the frame's area that a rectangle out of another clip covers, as a vehicle
+            does that stands there on one day only; its sides are in the ratio of 1:3 to 3:1 and rounded to
+            whole pixels. The frames of a clip are covered by those of the other clip in their order; a
+            clip alone is covered with black. Acts on 7 clips of 10.
         noise: standard deviation of Gaussian noise, of values in [0, 1]. Acts on 7 clips of 10.
 
     Shape: frames (B,C,H,W) or clips (B,T,C,H,W), float32 in [0, 1] -> the same, clamped to [0, 1].
@@ -105,13 +107,13 @@ class Augmentation(nn.Module):
         gamma: float = 0.5,
         illumination: float = 0.25,
         blur: float = 1.2,
-        occlusion: float = 0.15,
+        occlusion: float = 0.4,
         noise: float = 0.03,
     ) -> None:
         super().__init__()
         given = locals()
         self.strengths = {name: _checked(name, given[name]) for name in LARGEST}
-        self.colour, self.noise = self.strengths["colour"], noise
+        self.colour, self.noise, self.occlusion = self.strengths["colour"], noise, occlusion
         self.radius = max(1, round(blur)) if blur else 0
         gain, offset = exposure
         steps: list[nn.Module] = []
@@ -132,8 +134,6 @@ class Augmentation(nn.Module):
             size = 2 * self.radius + 1
             apart = size > 3  # 3 x 3 in one go takes half the time of rows and columns apart
             steps.append(RandomGaussianBlur((size, size), (min(0.1, blur), float(blur)), separable=apart))
-        if occlusion:
-            steps.append(RandomErasing((min(0.02, occlusion), float(occlusion)), (0.3, 3.0)))
         # in a tuple, which keeps kornia's buffers out of checkpoints: they hold strengths, nothing learnt
         self._steps = (VideoSequential(*steps),)
 
@@ -153,6 +153,8 @@ class Augmentation(nn.Module):
         (steps,) = self._steps
         clips: Tensor = frames if frames.ndim == 5 else frames[:, None]
         clips = steps(self._coloured(clips))
+        if self.occlusion:
+            clips = self._occluded(clips)
         if self.noise:
             noisy = torch.rand(len(clips), 1, 1, 1, 1, device=clips.device) < NOISY
             clips = torch.randn_like(clips).mul_(self.noise * noisy).add_(clips)
@@ -163,6 +165,23 @@ class Augmentation(nn.Module):
         gain, offset = self.colour
         draw = torch.rand(2, len(clips), 1, clips.shape[2], 1, 1, device=clips.device) * 2 - 1
         return (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)
+
+    def _occluded(self, clips: Tensor) -> Tensor:
+        """A rectangle of each clip taken from the one before."""
+        count, (height, width) = len(clips), clips.shape[-2:]
+        area, ratio, y, x, chance = torch.rand(5, count, 1, 1, device=clips.device)
+        area, ratio = area * self.occlusion, 3 ** (2 * ratio - 1)
+
+        def inside(pixels: int, side: Tensor, where: Tensor) -> Tensor:
+            side = (side.clamp(max=1) * pixels).round()
+            first = (where * (pixels - side + 1)).floor()
+            along = torch.arange(pixels, device=clips.device)
+            return (along >= first) & (along < first + side)
+
+        rows = inside(height, (area / ratio).sqrt(), y).transpose(1, 2)
+        covered = rows & inside(width, (area * ratio).sqrt(), x) & (chance < OCCLUDED)
+        other = clips.roll(1, 0) if count > 1 else torch.zeros_like(clips)
+        return torch.where(covered[:, None, None], other, clips)
 
     def extra_repr(self) -> str:
         shown = {name: value if len(value) > 1 else value[0] for name, value in self.strengths.items()}
