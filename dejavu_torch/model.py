@@ -219,7 +219,7 @@ class DejaVu(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path, features: nn.Module | None = None) -> DejaVu:
-        """Read a map file.
+        """Read a map file; the model is in eval mode.
 
         Args:
             features: the module that made the map's features, needed where it is not one of this
@@ -246,7 +246,7 @@ class DejaVu(nn.Module):
         except (AttributeError, KeyError, RuntimeError, TypeError) as error:
             what = "fit its modules" if isinstance(error, RuntimeError) else "hold what a map holds"
             raise InputError(f"{path} does not {what}: {' '.join(str(error).split())}") from error
-        return model
+        return model.eval()
 
     @property
     def map_bytes(self) -> int:

@@ -279,8 +279,7 @@ def trained_map(tmp_path: Path) -> Path:
 def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, before = trained_map.parent, trained_map.read_bytes()
     pair = folder / "a.npy", folder / "b.npy", "--truth", "0", "--features", "torch.nn.Flatten"
-    # options that make a map, and the metric, are the map's own
-    run("compare", *pair, "--map", trained_map, "--out", folder / "r", "--metric", "cosine")
+    run("compare", *pair, "--map", trained_map, "--out", folder / "r")
     report = json.loads((folder / "r" / "report.json").read_text())
     assert report["trained"] == {"steps": 30, "seconds": 1000.0, "seed": 3}
     assert report["seconds_learn"] > 1000
@@ -296,6 +295,32 @@ def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.Capt
     assert report["accepted"] == int(match.accepted.sum())
     run("compare", *pair, "--map", trained_map, "--out", folder / "r", "--threshold", "0.5")
     assert json.loads((folder / "r" / "report.json").read_text())["threshold"] == 0.5
+
+
+@pytest.mark.parametrize(
+    "option",
+    [["--metric", "cosine"], ["--periods.window", "99"], ["--temperature=2"], ["--config", "c.yaml"]],
+)
+def test_compare_with_a_map_takes_no_settings(
+    trained_map: Path, option: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = trained_map.parent
+    (folder / "c.yaml").write_text("reduction: sum\n")
+    option = [word.replace("c.yaml", str(folder / "c.yaml")) for word in option]
+    with pytest.raises(SystemExit):
+        run(
+            "compare",
+            folder / "a.npy",
+            folder / "b.npy",
+            "--map",
+            trained_map,
+            "--out",
+            folder / "r",
+            *option,
+        )
+    told = capsys.readouterr().err
+    assert f"{option[0].partition('=')[0]}: a --map has its own settings" in told
+    assert told.count("\n") == 1
 
 
 def test_compare_builds_features_of_this_package_by_itself(tmp_path: Path) -> None:

@@ -8,12 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from dejavu_torch import DejaVu
 from dejavu_torch.cli import train
 from dejavu_torch.cli.parser import UsageError, build_parser
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.periods.imposed import ImposedPeriods
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+TRAINING = (ROOT / "docs" / "training.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
@@ -64,11 +69,41 @@ def understand(line: str) -> None:
             train.run_train(words[1:])
 
 
-def test_every_command_shown_is_understood() -> None:
-    shown = re.findall(r"^dejavu .*$", README.replace("\\\n", " "), re.MULTILINE)
+@pytest.mark.parametrize("text", [README, TRAINING], ids=["README", "training"])
+def test_every_command_shown_is_understood(text: str) -> None:
+    shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
     assert len(shown) >= 4
     for line in shown:
         understand(line)
+
+
+def test_options_that_the_text_on_training_names_are_understood() -> None:
+    text = TRAINING.replace("\n  ", " ")
+    options = re.findall(r"`(--(?:model|data|trainer)\.[^`*\s]+ [^`]+)`", text)
+    assert len(options) >= 8
+    for option in options:
+        if "my_module" in option:
+            continue
+        understand(f"dejavu train fit --config configs/train_small.yaml --data.source sim:aerial {option}")
+
+
+def test_yaml_on_training_is_understood(tmp_path: Path) -> None:
+    (shown,) = re.findall(r"```yaml\n(.*?)```", TRAINING, re.DOTALL)
+    (tmp_path / "stop.yaml").write_text(shown)
+    config = f"--config configs/train_small.yaml --config {tmp_path / 'stop.yaml'}"
+    understand(f"dejavu train fit {config} --data.source sim:aerial")
+
+
+def test_export_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "road").mkdir()
+    shown = re.findall(r"```py\n(.*?)```", TRAINING, re.DOTALL)[-1]
+    features = SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2).eval()
+    model = DejaVu(features, ImposedPeriods([3, 4])).learn(torch.rand(50, 3, 64, 64))
+    model.save("road/map.safetensors")
+    exec(shown, {})
+    frames, program = torch.rand(5, 3, 64, 64), torch.export.load(tmp_path / "road.pt2")
+    torch.testing.assert_close(program.module()(frames), model.eval()(frames))
 
 
 def test_a_training_that_is_shown_would_be_understood() -> None:

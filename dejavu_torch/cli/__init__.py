@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shlex
 import signal
 import sys
@@ -11,7 +12,7 @@ from itertools import pairwise
 from typing import NoReturn
 
 from dejavu_torch.cli import commands
-from dejavu_torch.cli.parser import MODEL, UsageError, build_parser
+from dejavu_torch.cli.parser import MODEL, UsageError, build_parser, refusal
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
 
@@ -33,6 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = _spelt_out(list(sys.argv[1:] if arguments is None else arguments))
     if arguments is None:  # so that temporary files are removed
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # a user's own classes, as `python -m` finds them
     parser = build_parser()
     try:
         if given[:1] == ["train"]:  # Lightning, which takes seconds to import, is loaded for it alone
@@ -44,7 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if parsed.command is None:
             parser.print_help()
             raise SystemExit(2)
-        chosen = parser.instantiate(parsed)[parsed.command].as_dict()
+        try:
+            chosen = parser.instantiate(parsed)[parsed.command].as_dict()
+        except Exception as error:
+            raise refusal(error) from error
+        if chosen.get("map") and parsed.command == "compare":
+            _refuse_settings(given)
         chosen.pop("config", None)
         if parsed.command in ("demo", "learn", "compare"):
             chosen["model"] = DejaVu(**{name: chosen.pop(name) for name in MODEL})
@@ -53,17 +61,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         COMMANDS[parsed.command](**chosen)
     except UsageError as error:
         config = [value for name, value in pairwise(given) if name == "--config"]
-        fail(f"{error} (with --config {config[0]})" if config else f"{error} (see --help)")
+        fail(f"{error} (with --config {' --config '.join(config)})" if config else f"{error} (see --help)")
     except (InputError, OSError) as error:
         fail(str(error))
-    except ValueError as error:  # a constructor's own refusal arrives wrapped
-        cause = error.__cause__ or error.__context__
-        if not isinstance(cause, InputError):
-            raise
-        fail(str(cause))
     except KeyboardInterrupt:
         print("dejavu: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _refuse_settings(given: list[str]) -> None:
+    """A map has its own settings; only its threshold and what made its features can be given."""
+    for word in given:
+        name = word.removeprefix("--").partition("=")[0].partition(".")[0]
+        if word.startswith("--") and name in (*MODEL, "config") and name not in ("features", "threshold"):
+            raise UsageError(f"{word.partition('=')[0]}: a --map has its own settings")
 
 
 def _spelt_out(given: list[str]) -> list[str]:

@@ -59,6 +59,14 @@ class UsageError(InputError):
     """A command line or config file that does not say what the commands understand."""
 
 
+def refusal(error: Exception) -> InputError:
+    """What a part's constructor refused, in one line; jsonargparse wraps it."""
+    cause = error.__cause__ or error.__context__ or error
+    if isinstance(cause, InputError):
+        return cause
+    return InputError(f"a part cannot be built: {' '.join(str(cause).split())[:LONGEST]}")
+
+
 class Parser(jsonargparse.ArgumentParser):
     """An argument parser whose errors are one line."""
 
@@ -69,10 +77,10 @@ class Parser(jsonargparse.ArgumentParser):
         # of a union's complaints the first is the one about what the user wrote
         union = re.search(r"Errors:\n\s*- (.*?)(?=\n\s*- |\n  Given|\Z)", message, re.DOTALL)
         complaint = f"{message.partition(':')[0]}: {union[1]}" if union else message
-        raise UsageError(plainly(complaint)) from ex
+        raise UsageError(_plainly(complaint)) from ex
 
 
-def plainly(message: str) -> str:
+def _plainly(message: str) -> str:
     """jsonargparse's complaint as a user would put it: options by their names, types in words."""
     head, _, names = message.partition("required: ")
     if names:

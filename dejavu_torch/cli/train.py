@@ -11,11 +11,12 @@ from typing import Any, NoReturn
 
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning import Trainer
-from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
-from dejavu_torch.cli.parser import Parser, UsageError
+from dejavu_torch.cli.parser import Parser, UsageError, refusal
 from dejavu_torch.data.files import make_output_folder
+from dejavu_torch.database.certificate import describe
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import MapExport
 from dejavu_torch.training.task import PlaceRecognitionTask
@@ -29,6 +30,14 @@ DEFAULTS = {
     "num_sanity_val_steps": 0,
     "log_every_n_steps": 10,
 }
+
+PARTS = {
+    "model.backbone": "dejavu_torch.features.cnn.SmallCNN",
+    "model.periods": "dejavu_torch.periods.imposed.ImposedPeriods",
+    "model.preprocess": "dejavu_torch.Preprocess",
+    "data.augmentation": "dejavu_torch.training.augment.Augmentation",
+}
+log = logging.getLogger("dejavu_torch")
 
 
 class TrainParser(Parser, LightningArgumentParser):
@@ -77,7 +86,40 @@ class TrainCLI(LightningCLI):
         asked = self.config[self.subcommand]["trainer"]
         if asked["max_steps"] == -1 and asked["max_epochs"] in (None, -1) and not asked["fast_dev_run"]:
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
-        make_output_folder(Path(self.trainer.default_root_dir))
+        if 0 in (asked["max_steps"], asked["max_epochs"]):
+            raise InputError("the training has no steps; expected trainer.max_steps above 0")
+        if asked["overfit_batches"]:
+            raise InputError("trainer.overfit_batches is not for clips; expected trainer.limit_train_batches")
+        root = Path(self.trainer.default_root_dir)
+        make_output_folder(root)
+        if asked["fast_dev_run"]:  # leaves an earlier run as it is
+            writers = (ModelCheckpoint, MapExport)
+            self._callbacks[:] = [one for one in self._callbacks if not isinstance(one, writers)]
+        elif (root / "map.safetensors").exists() and not self.config[self.subcommand].get("ckpt_path"):
+            log.warning("%s holds an earlier run, which this one replaces", root)
+
+    def after_fit(self) -> None:
+        """Tell of the map."""
+        for callback in self._callbacks:
+            if isinstance(callback, MapExport) and callback.written is not None:
+                path, certificate = callback.written
+                print(f"{describe(certificate)}\nwritten to {path}; `dejavu compare --map` judges it")
+
+    def instantiate_classes(self) -> None:
+        """What a part's constructor refuses is told in one line."""
+        try:
+            super().instantiate_classes()
+        except Exception as error:
+            raise refusal(error) from error
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Parts that are our own unless another class is named, so that their options can be given alone."""
+        parser.set_defaults({name: {"class_path": path} for name, path in PARTS.items()})
+
+    @property
+    def _callbacks(self) -> list[Callback]:
+        found: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
+        return found
 
     @property
     def _checkpoints(self) -> Path:
@@ -144,6 +186,12 @@ def run_train(arguments: Sequence[str]) -> None:
         elif "Early stopping conditioned" not in told:
             raise
         raise InputError(told) from error
+    except KeyError as error:
+        if "pytorch-lightning_version" not in str(error):
+            raise
+        raise InputError(
+            "the checkpoint is none of a training; expected one that `dejavu train fit` wrote"
+        ) from error
     except MisconfigurationException as error:
         raise InputError(str(error)) from error
     except UnpicklingError as error:

@@ -55,17 +55,22 @@ def recipe_of(module: nn.Module) -> Recipe:
     return Recipe(path, json.loads(json.dumps(arguments)))
 
 
-def build(recipe: Recipe, kind: type[M]) -> M:
+def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
     """Build a module of this package from its recipe; never imports anything else.
+
+    Args:
+        given: a module from elsewhere, to stand where the recipe, or a part of it, names its class.
 
     Raises:
         InputError: a class outside this package, one that is not there, or one that is no `kind`.
     """
     module_name, _, class_name = str(recipe.class_path).rpartition(".")
+    if isinstance(given, kind) and recipe_of(given) == recipe:
+        return given
     if not str(recipe.class_path).startswith(PACKAGE + "."):
         raise InputError(
-            f"the map's features come from {recipe.class_path}, which only the caller can load; "
-            "expected --features CLASS, or features=... in Python"
+            f"the map's features come from {recipe.class_path}, which only the caller can load; expected "
+            f"--features {recipe.class_path} with the arguments it was made with, or features=... in Python"
         )
     try:
         cls = getattr(importlib.import_module(module_name), class_name)
@@ -74,7 +79,7 @@ def build(recipe: Recipe, kind: type[M]) -> M:
         parts = {
             n: Recipe(**v) for n, v in recipe.init_args.items() if isinstance(v, dict) and "class_path" in v
         }
-        module = cls(**recipe.init_args | {name: build(part, nn.Module) for name, part in parts.items()})
+        module = cls(**recipe.init_args | {n: build(part, nn.Module, given) for n, part in parts.items()})
     except (ImportError, AttributeError, TypeError) as error:
         raise InputError(f"the map names {recipe.class_path}, which cannot be built: {error}") from error
     return module
@@ -97,15 +102,31 @@ def build_parts(header: dict[str, Any], features: nn.Module | None = None) -> di
     """
     there = [name for name in PARTS if name != "velocity" or header[name] is not None]
     recipes = {name: Recipe(**header[name]) for name in there}
-    if features is not None and recipe_of(features) != recipes["features"]:
-        raise InputError(f"it was learnt with {recipes['features']}; got {recipe_of(features)}")
-    parts: dict[str, Any] = dict.fromkeys(PARTS) | {"features": features}
+    if features is not None and recipe_of(features) not in _within(recipes["features"]):
+        raise InputError(f"it was learnt with {_difference(recipes['features'], recipe_of(features))}")
+    parts: dict[str, Any] = dict.fromkeys(PARTS)
     for name, recipe in recipes.items():
         # only learning needs what found the periods: one from elsewhere need not be built
         elsewhere = name == "periods" and not recipe.class_path.startswith(PACKAGE + ".")
         if parts[name] is None and not elsewhere:
-            parts[name] = build(recipe, PARTS[name])
+            parts[name] = build(recipe, PARTS[name], features)
     return parts
+
+
+def _within(recipe: Recipe) -> list[Recipe]:
+    """A recipe, and those of its parts."""
+    parts = [Recipe(**v) for v in recipe.init_args.values() if isinstance(v, dict) and "class_path" in v]
+    return [recipe, *(inner for part in parts for inner in _within(part))]
+
+
+def _difference(stored: Recipe, given: Recipe) -> str:
+    """Where two recipes differ, in words."""
+    if stored.class_path != given.class_path:
+        return f"{stored.class_path}; got {given.class_path}"
+    names = [name for name, value in stored.init_args.items() if given.init_args.get(name) != value]
+    told = ", ".join(f"{name}={stored.init_args[name]}" for name in names)
+    got = ", ".join(f"{name}={given.init_args.get(name)}" for name in names)
+    return f"{stored.class_path} of {told}; got {got}"
 
 
 def metadata_of(header: dict[str, Any]) -> dict[str, str]:

@@ -150,7 +150,9 @@ def plot_spectrogram(
     return figure, (above, below)
 
 
-def plot_templates(layer: FrequencyLayer, values: Tensor, templates: Tensor, chosen: int) -> Plot:
+def plot_templates(
+    layer: FrequencyLayer, values: Tensor, templates: Tensor, chosen: int, thick: str = "their mean"
+) -> Plot:
     """The frames of equal phase averaged into templates (figure 4 of the paper).
 
     Args:
@@ -158,6 +160,7 @@ def plot_templates(layer: FrequencyLayer, values: Tensor, templates: Tensor, cho
         values: (n,) one feature at the frames of the layer's chunk.
         templates: (P,F) of the layer.
         chosen: position of that feature among the layer's.
+        thick: what the templates are, for the title.
 
     Convention: of more than 100 cycles every k-th is drawn. Of more than 64 features those are drawn that
         vary most from phase to phase; rows are ordered by where in the cycle they are high, each from
@@ -175,7 +178,7 @@ def plot_templates(layer: FrequencyLayer, values: Tensor, templates: Tensor, cho
     # phase k holds the frames that lie from k to k + 1 phases into their cycle
     phase = (torch.arange(layer.phases) + 0.5) * period / layer.phases - 0.5
     above.plot(phase, templates[:, chosen], color=BLUE, linewidth=2.2)
-    text = f"feature {number}, {len(cycles)} cycles of {period:.4g} frames; thick: their mean"
+    text = f"feature {number}, {len(cycles)} cycles of {period:.4g} frames; thick: {thick}"
     above.set_title(text, loc="left", fontsize=10)
     above.set(ylabel="value")
     rows = templates.var(0, correction=0).argsort(descending=True, stable=True)[:ROWS]

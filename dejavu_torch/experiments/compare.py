@@ -122,6 +122,7 @@ def compare(
             model.learn_features(stored, reference)
         else:
             _check_places(model, reference, len(stored))
+            _check_own(model, stored, tolerance, reference.name)
     with clock("localize"):
         seen = model.extract_all(query, "localizing" if progress else None)
         model.check_queries(frame_shape(query), seen.shape[1], query.name)
@@ -266,6 +267,15 @@ def _check_places(model: DejaVu, reference: Traverse, places: int) -> None:
             f"{reference.name} gives {places} places, the map holds {model.map.places}; "
             "expected the reference that it was made of"
         )
+
+
+def _check_own(model: DejaVu, stored: Tensor, tolerance: int, name: str) -> None:
+    """Tell of a map that finds few of the frames that it should be made of."""
+    sample = torch.arange(0, len(stored), max(1, len(stored) // 256))
+    right = (model.localize(stored[sample]).index - sample).abs() <= tolerance
+    if model.map.plan and right.float().mean() < 0.5:
+        told = "the map finds %d of %d frames of %s; expected the reference that it was made of"
+        log.warning(told, int(right.sum()), len(sample), name)
 
 
 def _plain(period: object) -> int | float:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
 from dejavu_torch.evaluation.controls import null_control
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match, Traverse
 
@@ -35,20 +36,21 @@ def others_of(
         progress: show progress bars on a terminal.
     """
     frames, dimension = stored.shape
-    itemsize = model.map.templates.element_size()
+    itemsize, backbone = model.map.templates.element_size(), model.backbone_bytes  # frames need it as well
     strides = {
         "uncompressed": 1,
-        "stride": fair_stride(frames, dimension, itemsize, model.map_bytes, tolerance),
+        "stride": fair_stride(frames, dimension, itemsize, model.map_bytes - backbone, tolerance),
         "stride_coarsest": max(1, 2 * tolerance),
     }
+    of = "" if isinstance(model.features, HOG) else "same features, "
     names = {
-        "uncompressed": f"all {frames} frames",
-        "stride": f"{_every(strides['stride'])} (at least the map's bytes)",
-        "stride_coarsest": f"{_every(strides['stride_coarsest'])} (2 x tolerance)",
+        "uncompressed": f"{of}all {frames} frames",
+        "stride": f"{of}{_every(strides['stride'])} (at least the map's bytes)",
+        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'])} (2 x tolerance)",
     }
     nearest = nearest_frames(stored, seen, tuple(strides.values()), model.matcher.metric, progress)
     others = {
-        key: Other(names[key], match, stride_bytes(frames, dimension, itemsize, k), k)
+        key: Other(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k)
         for (key, k), match in zip(strides.items(), nearest, strict=True)
     }
     if model.trained is None:

@@ -59,11 +59,11 @@ def draw_pictures(
     curves = {}
     if truth is not None:
         judged, strides = {"this map": match}, []
-        for key, (name, other, _, stride) in others.items():
+        for key, (name, other, size, stride) in others.items():
             # leave_out has other queries
-            if key != "leave_out" and (stride is None or stride not in strides):
+            if key != "leave_out" and (stride is None or (stride, size) not in strides):
                 judged[name] = other
-                strides.append(stride)
+                strides.append((stride, size))
         curves = {
             name: curve_of(one, truth, tolerance)
             for name, one in judged.items()
@@ -91,7 +91,7 @@ def draw_pictures(
     )
     pictures["chunks"] = Picture(
         plot_chunks(plan, places),
-        "periods found along the route",
+        "the map's periods along the route",
         "Dotted lines cut the route into chunks. Each bar is a layer: the features that repeat with one "
         "period in one chunk; the wider, the more features.",
     )
@@ -158,11 +158,17 @@ def draw_features(model: DejaVu, reference: Traverse, stored: Tensor) -> dict[st
             "chunk. The map keeps the strongest periods, circled: they put the feature into a layer each.",
         )
     pictures["templates"] = Picture(
-        plot_templates(layer, values[layer.start : layer.stop, 0], templates, chosen),
+        plot_templates(
+            layer,
+            values[layer.start : layer.stop, 0],
+            templates,
+            chosen,
+            "the trained template" if model.trained else "their mean",
+        ),
         "frames of equal phase become templates",
-        "Above, the same feature cut into cycles of one period and laid over each other; their mean is "
-        f"what {'training starts from' if model.trained else 'the map stores'}. Below, the "
-        f"{'trained templates' if model.trained else 'means'} of the layer's features, a row each.",
+        "Above, the same feature cut into cycles of one period and laid over each other, and "
+        + ("the template that training made of it" if model.trained else "their mean, which the map stores")
+        + ". Below, the templates of the layer's features, a row each.",
     )
     features = model.features
     if type(features) is HOG:

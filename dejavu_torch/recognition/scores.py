@@ -68,7 +68,7 @@ def combine_layers(
         frames = torch.arange(start, stop, device=distances[0].device)
         total = distances[0].new_zeros(len(distances[0]), stop - start)
         for j in members:
-            total = total + distances[j][:, plan[j].phase(frames)]
+            total = total + distances[j].index_select(1, plan[j].phase(frames))
         if reduction == "mean":
             total = total / sum(weight_per_feature(metric, len(plan[j].features)) for j in members)
         parts.append(total)
@@ -78,8 +78,9 @@ def combine_layers(
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
     """How unlikely each place is: -log softmax(-S / T) over places.
 
-    It orders the places of a query as S does, and makes the scores of different queries comparable: S grows
-    with all that a frame has in no template, this only with what fits other places as well.
+    It orders the places of a query as S does (but for rounding where T is large), and makes the scores of
+    different queries comparable: S grows with all that a frame has in no template, this only with what fits
+    other places as well.
 
     Args:
         scores: S, lower is better. temperature: T, in units of S.

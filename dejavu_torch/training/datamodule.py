@@ -14,6 +14,7 @@ from dejavu_torch.data.truth import Shown, as_truth
 from dejavu_torch.data.truthfile import find_truth
 from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.model import DejaVu
 from dejavu_torch.training.augment import Augmentation
 from dejavu_torch.training.frames import Batch, Clips, StoredFrames, store
 from dejavu_torch.types import InputError, Traverse
@@ -68,6 +69,8 @@ class RouteData(LightningDataModule):
                 f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}; expected a tolerance of 0 "
                 "or more, and batches of at least 2 frames made of whole clips"
             )
+        if resize is not None and (len(resize) != 2 or min(resize) < 1):
+            raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
         self.source = source
         self.others = {
             "second": (second, second_truth),
@@ -109,7 +112,8 @@ class RouteData(LightningDataModule):
         if values.shape[1:] != reference.values.shape[1:]:
             raise InputError(
                 f"{traverse.name} has frames of {tuple(values.shape[1:])}, the reference of "
-                f"{tuple(reference.values.shape[1:])}; expected one size, as data.resize makes"
+                f"{tuple(reference.values.shape[1:])}; expected the same channels, and one size, "
+                "as data.resize makes"
             )
         shown = None
         if isinstance(self.reference, EvenlySpaced):
@@ -125,9 +129,7 @@ class RouteData(LightningDataModule):
         return StoredFrames(values, known)
 
     def _evenly(self, traverse: Traverse, step: float | None = None) -> Traverse:
-        if self.velocity is None or isinstance(traverse, EvenlySpaced):
-            return traverse
-        return EvenlySpaced(traverse, self.velocity, self.batch_size, step)
+        return DejaVu(velocity=self.velocity, batch_size=self.batch_size).evenly(traverse, step)
 
     def _check_length(self, name: str, frames: int) -> None:
         if frames <= max(1, self.tolerance):
@@ -146,8 +148,8 @@ class RouteData(LightningDataModule):
         width = max(right.shape[1] for right in rights)
         pad = torch.nn.functional.pad
         right = torch.cat([pad(right, (0, width - right.shape[1]), value=-1) for right in rights])
-        values = parts[0].values if len(parts) == 1 else torch.cat([part.values for part in parts])
-        return _loader(StoredFrames(values, as_truth(right)), Clips(lengths, self.batch_size, self.clip))
+        frames = StoredFrames(parts[0].values, as_truth(right), *(part.values for part in parts[1:]))
+        return _loader(frames, Clips(lengths, self.batch_size, self.clip))
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """The validation traverse, or the reference under augmentations that are the same each time."""

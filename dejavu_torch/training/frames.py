@@ -27,18 +27,25 @@ class StoredFrames(Dataset[Batch]):
     """Frames as bytes, which may lie in a temporary file (see `gather`), with their right places.
 
     Args:
-        values: frames (n,C,H,W) uint8, or features (n,D) float. truth: of n queries.
+        values: frames (n,C,H,W) uint8, or features (n,D) float. more: further ones behind them.
+        truth: of all of them.
     """
 
-    def __init__(self, values: Tensor, truth: Truth) -> None:
-        self.values = values
+    def __init__(self, values: Tensor, truth: Truth, *more: Tensor) -> None:
+        self.values, self.more = values, more
         self.truth = truth._replace(right=truth.right.masked_fill(~truth.known[:, None], -1))
 
     def __len__(self) -> int:
-        return len(self.values)
+        return len(self.values) + sum(len(part) for part in self.more)
 
     def __getitem__(self, index: list[int]) -> Batch:
-        return Batch(as_frames(self.values[index]), Truth(*(part[index] for part in self.truth)))
+        frames, first = torch.tensor(index), 0
+        chosen = self.values.new_empty(len(frames), *self.values.shape[1:])
+        for part in (self.values, *self.more):  # which may lie in files: never as one
+            here = (frames >= first) & (frames < first + len(part))
+            chosen[here] = part[frames[here] - first]
+            first += len(part)
+        return Batch(as_frames(chosen), Truth(*(part[index] for part in self.truth)))
 
 
 class Clips(Sampler[list[int]]):

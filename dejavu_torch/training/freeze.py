@@ -12,7 +12,8 @@ from dejavu_torch.database.mapfile import read_map
 from dejavu_torch.types import InputError
 
 # follow the batches in training: their running statistics change without any gradient
-RUNNING = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
+BATCH = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
+RUNNING = (*BATCH, nn.InstanceNorm1d, nn.InstanceNorm2d, nn.InstanceNorm3d)
 
 
 def freeze(

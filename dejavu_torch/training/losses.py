@@ -1,7 +1,4 @@
-"""What a feature is trained for: to find the place, to repeat, and to tell places apart.
-
-Each loss is a scalar, in float32 at least; where nothing counts it is 0, with zero gradients.
-"""
+"""To find the place, to repeat, to tell places apart: scalars in float32 at least, 0 where nothing counts."""
 
 from __future__ import annotations
 
@@ -105,6 +102,7 @@ def periodicity_loss(
     periods: Sequence[Fraction | int],
     temperature: float = 0.1,
     cycles: int = 2,
+    phases: Sequence[int] | None = None,
 ) -> Tensor:
     """Mean over features of -T log mean_tau exp(r / T), where r = 1 - SSE / SST on cycles held out.
 
@@ -115,7 +113,7 @@ def periodicity_loss(
     Args:
         features: of the frames, in any order and with gaps.
         frames: index of each along the route.
-        periods: candidates tau >= 2, in frames; each gets round(tau) phases.
+        periods: candidates tau >= 2, in frames. phases: of each; None is round(tau).
         temperature: T > 0; the smaller, the more each feature keeps to its best period.
         cycles: number of folds, at least 2.
 
@@ -139,7 +137,8 @@ def periodicity_loss(
     if not periods or min(periods) < 2 or not temperature > 0 or cycles < 2:
         seen = f"periods {[str(period) for period in periods]}, temperature {temperature}, {cycles} cycles"
         raise InputError(f"periodicity_loss got {seen}; expected periods >= 2, T > 0, at least 2 cycles")
-    r = torch.stack([_explained(features, frames, Fraction(period), cycles) for period in periods])
+    pairs = zip(periods, phases or [round(period) for period in periods], strict=True)
+    r = torch.stack([_explained(features, frames, Fraction(tau), count, cycles) for tau, count in pairs])
     return temperature * (math.log(len(periods)) - (r / temperature).logsumexp(0)).mean()
 
 
@@ -151,7 +150,8 @@ def decorrelation_loss(groups: Sequence[Tensor]) -> Tensor:
 
     Shape: L tensors (n,F) -> scalar.
 
-    Convention: a constant feature correlates with nothing and gets zero gradients.
+    Convention: a constant feature correlates with nothing and gets zero gradients. Layers that share their
+        features are copies of each other; `ImposedPeriods(separate=True)` gives each its own.
 
     Raises:
         InputError: no layers, or shapes that do not fit.
@@ -269,9 +269,9 @@ def _centred(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return values, scatter, scatter <= rounding * features.square().sum(0)
 
 
-def _explained(features: Tensor, frames: Tensor, period: Fraction, cycles: int) -> Tensor:
+def _explained(features: Tensor, frames: Tensor, period: Fraction, phases: int, cycles: int) -> Tensor:
     """r of each feature for one period. (n,F), (n,) -> (F,)."""
-    layer = FrequencyLayer(period, round(period), 0, 1, (0,))
+    layer = FrequencyLayer(period, phases, 0, 1, (0,))
     fold = (frames * period.denominator // period.numerator).remainder(cycles)
     cell = fold * layer.phases + layer.phase(frames)
     count = cell.bincount(minlength=cycles * layer.phases).view(cycles, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -47,7 +48,7 @@ class Objective:
     """
 
     place: float = 1.0
-    phase: float = 0.3
+    phase: float = 1.0
     periodicity: float = 0.0
     decorrelation: float = 0.0
     support: float = 0.0
@@ -56,10 +57,11 @@ class Objective:
 
     def __post_init__(self) -> None:
         weights = list(self.weights.values())
-        if not min(weights) >= 0 or not max(weights) > 0 or not self.margin > 0:
+        fit = all(0 <= weight < math.inf for weight in weights) and any(weights) and self.margin > 0
+        if not fit or not all(2 <= period < math.inf for period in self.candidates or ()):
             raise InputError(
-                f"the losses count {self.weights}, the margin is {self.margin}; expected 0 or more, one of "
-                "them above 0, and a margin above 0"
+                f"the losses count {self.weights}, margin {self.margin}, candidates {self.candidates}; "
+                "expected 0 or more, one of them above 0, a margin above 0, and periods of at least 2"
             )
 
     @property
@@ -99,8 +101,11 @@ class Objective:
             parts["phase"] = phase_cross_entropy(distances, route.plan, right, temperature)
         if self.periodicity:
             known = right[:, 0] >= 0
-            periods = [Fraction(p) for p in self.candidates or ()] or [layer.period for layer in route.plan]
-            parts["periodicity"] = periodicity_loss(features[known], right[known, 0], periods)
+            tried = [Fraction(period).limit_denominator(1000) for period in self.candidates or ()]
+            periods = tried or [layer.period for layer in route.plan]
+            phases = None if tried else [layer.phases for layer in route.plan]
+            frames = right[known, 0]
+            parts["periodicity"] = periodicity_loss(features[known], frames, periods, phases=phases)
         if self.decorrelation:
             groups = [features.index_select(1, index) for index in route.layer_features()]
             parts["decorrelation"] = decorrelation_loss(groups)

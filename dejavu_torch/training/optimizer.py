@@ -4,33 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch.nn import Module, Parameter
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
+from dejavu_torch.types import InputError
 
-def adamw(parameters: Iterable[Parameter], lr: float, weight_decay: float) -> AdamW:
-    """AdamW that lets only what is multiplied with something decay: matrices and kernels."""
+
+def adamw_of(parameters: Iterable[Parameter], lr: float, weight_decay: float, steps: float) -> dict[str, Any]:
+    """AdamW, and a schedule: the learning rate rises over the first tenth of the steps, then falls along a
+    cosine to 0. Only what is multiplied with something decays: matrices and kernels.
+
+    Returns:
+        What Lightning's `configure_optimizers` gives.
+
+    Raises:
+        InputError: steps without an end.
+    """
+    if not math.isfinite(steps):
+        raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
     trained = [parameter for parameter in parameters if parameter.requires_grad]
     groups = [
         {"params": [p for p in trained if p.ndim > 1], "weight_decay": weight_decay},
         {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
     ]
-    return AdamW([group for group in groups if group["params"]], lr=lr)
-
-
-def rise_and_fall(optimizer: AdamW, steps: int) -> LambdaLR:
-    """The learning rate rises over the first tenth of the steps, then falls along a cosine to 0."""
+    optimizer = AdamW([group for group in groups if group["params"]], lr=lr)
     rise = max(1, round(steps / 10))
 
     def height(step: int) -> float:
         if step < rise:
             return (step + 1) / rise
-        return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (step - rise) / max(1, steps - rise)))
+        return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (step - rise) / max(1.0, steps - rise)))
 
-    return LambdaLR(optimizer, height)
+    schedule = {"scheduler": LambdaLR(optimizer, height), "interval": "step"}
+    return {"optimizer": optimizer, "lr_scheduler": schedule}
 
 
 def replace(optimizer: torch.optim.Optimizer, before: Module, after: Module) -> None:

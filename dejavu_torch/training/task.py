@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 import os
 import time
-from fractions import Fraction
 from typing import Any, Literal, cast
 
 import pytorch_lightning as pl
@@ -14,23 +14,27 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.scores import Reduction, combine_layers, log_posterior
 from dejavu_torch.recognition.select import best_match
+from dejavu_torch.training.checkpoint import check_trained, stored_map
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.frames import Batch, as_frames
+from dejavu_torch.training.frames import Batch
 from dejavu_torch.training.freeze import freeze as freeze_part
 from dejavu_torch.training.freeze import start_from
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.objective import Objective
-from dejavu_torch.training.optimizer import adamw, replace, rise_and_fall
+from dejavu_torch.training.optimizer import adamw_of, replace
+from dejavu_torch.training.reference import in_mode, reference_features
 from dejavu_torch.types import InputError, Training
+
+log = logging.getLogger("dejavu_torch")
 
 
 class PlaceRecognitionTask(pl.LightningModule):
@@ -45,13 +49,13 @@ class PlaceRecognitionTask(pl.LightningModule):
         periods: gives the layers; None is `ImposedPeriods` with its defaults.
         preprocess, metric, reduction: as in `DejaVu`.
         temperature: T of `log_posterior` at the start, in units of the scores; it is learnt.
-        train_templates: False leaves the templates phase means, taken anew at every refresh and at the end.
+        train_templates: False leaves the templates phase means, taken anew every epoch and at the end.
         feature_weights: learn what a difference in each feature counts, at least 0.
         start: a map file of the same backbone, whose weights to start from.
         freeze: parameters of the backbone whose names begin with one of these stay as they are, and
             so do the running statistics below; "" is all of it.
-        batch_norm: "train" lets BatchNorm follow the batches, which holds frames from all over the
-            route; "frozen" keeps its running statistics, as fine-tuning on few or correlated frames needs.
+        batch_norm: "train" lets BatchNorm follow the batches, which hold frames from all over the route;
+            "frozen" keeps its running statistics, as pretrained networks and few frames want.
         refresh: epochs after which the layers are asked for anew, and templates start over from the
             phase means; 0 never.
         losses: which losses count, and how much.
@@ -84,7 +88,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         batch_size: int = 64,
     ) -> None:
         super().__init__()
-        if not lr > 0 or weight_decay < 0 or refresh < 0 or not 0 < temperature < math.inf:
+        if not lr > 0 or not weight_decay >= 0 or refresh < 0 or not 0 < temperature < math.inf:
             raise InputError(
                 f"lr is {lr}, temperature {temperature}, weight_decay {weight_decay}, refresh {refresh}; "
                 "expected the first two above 0, the others 0 or more"
@@ -101,6 +105,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.frozen = [module.eval() for module in freeze_part(backbone, freeze or [], batch_norm)]
         self.refresh = refresh
         self.losses = Objective() if losses is None else losses
+        if self.losses.support and not train_templates:
+            raise InputError("the support loss is of trained templates; expected train_templates")
         self.lr, self.weight_decay = lr, weight_decay
         self.metric: PlaceRecognition | None = None
         self.seconds = 0.0
@@ -115,51 +121,52 @@ class PlaceRecognitionTask(pl.LightningModule):
         return data
 
     def setup(self, stage: str) -> None:
-        """The first map: layers of the untrained features, templates from their phase means."""
+        """Get ready for a route; the first map is made later, where no checkpoint brings one."""
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
-        if not self.dejavu.map.places:
-            self.relearn()
+        self._check_route(self.dejavu.map.places)
+        if self.data.sets["reference"].values.ndim == 2 and list(self.dejavu.features.parameters()):
+            log.warning("these are ready features: the backbone is left out")
+            self.dejavu.features = HOG()  # has nothing to store
+
+    def _check_route(self, places: int) -> None:
+        """Refuse a map of another route than the data's."""
+        reference = self.data.sets["reference"]
+        if places not in (0, len(reference)):
+            raise InputError(
+                f"the map is of {places} places, {self.data.reference.name} has {len(reference)}; expected "
+                "the route that it was made of"
+            )
 
     def relearn(self) -> None:
         """Layers and templates anew from the present features of the reference (section III-A)."""
-        weights = self.dejavu.map.weights
+        weights, values = self.dejavu.map.weights, self.data.sets["reference"].values
         self.dejavu.learn_features(self._reference_features(), self.data.reference)
-        self.dejavu.learnt_from = tuple(self.data.sets["reference"].values.shape[1:])  # after data.resize
-        self.dejavu.map.trainable(self.train_templates, self.feature_weights, weights)
+        self.dejavu.learnt_from = tuple(values.shape[1:])  # after data.resize
         if not self.dejavu.map.plan:
             raise InputError(
                 f"nothing repeats in the features of {self.data.reference.name}; expected imposed periods"
             )
+        self.dejavu.map.trainable(self.train_templates, self.feature_weights, weights)
+
+    def retake_means(self) -> None:
+        """Templates that are not trained become the phase means of the present features (eq. 1)."""
+        route = self.dejavu.map
+        if not self.train_templates:
+            with torch.no_grad():
+                templates = self.dejavu.templates(route.weighted(self._reference_features()), route.plan)
+                route.templates = torch.cat([block.flatten() for block in templates])
 
     def _reference_features(self) -> Tensor:
         """(N,D), as in training at its start, where running statistics are still to be gathered."""
-        values, at_once = self.data.sets["reference"].values, self.dejavu.batch_size
-        modes = [(module, module.training) for module in self.modules()]
-        self.train(not self.dejavu.map.places)
-        order = torch.randperm(len(values)) if self.training else torch.arange(len(values))
-        count = min(-(-len(order) // at_once), len(order) // 2)  # none of a single frame
-        try:
-            with torch.no_grad():
-                batches = (as_frames(values[batch]) for batch in order.tensor_split(count))
-                parts = [self._features(batch.to(self.device)) for batch in batches]
-        finally:
-            for module, training in modes:
-                module.training = training
-        features = torch.cat(parts)[order.argsort()]
-        if not features.isfinite().all():
-            raise InputError(
-                f"{type(self.dejavu.features).__name__} makes NaN or infinite features of "
-                f"{self.data.reference.name}; expected finite numbers"
-            )
-        return features
-
-    def _features(self, frames: Tensor) -> Tensor:
-        return features_of(frames, self.dejavu.pipeline, "the batch")
+        values, first = self.data.sets["reference"].values, not self.dejavu.map.places
+        with in_mode(self, first):
+            pipeline, at_once, name = self.dejavu.pipeline, self.dejavu.batch_size, self.data.reference.name
+            return reference_features(pipeline, values, at_once, self.device, name, shuffled=first)
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scores of all places, the very ones that the exported map gives. (B,C,H,W) or (B,D) -> (B,N)."""
-        return self._scores(self._distances(self._features(frames)))
+        return self._scores(self._distances(features_of(frames, self.dejavu.pipeline, "the batch")))
 
     def _distances(self, features: Tensor) -> list[Tensor]:
         return self.dejavu.matcher.distances(features, self.dejavu.map)
@@ -171,9 +178,8 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
-        features = self._features(batch.frames)
+        features = features_of(batch.frames, self.dejavu.pipeline, "the batch")
         distances = self._distances(features)
-        temperature = self.log_temperature.exp()
         total, parts, left_out = self.losses(
             features,
             distances,
@@ -181,7 +187,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             batch.truth.right,
             self.dejavu.map,
             self.dejavu.matcher,
-            temperature,
+            self.log_temperature.exp(),
             self.data.tolerance,
         )
         if not total.isfinite():
@@ -194,11 +200,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.log("train/left_out", float(left_out), reduce_fx="sum", on_step=False, on_epoch=True)
         self.log("train/loss", total.detach(), prog_bar=True)
         return total
-
-    def on_train_batch_end(self, *_: Any) -> None:
-        """No weight below 0, which a map refuses."""
-        if self.feature_weights:
-            self.dejavu.map.weights.data.clamp_(min=0)
 
     def train(self, mode: bool = True) -> PlaceRecognitionTask:
         """As nn.Module's, but what is frozen keeps its running statistics."""
@@ -221,24 +222,33 @@ class PlaceRecognitionTask(pl.LightningModule):
     def on_train_epoch_start(self) -> None:
         """Ask for the layers anew where it is time to."""
         if not self.refresh or not self.current_epoch or self.current_epoch % self.refresh:
-            return
+            return self.retake_means()
         before = self.dejavu.map
         self.relearn()
         replace(cast(Optimizer, self.optimizers(use_pl_optimizer=False)), before, self.dejavu.map)
 
     def configure_optimizers(self) -> Any:
-        """AdamW; the learning rate rises, then falls along a cosine to 0 at the last step."""
-        total = float(self.trainer.estimated_stepping_batches)
-        if not math.isfinite(total):
-            raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
-        optimizer = adamw(self.parameters(), self.lr, self.weight_decay)
-        schedule = {"scheduler": rise_and_fall(optimizer, int(total)), "interval": "step"}
-        return {"optimizer": optimizer, "lr_scheduler": schedule}
+        """For the parameters that there are once the first map is made."""
+        if not self.dejavu.map.places:
+            self.relearn()
+        steps = float(self.trainer.estimated_stepping_batches)
+        return adamw_of(self.parameters(), self.lr, self.weight_decay, steps)
+
+    def on_validation_epoch_start(self) -> None:
+        """What is judged are the templates of these features."""
+        if not self.dejavu.map.places:
+            self.relearn()
+        self.retake_means()
+
+    def on_test_epoch_start(self) -> None:
+        """As for a validation."""
+        self.on_validation_epoch_start()
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Localize a batch."""
+        """Localize a batch, in the number type of the exported map whatever the training's."""
         assert self.metric is not None  # setup made it
-        self.metric.update(best_match(self(batch.frames)), batch.truth)
+        with torch.autocast(self.device.type, enabled=False):
+            self.metric.update(best_match(self(batch.frames)), batch.truth)
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Localize a batch."""
@@ -246,55 +256,40 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log what `judge` says."""
-        self._tell("val")
-
-    def on_test_epoch_end(self) -> None:
-        """Log what `judge` says."""
-        self._tell("test")
-
-    def _tell(self, stage: str) -> None:
         assert self.metric is not None
         figures = cast(dict[str, Tensor], self.metric.compute())
         self.metric.reset()
+        stage = "test" if self.trainer.testing else "val"
         self.log_dict({f"{stage}/{name}": value.float() for name, value in figures.items()})
 
+    def on_test_epoch_end(self) -> None:
+        """As for a validation."""
+        self.on_validation_epoch_end()
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the clock."""
-        checkpoint["seconds"] = self._elapsed()
+        """Keep the clock, and what is trained."""
+        checkpoint |= {"seconds": self._elapsed(), "trained": self._trained()}
+
+    def _trained(self) -> list[str]:
+        return sorted(name for name, parameter in self.named_parameters() if parameter.requires_grad)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another plan; take over its layers where they were found anew since."""
-        self.seconds = float(checkpoint.get("seconds", 0.0))
-        prefix, route, weights = "dejavu.map.", self.dejavu.map, checkpoint["state_dict"]
-        state = {n.removeprefix(prefix): t for n, t in weights.items() if n.startswith(prefix)}
-        plan = ("size", "layers", "feature_ptr", "feature_index")
-        if all(name in state and torch.equal(state[name].cpu(), getattr(route, name).cpu()) for name in plan):
-            return
-        if not self.refresh or "size" not in state or not torch.equal(state["size"].cpu(), route.size.cpu()):
-            raise InputError(
-                f"the checkpoint holds {_layers(state)}; this run has {_layers(route.state_dict())}: "
-                "expected a checkpoint of the same route and periods"
-            )
-        self.dejavu.map = CompressedMap().to(route.size.device)
-        self.dejavu.map.load_state_dict(state)
+        """Take over the checkpoint's layers; refuse those of another route, or others than imposed."""
+        route = stored_map(checkpoint, self.dejavu.periods)
+        if self._trainer is not None:
+            self._check_route(route.places)
+        self.dejavu.map = route.to(self.device)
         self.dejavu.map.trainable(self.train_templates, self.feature_weights)
+        check_trained(checkpoint, self._trained())
+        self.seconds = float(checkpoint.get("seconds", 0.0))
 
     def deployed(self) -> DejaVu:
         """The trained model by itself, whose `save` writes the map file."""
-        if not self.train_templates:
-            self.relearn()
+        self.retake_means()
         model = copy.deepcopy(self.dejavu).eval()
         model.map.settle()
         model.matcher.temperature = float(self.log_temperature.detach().exp())
         seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
-        steps = self.trainer.global_step
-        model.trained = Training(steps, self._elapsed(), None if seed is None else int(seed))
+        given = None if seed is None else int(seed)
+        model.trained = Training(self.trainer.global_step, self._elapsed(), given)
         return model
-
-
-def _layers(state: dict[str, Tensor]) -> str:
-    if "layers" not in state or "size" not in state:
-        return "no map"
-    places, features = state["size"].tolist()
-    layers = [f"{p} in {Fraction(a, b)}" for a, b, p, *_ in state["layers"].tolist()]
-    return f"{places} places, {features} features and layers of {', '.join(layers)} frames"

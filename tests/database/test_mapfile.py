@@ -628,12 +628,22 @@ def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> N
     assert torch.equal(again.localize(query).score, model.localize(query).score)
 
 
+def test_of_an_embedding_the_network_alone_may_be_given(path: Path) -> None:
+    torch.manual_seed(0)
+    model, query = learnt_with(embedding(Patch()), path), pictures(5)
+    torch.manual_seed(1)
+    again = DejaVu.load(path, network := Patch())
+    assert again.features.network is network
+    assert not again.training
+    assert torch.equal(again.localize(query).score, model.localize(query).score)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: embedding(Patch(), grid=2), ("'grid': 1", "'grid': 2")),
+        (lambda: embedding(Patch(), grid=2), ("Embedding of grid=1; got grid=2",)),
         (lambda: embedding(Small()), ("Patch", "Small")),
-        (Patch, ("Embedding", "Patch")),
+        (Small, ("Embedding; got", "Small")),
         (lambda: embedding(Patch(3)), ("does not fit",)),
     ],
 )

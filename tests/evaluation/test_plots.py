@@ -206,9 +206,9 @@ def test_templates_of_any_period_and_of_many_features(period: Fraction, phases: 
 
 def test_of_many_cycles_some_are_drawn() -> None:
     one = FrequencyLayer(Fraction(2), 2, 0, 500, (0,))
-    figure, (above, _) = plot_templates(one, torch.rand(500), torch.rand(2, 1), 0)
+    figure, (above, _) = plot_templates(one, torch.rand(500), torch.rand(2, 1), 0, "a line")
     assert 50 <= len(above.lines) - 1 <= 100
-    assert "feature 0, 250 cycles of 2 frames; thick: their mean" in told(figure)
+    assert "feature 0, 250 cycles of 2 frames; thick: a line" in told(figure)
 
 
 LAYOUTS = st.tuples(

@@ -1,18 +1,21 @@
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
-from helpers import refused
+from helpers import Fixed, refused
+from test_evenly import QUERY, REFERENCE, STEP, camera
+from test_evenly import footage as ground
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, InputError, SpectrogramAnalysis
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import judge
 from dejavu_torch.experiments.compare import compare
-from dejavu_torch.types import Training, Traverse
+from dejavu_torch.types import FrequencyLayer, Training, Traverse
 
 
 def route(seed: int, frames: int = 240) -> torch.Tensor:
@@ -155,9 +158,53 @@ def test_features_of_another_dimension_than_the_map_s_are_refused(trained: DejaV
         compare(*pair, model=trained, learn=False)
 
 
-def test_leaving_out_of_a_trained_map_is_refused(trained: DejaVu) -> None:
-    with refused("leave-out", "trained templates"):
-        compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=trained, leave_out=2, learn=False)
+class Unreadable(ArrayTraverse):
+    """Frames that nobody may ask for yet."""
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        raise AssertionError("read too early")
+
+
+def test_leaving_out_of_a_trained_map_is_refused_at_once(trained: DejaVu) -> None:
+    with refused("leave_out is 2", "trained templates", "no means of frames"):
+        compare(Unreadable(route(0)), Unreadable(route(1)), model=trained, leave_out=2, learn=False)
+    # learnt anew they are means again
+    report = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=trained, leave_out=2).report
+    assert "leave_out" in report.contenders
+
+
+def test_a_map_of_another_route_is_told_of(model: DejaVu, caplog: pytest.LogCaptureFixture) -> None:
+    def told(reference: Tensor) -> list[str]:
+        caplog.clear()
+        pair = ArrayTraverse(reference, "one"), ArrayTraverse(route(1), "two")
+        compare(*pair, model=model, tolerance=2, learn=False)
+        return [one.getMessage() for one in caplog.records]
+
+    model.periods = Fixed(FrequencyLayer(240, 240, 0, 240, tuple(range(60))))
+    model.learn(route(0))
+    assert told(route(0)) == []
+    (message,) = told(torch.randn(240, 60))
+    assert re.fullmatch(r"the map finds \d+ of 240 frames of one; expected the reference .*", message)
+
+
+def test_the_template_that_is_drawn_is_called_what_it_is(trained: DejaVu) -> None:
+    pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
+    for learn, thick in ((False, "the trained template"), (True, "their mean")):
+        picture = compare(*pair, model=trained, learn=learn).pictures["templates"]
+        assert f"thick: {thick}" in picture.plot[1][0].get_title(loc="left")
+        assert ("that training made of it" in picture.caption) != learn
+
+
+def test_a_map_of_even_steps_is_judged_at_its_own_step() -> None:
+    """Not at the one that its reference would get of itself."""
+    everything = Fixed(FrequencyLayer(101, 101, 0, 101, tuple(range(900))))
+    reference, query = ArrayTraverse(ground(REFERENCE)), ArrayTraverse(ground(QUERY))
+    model = DejaVu(periods=everything, velocity=camera()).learn(reference)
+    model.velocity = camera(step=None)
+    result = compare(reference, query, "0", model, learn=False)
+    assert len(result.stored) == len(result.seen) == 101
+    assert result.report.as_json()["spacing"]["step"] == STEP
+    assert result.report.as_json()["recall_at_1"] == 1
 
 
 # HOG beside other features
@@ -187,6 +234,31 @@ def test_hog_stands_beside_other_features() -> None:
         assert found[key].scores is not None
     # of the eight that look alike the noise decides: all are frames, none is the map
     assert 0 < found["hog"].scores.recall_at_1 < 0.9
+
+
+def test_the_curves_show_hog_as_well() -> None:
+    periods = SpectrogramAnalysis(window=64, min_period=4, strongest=1)
+    model = DejaVu(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()), periods)
+    result = compare(pictures(1), pictures(2), "0", model, 3)
+    labels = [text.get_text() for text in result.pictures["auc"].plot[1].texts]
+    assert {one.name for one in result.report.contenders.values()} < set(labels)
+    assert {"HOG, every frame", "HOG, every 6th frame"} < set(labels)
+
+
+def test_whatever_stores_features_needs_the_backbone_as_well() -> None:
+    net = nn.Sequential(nn.AvgPool2d(4), nn.Flatten(), nn.Linear(36, 40), nn.BatchNorm1d(40)).eval()
+    weights = sum(tensor.nbytes for tensor in net.state_dict().values())
+    model = DejaVu(net, SpectrogramAnalysis(window=64, min_period=4, strongest=1))
+    report = compare(pictures(1), pictures(2), "0", model, 3).report.as_json()
+    assert report["backbone_bytes"] == weights > 0
+    assert report["map_bytes"] == model.map_bytes > weights
+    for key in ("uncompressed", "stride", "stride_coarsest"):
+        kept = -(-64 // report[key]["k"])
+        assert report[key]["bytes"] == kept * 160 + weights, key
+    # the stride's frames take at least what the map takes beside the backbone, one more would be fewer
+    k, own = report["stride"]["k"], report["map_bytes"] - weights
+    assert -(-64 // k) * 160 >= own > -(-64 // (k + 1)) * 160
+    assert k > 1
 
 
 def test_hog_does_not_stand_beside_itself_nor_where_there_are_no_frames(model: DejaVu) -> None:

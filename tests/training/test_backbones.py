@@ -9,11 +9,12 @@ import pytest
 import torch
 from helpers import refused
 from kornia.feature import TFeat
-from test_task import FRAMES, backbone, data_of, fit, footage, new_task, recall, trainer
+from test_task import FRAMES, backbone, data_of, fit, footage, new_task, recall, trainer, warned
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.training.augment import Augmentation
 from dejavu_torch.training.freeze import freeze, start_from
@@ -26,7 +27,7 @@ def changed(tmp_path: Path, module: nn.Module, **settings: Any) -> tuple[set[str
     """The names in the backbone's state that a training changes."""
     before = {name: value.clone() for name, value in module.state_dict().items()}
     task = new_task(backbone=module, **settings)
-    fit(tmp_path, task, data_of())
+    trainer(tmp_path).fit(task, data_of())
     after = module.state_dict()
     return {name for name, value in before.items() if not torch.equal(value, after[name])}, task
 
@@ -58,6 +59,25 @@ def test_frozen_batch_norm_keeps_its_statistics_and_learns_its_weights(tmp_path:
     task.train()
     assert {type(part) for part in module.modules() if not part.training} == {nn.BatchNorm1d, nn.BatchNorm2d}
     assert module.training
+
+
+@pytest.mark.parametrize("norm", [nn.BatchNorm2d, nn.InstanceNorm2d], ids=lambda kind: kind.__name__)
+def test_all_running_statistics_can_be_frozen(norm: type[nn.Module]) -> None:
+    net = nn.Sequential(nn.Conv2d(1, 2, 3), norm(2, affine=True, track_running_stats=True))
+    assert freeze(net, [], "train") == []
+    assert freeze(net, [], "frozen") == freeze(net, ["1"], "train") == [net[1]]
+    assert freeze(net, ["0"], "train") == []
+
+
+def test_statistics_of_instances_stay_in_a_frozen_part(tmp_path: Path) -> None:
+    def module() -> nn.Module:
+        norm = nn.InstanceNorm2d(2, affine=True, track_running_stats=True)
+        return nn.Sequential(nn.Conv2d(1, 2, 5, stride=4), norm, nn.Flatten(), nn.Linear(18, 4))
+
+    names, _ = changed(tmp_path, module(), freeze=["1"])
+    assert names == {"0.weight", "0.bias", "3.weight", "3.bias"}
+    names, _ = changed(tmp_path, module())
+    assert {"1.running_mean", "1.running_var"} < names
 
 
 def test_a_prefix_of_nothing_is_refused() -> None:
@@ -112,7 +132,7 @@ def test_a_foreign_network_learns(tmp_path: Path, kind: str) -> None:
         torch.testing.assert_close(model.eval()(noisy[:4, None] / 255), task.eval()(noisy[:4, None] / 255))
         found.append(recall(model, noisy))
     assert found[1] > max(0.4, found[0] + 0.15), found
-    with refused("expected --features CLASS"):
+    with refused("expected --features", "features=... in Python"):
         DejaVu.load(tmp_path / "map.safetensors")
 
 
@@ -134,6 +154,33 @@ def test_ready_features_need_no_backbone(tmp_path: Path) -> None:
     assert model.learnt_from == (6,)
     torch.testing.assert_close(model(features[:3]), task(features[:3]))
     assert model.localize(ArrayTraverse(features)).index.shape == (FRAMES,)
+
+
+def test_ready_features_leave_a_backbone_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    features, task = torch.randn(FRAMES, 6), new_task(train_templates=False)
+    running = trainer(tmp_path)
+    running.fit(task, data_of(features))
+    model = DejaVu.load(tmp_path / "map.safetensors")  # by itself
+    assert warned(caplog) == ["these are ready features: the backbone is left out"]
+    assert model.backbone_bytes == 0
+    assert model.map_bytes < sum(p.nbytes for p in backbone().parameters())
+    torch.testing.assert_close(model(features[:3]), task(features[:3]))
+    running.validate(task, data_of(features), verbose=False)
+    assert len(warned(caplog)) == 1
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_backbone_for_other_channels_is_told_at_once(tmp_path: Path, channels: int) -> None:
+    frames = footage()[:, None].expand(-1, channels, -1, -1)
+    for module, words in (
+        (SmallCNN(8, 4 - channels, (16, 16), (4,)), (f"got frames (40, {channels}, 16, 16)",)),
+        (
+            nn.Sequential(nn.Conv2d(4 - channels, 2, 3), nn.Flatten()),
+            (f"Sequential does not take frames ({channels}, 16, 16)", f"{4 - channels} channels"),
+        ),
+    ):
+        with refused(*words):
+            fit(tmp_path, new_task(backbone=module), data_of(frames.float() / 255))
 
 
 class Wrong(nn.Module):

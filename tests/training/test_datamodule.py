@@ -12,12 +12,15 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
+from test_evenly import QUERY, REFERENCE, camera
+from test_evenly import footage as ground
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.truth import as_truth
 from dejavu_torch.training.augment import Augmentation
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.frames import Clips, as_frames, store
+from dejavu_torch.training.frames import Clips, StoredFrames, as_frames, store
 from dejavu_torch.types import Truth
 
 
@@ -82,11 +85,54 @@ def test_what_is_known_and_soft_reaches_the_judge(tmp_path: Path) -> None:
 
 
 def test_validation_and_query_come_in_order_as_they_are() -> None:
-    data = route(validation=numbered(24, 100))
-    data.setup("test") if data.others["query"][0] else None
-    frames = torch.cat([batch.frames for batch in data.val_dataloader()])
-    assert torch.equal(frames, as_frames(store(numbered(24, 100))))
-    assert len(route(20, batch_size=8).val_dataloader()) == 3  # the last one is not full, and counts
+    data = route(validation=numbered(24, 100), query=numbered(20, 200), truth="2")
+    data.setup("test")
+    for loader, there, shift in (
+        (data.val_dataloader(), numbered(24, 100), 0),
+        (data.test_dataloader(), numbered(20, 200), 2),
+    ):
+        batches = list(loader)
+        assert torch.equal(torch.cat([batch.frames for batch in batches]), as_frames(store(there)))
+        right = torch.cat([batch.truth.right[:, 0] for batch in batches])
+        assert right.tolist() == list(range(shift, shift + len(right)))
+    assert len(data.test_dataloader()) == 3  # the last one is not full, and counts
+    assert len(route(20, batch_size=8).val_dataloader()) == 3
+
+
+def test_parts_are_as_one_behind_the_other() -> None:
+    parts = [store(numbered(count, first)) for count, first in ((5, 0), (3, 50), (4, 90))]
+    frames = StoredFrames(parts[0], as_truth(torch.arange(12)[:, None]), *parts[1:])
+    assert len(frames) == 12
+    index = torch.randperm(12).repeat(2)
+    batch = frames[index.tolist()]
+    assert torch.equal(batch.frames, as_frames(torch.cat(parts)[index]))
+    assert torch.equal(batch.truth.right[:, 0], index)
+    assert torch.equal(frames[[5]].frames, as_frames(parts[1][:1]))
+    features = [torch.randn(4, 3, dtype=torch.float64) for _ in range(2)]
+    both = StoredFrames(features[0], as_truth(torch.arange(8)[:, None]), features[1])
+    assert torch.equal(both[[7, 0]].frames, torch.stack([features[1][3], features[0][0]]))
+
+
+@pytest.mark.parametrize("stage", ["fit", "test"])
+def test_other_traverses_come_at_the_reference_s_steps(tmp_path: Path, stage: str) -> None:
+    """Of their own they would take twice as large ones, and their truth tells frames."""
+    nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
+    rows = "".join(f"{q},{p}\n" for q, p in enumerate(nearest))
+    (tmp_path / "truth.csv").write_text(f"query_frame,place_frame\n{rows}")
+    other, truth = ArrayTraverse(ground(QUERY)), str(tmp_path / "truth.csv")
+    given: dict[str, Any] = {"query": other, "truth": truth}
+    if stage == "fit":
+        given = {"second": other, "second_truth": truth, "validation": other, "validation_truth": truth}
+    data = RouteData(ArrayTraverse(ground(REFERENCE)), velocity=camera(step=None), **given)
+    data.setup(stage)
+    assert len(data.sets["reference"]) == 600 // 4 + 1
+    for name in {"fit": ("second", "validation"), "test": ("query",)}[stage]:
+        found = data.sets[name]
+        assert len(found) == 600 // 4 + 1
+        right = found.truth.right
+        assert found.truth.known.all()
+        apart = (right - torch.arange(151)[:, None]).abs().masked_fill(right < 0, 999).amin(1)
+        assert apart.max() <= 3  # the other shows each frame twice
 
 
 # batches -------------------------------------------------------------------------------------------------
@@ -189,6 +235,8 @@ def test_frames_are_kept_as_bytes_and_resized() -> None:
         ({"clip": 0}, ("clip 0",)),
         ({"batch_size": 1}, ("batch_size 1", "at least 2 frames")),
         ({"batch_size": 10, "clip": 4}, ("batch_size 10, clip 4", "whole clips")),
+        ({"resize": (0, 4)}, ("resize is (0, 4)", "(height, width)")),
+        ({"resize": (4,)}, ("resize is (4,)", "at least 1 pixel")),
         ({"tolerance": 24}, ("from 0 has 24 frames", "tolerance is 24", "longer")),
         ({"frames": 1, "tolerance": 0}, ("from 0 has 1 frame and", "longer")),
         ({"validation": numbered(2, 100)}, ("from 100 has 2 frames", "tolerance is 2")),
@@ -196,7 +244,7 @@ def test_frames_are_kept_as_bytes_and_resized() -> None:
         ({"second": numbered(20, 100)}, ("expected data.second_truth",)),
         ({"stage": "test", "query": numbered(20, 100)}, ("expected data.truth",)),
         ({"stage": "test"}, ("nothing to test on", "data.query")),
-        ({"second": numbered(24, 100, side=9)}, ("(1, 9, 9)", "(1, 8, 8)", "data.resize")),
+        ({"second": numbered(24, 100, side=9)}, ("(1, 9, 9)", "(1, 8, 8)", "same channels", "data.resize")),
         ({"second": numbered(24, 100), "second_truth": "nix"}, ("truth 'nix'", "offset")),
         ({"second": numbered(24, 100), "second_truth": "24"}, ("no query has a right answer",)),
         ({"second": "nowhere"}, ("nowhere is not there",)),

@@ -423,3 +423,14 @@ PAIRS = torch.tensor([[0, 5]])
 def test_bad_input_is_refused(call: Callable[[], object], words: list[str]) -> None:
     with refused(*words):
         call()
+
+
+def test_periodicity_takes_the_phases_of_a_layer() -> None:
+    frames = torch.arange(100)
+    stairs = torch.tensor([3.0, 1.0, 4.0, 1.5, 9.0])[frames // 5 % 5][:, None]  # bins of 5 frames
+    some = torch.randperm(100)[:60]
+    by_bin = periodicity_loss(stairs[some], some, [25], phases=[5])
+    assert by_bin.item() == pytest.approx(-1, abs=1e-6)
+    assert periodicity_loss(stairs, frames, [25], phases=[5]) < periodicity_loss(stairs, frames, [20]) - 0.5
+    with pytest.raises(ValueError, match="zip"):
+        periodicity_loss(stairs, frames, [25, 30], phases=[5])

@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import Fixed, refused
+from helpers import Fixed
 from pytorch_lightning import Callback, Trainer
-from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
 from test_evenly import QUERY, REFERENCE, STEP, camera
 from test_evenly import footage as ground
 from torch import Tensor, nn
 
-from dejavu_torch import DejaVu, PhaseTemplates
+from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.truthfile import read_truth
 from dejavu_torch.evaluation.curves import judge
@@ -66,7 +65,12 @@ def trainer(folder: Path, *callbacks: Callback, **settings: Any) -> Trainer:
 def fit(folder: Path, task: PlaceRecognitionTask, data: RouteData, **settings: Any) -> DejaVu:
     """The map that a training writes."""
     trainer(folder, **settings).fit(task, data)
-    return DejaVu.load(folder / "map.safetensors").eval()
+    return DejaVu.load(folder / "map.safetensors")
+
+
+def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """What the package told."""
+    return [record.getMessage() for record in caplog.records if record.name == "dejavu_torch"]
 
 
 @pytest.mark.parametrize(
@@ -103,6 +107,7 @@ def test_the_map_tells_its_training_and_counts_the_backbone(
     task = new_task()
     model = fit(tmp_path, task, data_of())
     assert model.trained == Training(4, task.seconds, None)
+    assert not any(part.training for part in model.modules())
     assert task.seconds > 0
     weights = sum(tensor.nbytes for tensor in task.dejavu.features.state_dict().values())
     assert model.backbone_bytes == weights > 0
@@ -153,26 +158,14 @@ def test_bf16_trains_and_exports_float32(tmp_path: Path) -> None:
 # templates, weights, layers ------------------------------------------------------------------------------
 
 
-def test_untrained_templates_are_phase_means_of_the_final_features(tmp_path: Path) -> None:
-    model = fit(tmp_path, new_task(train_templates=False), data_of())
-    means = PhaseTemplates()(model.extract_all(ArrayTraverse(footage())), model.map.plan)
-    for block, mean in zip(model.map.blocks(), means, strict=True):
-        torch.testing.assert_close(block, mean, rtol=1e-5, atol=1e-5)
-    trained = fit(tmp_path, new_task(), data_of())
-    means = PhaseTemplates()(trained.extract_all(ArrayTraverse(footage())), trained.map.plan)
-    assert not torch.allclose(trained.map.blocks()[0], means[0], atol=1e-3)
-
-
-def test_weights_are_learnt_and_never_below_0(tmp_path: Path) -> None:
-    kept = ModelCheckpoint(tmp_path, save_last=True)
+def test_weights_are_learnt_and_written_with_their_signs_turned(tmp_path: Path) -> None:
     task = new_task(feature_weights=True, lr=2.0)
-    trainer(tmp_path, kept).fit(task, data_of())
-    weights = DejaVu.load(tmp_path / "map.safetensors").map.weights
-    assert weights.min() == 0  # so large a step would have gone below
-    assert weights.unique().numel() > 1
-    again = new_task(feature_weights=True)
-    trainer(tmp_path, kept, max_steps=5).fit(again, data_of(), ckpt_path=tmp_path / "last.ckpt")
-    assert again.global_step == 5
+    model = fit(tmp_path, task, data_of())
+    weights, frames = task.dejavu.map.weights.detach(), footage(0.1)[:7, None] / 255
+    assert weights.min() < 0  # so large a step, and nothing holds it back
+    assert torch.equal(model.map.weights, weights.abs())
+    with torch.no_grad():
+        torch.testing.assert_close(model(frames), task.eval()(frames), rtol=1e-5, atol=1e-5)
 
 
 class Later(Fixed):
@@ -186,6 +179,11 @@ class Later(Fixed):
         return tuple(FrequencyLayer(Fraction(p), p, 0, len(features), tuple(range(8))) for p in periods)
 
 
+def phases(task: PlaceRecognitionTask | DejaVu) -> list[int]:
+    model = task if isinstance(task, DejaVu) else task.dejavu
+    return [layer.phases for layer in model.map.plan]
+
+
 class Starts(Callback):
     """Remembers the templates at the start of the last epoch."""
 
@@ -195,23 +193,35 @@ class Starts(Callback):
 
 
 @pytest.mark.parametrize("weights", [False, True])
-def test_layers_found_later_are_trained_and_resumed(tmp_path: Path, weights: bool) -> None:
+def test_layers_found_later_are_trained(tmp_path: Path, weights: bool) -> None:
     task, seen = new_task(periods=Later(), refresh=1, feature_weights=weights), Starts()
-    kept = ModelCheckpoint(tmp_path, save_last=True)
-    running = trainer(tmp_path, kept, seen, max_epochs=2, max_steps=-1)
+    running = trainer(tmp_path, seen, max_epochs=2, max_steps=-1, enable_checkpointing=False)
     running.fit(task, data_of())
-    assert [layer.phases for layer in task.dejavu.map.plan] == [5, 7, 9]
+    assert phases(task) == [5, 7, 9]
     assert not torch.equal(seen.templates, task.dejavu.map.templates)
     optimised = {id(p) for group in running.optimizers[0].param_groups for p in group["params"]}
     assert optimised == {id(p) for p in task.parameters()}
     assert {id(p) for p in running.optimizers[0].state} <= optimised
-    again = new_task(periods=Later(), refresh=1, feature_weights=weights)
-    resumed = trainer(tmp_path, max_epochs=3, max_steps=-1)
-    resumed.fit(again, data_of(), ckpt_path=tmp_path / "last.ckpt")
-    assert resumed.global_step == 3 * (FRAMES // 16)
-    assert [layer.phases for layer in again.dejavu.map.plan] == [5, 7, 9]
-    with refused("3 in 3, 4 in 4 frames", "5 in 5, 7 in 7, 9 in 9 frames"):
-        trainer(tmp_path).fit(new_task(periods=Later()), data_of(), ckpt_path=tmp_path / "last.ckpt")
+
+
+class Asked(Callback):
+    """Remembers how often the layers were asked for by the first step of each epoch."""
+
+    def __init__(self) -> None:
+        self.times: list[int] = []
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
+        if batch_idx == 0:
+            self.times.append(pl_module.dejavu.periods.asked)
+
+
+@pytest.mark.parametrize(
+    ("refresh", "times"), [(0, [1] * 5), (1, [1, 2, 3, 4, 5]), (2, [1, 1, 2, 2, 3]), (3, [1, 1, 1, 2, 2])]
+)
+def test_layers_are_asked_for_every_few_epochs(tmp_path: Path, refresh: int, times: list[int]) -> None:
+    asked, task = Asked(), new_task(periods=Later(), refresh=refresh)
+    trainer(tmp_path, asked, max_epochs=5, max_steps=-1, enable_checkpointing=False).fit(task, data_of())
+    assert asked.times == times
 
 
 def test_places_without_a_layer_are_left_out(tmp_path: Path) -> None:
@@ -238,49 +248,16 @@ def test_frames_that_were_resized_are_what_the_map_expects(tmp_path: Path) -> No
     assert model.learnt_from == (1, 16, 16)
 
 
-# checkpoints ---------------------------------------------------------------------------------------------
+# figures ---------------------------------------------------------------------------------------------------
 
 
-def test_a_resumed_run_goes_on(tmp_path: Path) -> None:
-    kept = ModelCheckpoint(tmp_path, save_last=True)
-    task, again = new_task(), new_task()
-    trainer(tmp_path, kept).fit(task, data_of())
-    spent = torch.load(tmp_path / "last.ckpt", weights_only=True)["seconds"]
-    assert 0 < spent <= task.seconds
-    running = trainer(tmp_path, max_steps=6)
-    running.fit(again, data_of(), ckpt_path=tmp_path / "last.ckpt")
-    assert running.global_step == 6
-    assert again.seconds > spent
-    trained = DejaVu.load(tmp_path / "map.safetensors").trained
-    assert trained is not None
-    assert trained[:2] == (6, again.seconds)
-
-
-class Wreck(Callback):
-    """Spoils what was learnt, from the second epoch on."""
-
-    @torch.no_grad()
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: Any) -> None:
-        if trainer.current_epoch:
-            pl_module.dejavu.map.templates.fill_(trainer.current_epoch)
-
-
-def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Path) -> None:
-    best = ModelCheckpoint(tmp_path, monitor="val/auc", mode="max")
-    every = ModelCheckpoint(tmp_path, save_last=True)
-    stop = EarlyStopping("val/auc", mode="max", patience=2)
-    task = new_task(lr=1e-4)
-    running = trainer(tmp_path, every, best, stop, Wreck(), max_epochs=9, max_steps=-1)
-    running.fit(task, data_of(batch_size=20, validation=ArrayTraverse(footage(0.02))))
-    assert 2 < running.current_epoch < 9
-    state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
-    model = DejaVu.load(tmp_path / "map.safetensors")
-    assert torch.equal(model.map.templates, state["dejavu.map.templates"])
-    last = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
-    assert not torch.equal(model.map.templates, last["dejavu.map.templates"])
-    assert model.trained is not None
-    assert model.trained.steps == running.global_step
-    assert model.trained.seconds == task.seconds
+def assert_figures(running: Trainer, task: PlaceRecognitionTask, noisy: Tensor, truth: str = "0") -> None:
+    """What a test tells is what `judge` says of the map in the trainer's folder."""
+    data = data_of(query=ArrayTraverse(noisy), truth=truth)
+    (figures,) = running.test(task, data, verbose=False)
+    match = DejaVu.load(Path(running.default_root_dir) / "map.safetensors").localize(ArrayTraverse(noisy))
+    expected = judge(match, read_truth(truth, FRAMES, FRAMES), tolerance=2)._asdict()
+    assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
 
 
 @pytest.mark.parametrize("truth", ["0", "5", "csv"])
@@ -290,11 +267,21 @@ def test_the_figures_are_those_of_judge_on_the_map(tmp_path: Path, truth: str) -
         truth = str(tmp_path / "truth.csv")
         rows = [f"{i},{i},{i // 2}" if i % 3 else f"{i}" for i in range(30)]
         Path(truth).write_text("\n".join(rows) + "\n")
-    noisy = footage(0.2)
-    task, data = new_task(), data_of(query=ArrayTraverse(noisy), truth=truth)
-    running = trainer(tmp_path)
-    running.fit(task, data)
-    (figures,) = running.test(task, data, verbose=False)
-    match = DejaVu.load(tmp_path / "map.safetensors").localize(ArrayTraverse(noisy))
-    expected = judge(match, read_truth(truth, FRAMES, FRAMES), tolerance=2)._asdict()
-    assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
+    running, task = trainer(tmp_path), new_task()
+    running.fit(task, data_of())
+    assert_figures(running, task, footage(0.2), truth)
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed", "32-true"])
+@pytest.mark.parametrize("settings", [{}, {"train_templates": False, "feature_weights": True}], ids=str)
+def test_figures_are_made_in_32_bits(tmp_path: Path, precision: Any, settings: dict[str, Any]) -> None:
+    running, task = trainer(tmp_path, precision=precision, max_steps=30), new_task(**settings)
+    running.fit(task, data_of())
+    assert_figures(running, task, footage(0.2))
+
+
+def test_without_training_the_phase_means_are_judged(tmp_path: Path) -> None:
+    running, task = trainer(tmp_path), new_task()
+    running.validate(task, data_of(validation=ArrayTraverse(footage(0.2))), verbose=False)
+    task.deployed().save(tmp_path / "map.safetensors")
+    assert_figures(running, task, footage(0.2))

@@ -1,0 +1,38 @@
+"""A folder in which `dejavu train` has run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_task import footage
+from training_config import CONFIG, MINE, train
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with traverses, a config, a user's module, and a training."""
+    folder = tmp_path_factory.mktemp("train")
+    arrays = {"one": footage(), "two": footage(0.1), "short": footage()[:2], "single": footage()[:1]}
+    arrays |= {"thirty": footage()[:30], "large": footage(side=24)}
+    arrays["colour"] = footage()[..., None].expand(-1, -1, -1, 3)
+    for name, frames in arrays.items():
+        np.save(folder / f"{name}.npy", frames.numpy())
+    (folder / "train.yaml").write_text(CONFIG)
+    (folder / "mine.py").write_text(MINE)
+    (folder / "a_file").write_text("not a folder, not a checkpoint")
+    torch.save({"state_dict": {"weight": torch.zeros(3)}}, folder / "foreign.ckpt")
+    (folder / "empty").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        train("fit")
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(made)
+    monkeypatch.syspath_prepend(str(made))
+    return made

@@ -1,0 +1,90 @@
+"""The map that a training leaves: which step it is of, and what is said where it is not what one expects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from pytorch_lightning import Callback, Trainer
+from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
+from test_task import data_of, footage, new_task, trainer, warned
+
+from dejavu_torch import DejaVu
+from dejavu_torch.data.arrays import ArrayTraverse
+
+
+class Wreck(Callback):
+    """Spoils what was learnt, from the second epoch on."""
+
+    @torch.no_grad()
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: Any) -> None:
+        if trainer.current_epoch:
+            pl_module.dejavu.map.templates.fill_(trainer.current_epoch)
+
+
+def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Path) -> None:
+    best = ModelCheckpoint(tmp_path, monitor="val/auc", mode="max")
+    every = ModelCheckpoint(tmp_path, save_last=True)
+    stop = EarlyStopping("val/auc", mode="max", patience=2)
+    task = new_task(lr=1e-4)
+    running = trainer(tmp_path, every, best, stop, Wreck(), max_epochs=9, max_steps=-1)
+    running.fit(task, data_of(batch_size=20, validation=ArrayTraverse(footage(0.02))))
+    assert 2 < running.current_epoch < 9
+    state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
+    model = DejaVu.load(tmp_path / "map.safetensors")
+    assert torch.equal(model.map.templates, state["dejavu.map.templates"])
+    assert torch.equal(model.features.linear.weight, state["dejavu.features.linear.weight"])
+    last = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
+    assert not torch.equal(model.map.templates, last["dejavu.map.templates"])
+    assert model.trained is not None
+    assert model.trained.steps == running.global_step
+    assert model.trained.seconds == task.seconds
+
+
+def test_without_a_step_there_is_no_map(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trainer(tmp_path, limit_train_batches=0).fit(new_task(), data_of())
+    assert warned(caplog) == ["no step was taken: no map is written"]
+    assert not (tmp_path / "map.safetensors").exists()
+
+
+def test_a_run_that_is_over_already_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trainer(tmp_path, ModelCheckpoint(tmp_path, save_last=True)).fit(new_task(), data_of())
+    assert warned(caplog) == []
+    (tmp_path / "map.safetensors").rename(tmp_path / "before.safetensors")
+    trainer(tmp_path).fit(new_task(), data_of(), ckpt_path=tmp_path / "last.ckpt")
+    (told,) = warned(caplog)
+    assert told.startswith("nothing was trained")
+    assert "step 4 is reached" in told
+    maps = [DejaVu.load(tmp_path / f"{name}.safetensors").map for name in ("before", "map")]
+    assert torch.equal(maps[0].templates, maps[1].templates)
+
+
+def test_a_figure_that_was_never_measured_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    best, task = ModelCheckpoint(tmp_path, monitor="val/auc", mode="max"), new_task()
+    trainer(tmp_path, best, check_val_every_n_epoch=9).fit(task, data_of())
+    assert warned(caplog) == ["val/auc was never measured: the map is of the last step"]
+    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.dejavu.map.templates)
+
+
+class Tidy(Callback):
+    """Deletes the best checkpoint."""
+
+    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
+        Path(trainer.checkpoint_callbacks[0].best_model_path).unlink()  # type: ignore[attr-defined]
+
+
+def test_a_best_checkpoint_that_is_gone_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    best, task = ModelCheckpoint(tmp_path, monitor="val/auc", mode="max"), new_task()
+    trainer(tmp_path, best, Tidy()).fit(task, data_of())
+    assert warned(caplog) == [f"{best.best_model_path} is gone: the map is of the last step"]
+    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.dejavu.map.templates)
+
+
+def test_what_was_written_is_told(tmp_path: Path) -> None:
+    running = trainer(tmp_path)
+    running.fit(new_task(), data_of())
+    path, certificate = running.callbacks[0].written  # type: ignore[attr-defined]
+    assert path == tmp_path / "map.safetensors"
+    assert certificate == DejaVu.load(path).certificate

@@ -1,0 +1,100 @@
+"""One line for every mistake that `dejavu train` can meet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from training_config import CONFIG
+
+from dejavu_torch.cli import main
+
+STOP, WATCH = (["--trainer.callbacks+", name] for name in ("EarlyStopping", "ModelCheckpoint"))
+ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "words"),
+    [
+        ("fit", ["--model.backbone", "mine.Deep"], ["Deep made (40, 8, 1)", "expected features (40, D)"]),
+        ("fit", ["--model.backbone", "mine.Late"], ["the loss is nan at step 1", "expected a finite number"]),
+        ("fit", ["--model.lr", "1e30"], ["the loss is", "try a lower lr"]),
+        ("fit", ["--model.lr", "-1"], ["lr is -1.0", "above 0"]),
+        ("fit", ["--model.losses.phase", "-1"], ["'phase': -1.0", "expected 0 or more"]),
+        ("fit", ["--model.freeze", "[nix]"], ["'nix'", "expected one of convolutions, linear"]),
+        ("fit", [*ANOTHER, "--model.periods.periods", "[3,4,7]"], ["5 in 10", "imposes 3 in 6", "7 in 14"]),
+        ("fit", [*ANOTHER, "--model.backbone.dimension", "9"], ["another model", "linear.weight"]),
+        ("fit", [*ANOTHER, "--model.backbone", "mine.Plain"], ["convolutions", "not in both"]),
+        ("fit", [*ANOTHER, "--model.train_templates", "false"], ["dejavu.map.templates", "same settings"]),
+        ("fit", [*ANOTHER, "--data.source", "thirty.npy"], ["of 40 places", "thirty.npy has 30"]),
+        ("fit", ["--ckpt_path", "gone.ckpt"], ["gone.ckpt"]),
+        ("fit", ["--ckpt_path", "a_file"], ["checkpoint cannot be read"]),
+        ("fit", ["--ckpt_path", "foreign.ckpt"], ["checkpoint is none of a training"]),
+        ("test", ["--ckpt_path", "foreign.ckpt", "--data.query", "two.npy"], ["none of a training"]),
+        ("fit", ["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
+        ("fit", ["--model.backbone.channels", "3"], ["got frames (40, 1, 16, 16)", "expected (B,3,H,W)"]),
+        ("fit", ["--data.source", "colour.npy"], ["got frames (40, 3, 16, 16)", "expected (B,1,H,W)"]),
+        ("fit", ["--data.resize", "[0,4]"], ["resize is", "(height, width)", "at least 1 pixel"]),
+        ("fit", ["--trainer.max_steps", "0"], ["no steps", "above 0"]),
+        ("fit", ["--trainer.max_epochs", "0"], ["no steps"]),
+        ("fit", ["--trainer.overfit_batches", "2"], ["overfit_batches", "trainer.limit_train_batches"]),
+        ("fit", ["--data.validation", "short.npy"], ["short.npy has 2 frames", "tolerance is 2", "longer"]),
+        ("fit", ["--data.validation", "thirty.npy"], ["30 frames of thirty.npy", "data.validation_truth"]),
+        ("test", ["--data.query", "large.npy"], ["(1, 24, 24)", "(1, 16, 16)", "data.resize"]),
+        ("test", [], ["nothing to test on", "data.query"]),
+        ("test", ["--trainer.default_root_dir", "never"], ["no never/checkpoints/last.ckpt", "--ckpt_path"]),
+        ("validate", ["--trainer.default_root_dir", "never"], ["no never/checkpoints/last.ckpt"]),
+        ("fit", ["--data.source", "gone.npy"], ["gone.npy is not there", "expected a folder"]),
+        ("fit", ["--data.source", "empty"], ["empty holds no images"]),
+        ("fit", ["--data.source", "single.npy"], ["single.npy has 1 frame and", "longer"]),
+        ("fit", ["--data.source", "single.npy", "--data.tolerance", "0"], ["single.npy has 1 frame and"]),
+        ("fit", ["--trainer.default_root_dir", "a_file"], ["a_file cannot be made a folder"]),
+        ("fit", ["--trainer.max_steps", "-1"], ["no end", "trainer.max_steps or trainer.max_epochs"]),
+        ("fit", ["--trainer.accelerator", "nix"], ["nix", "accelerator"]),
+        ("fit", [*STOP, "--trainer.callbacks.monitor=nix"], ["early stopping", "`nix`"]),
+        ("fit", [*WATCH, "--trainer.callbacks.monitor=nix"], ["monitor='nix'"]),
+        ("fit", ["--trainer.max_steps", "x"], ["--trainer.max_steps is x", "a whole number"]),
+        ("fit", ["--trainer.accelerator", "mps"], ["mps", "not available"]),
+        ("fit", ["--model.backbone", "nix.Nothing"], ["--model.backbone", "No module named 'nix'"]),
+        ("fit", ["--model.backbone", "mine.Nothing"], ["--model.backbone", "no attribute 'Nothing'"]),
+        ("fit", ["--clop", "3"], ["--clop"]),
+        ("fit", ["--config", "gone.yaml"], ["gone.yaml", "does not exist"]),
+        ("predict", [], ["'predict'", "fit"]),
+    ],
+    ids=str,
+)
+def test_a_mistake_is_one_line(
+    folder: Path, capfd: pytest.CaptureFixture[str], command: str, options: list[str], words: list[str]
+) -> None:
+    if command == "fit":
+        options = ["--trainer.default_root_dir", "bad", *options]
+    fails(capfd, [command, "--config", "train.yaml", *options], words)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("model:", "clop: 3\nmodel:", ["'clop'"]),
+        ("model:", "model:\n  clop: 3", ["'model.clop'"]),
+        ("tolerance: 2", "tolerance: 2, augmentation: {clop: 3}", ["data.augmentation", "'clop'"]),
+        ("source: one.npy, ", "", ["required: --data.source"]),
+        ("max_steps: 4, ", "", ["no end", "trainer.max_epochs"]),
+        ("data: {", "data: [", ["parsing config"]),
+    ],
+    ids=str,
+)
+def test_a_mistake_in_the_config_is_one_line(
+    folder: Path, capfd: pytest.CaptureFixture[str], tmp_path: Path, before: str, after: str, words: list[str]
+) -> None:
+    (tmp_path / "bad.yaml").write_text(CONFIG.replace(before, after))
+    fails(capfd, ["fit", "--config", str(tmp_path / "bad.yaml")], words)
+
+
+def fails(capfd: pytest.CaptureFixture[str], arguments: list[str], words: list[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["train", *arguments])
+    assert stop.value.code == 2
+    error = capfd.readouterr().err
+    assert error.startswith("dejavu: ")
+    assert error.count("\n") == 1, error
+    assert [word for word in words if word.lower() not in error.lower()] == [], error
