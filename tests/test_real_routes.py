@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from dejavu_torch.cli import main
@@ -18,7 +19,8 @@ from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
 
-TOLD = (Path(__file__).parents[1] / "docs" / "real_routes.md").read_text()
+ROOT = Path(__file__).parents[1]
+TOLD = (ROOT / "docs" / "real_routes.md").read_text()
 KEYS = ("auc", "recall_at_1", "recall_at_100_precision", "auc_reported")
 
 
@@ -210,6 +212,26 @@ def test_the_dash_of_the_road_is_the_strongest_layer_in_the_difference_of_red_an
         assert told == pytest.approx([entry["auc"], entry["recall_at_1"]], abs=0.02)
     ours, null = report["auc"], report["null_same_plan"]["auc"]
     assert (ours > null + 0.08) == (channel == "R-B")
+
+
+def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
+    data_dir: Path, tmp_path: Path
+) -> None:
+    stretch = (0, 0, 1000, 320)  # of 5585 columns, to be done in seconds
+    for flight in (1, 2):
+        Image.open(data_dir / "aerial_road" / f"pass{flight}.png").crop(stretch).save(
+            tmp_path / f"{flight}.png"
+        )
+    first, second = (f"strip:{tmp_path}/{flight}.png?halve=1&rows=32:128&width=96" for flight in (1, 2))
+    config = ["--config", str(ROOT / "configs" / "train_road.yaml"), "--seed_everything", "0"]
+    small = ["--data.resize", "[48,48]", "--model.backbone.resize", "[48,48]"]
+    short = ["--trainer.max_steps", "300", "--trainer.limit_val_batches", "0"]
+    silent = ["--trainer.enable_progress_bar", "false", "--trainer.default_root_dir", str(tmp_path)]
+    main(["train", "fit", *config, "--data.source", first, *small, *short, *silent])
+    report = compare(tmp_path / "report", first, second, "--map", tmp_path / "map.safetensors")
+    assert min(report["auc"], report["recall_at_1"]) > 0.9
+    assert report["null"]["auc"] < 0.2
+    assert report["template_numbers"] == 53 * 192
 
 
 def test_the_railway_in_two_seasons(data_dir: Path, tmp_path: Path) -> None:
