@@ -307,18 +307,8 @@ def test_compare_with_a_map_takes_no_settings(
     folder = trained_map.parent
     (folder / "c.yaml").write_text("reduction: sum\n")
     option = [word.replace("c.yaml", str(folder / "c.yaml")) for word in option]
-    with pytest.raises(SystemExit):
-        run(
-            "compare",
-            folder / "a.npy",
-            folder / "b.npy",
-            "--map",
-            trained_map,
-            "--out",
-            folder / "r",
-            *option,
-        )
-    told = capsys.readouterr().err
+    pair = folder / "a.npy", folder / "b.npy"
+    told = fails(capsys, "compare", *pair, "--map", trained_map, "--out", folder / "r", *option)
     assert f"{option[0].partition('=')[0]}: a --map has its own settings" in told
     assert told.count("\n") == 1
 
@@ -356,16 +346,8 @@ def test_a_map_that_cannot_be_judged(trained_map: Path, capsys: pytest.CaptureFi
     assert "short.npy gives 95 places, the map holds 96" in error
     assert "not there" in told("a.npy", "--map", folder / "nowhere.safetensors")
     assert "trained templates" in told("a.npy", "--map", trained_map, "--leave_out", "2")
-    assert "Flatten" in fails(
-        capsys,
-        "compare",
-        folder / "a.npy",
-        folder / "b.npy",
-        "--map",
-        trained_map,
-        "--out",
-        folder / "r",
-    )
+    pair = folder / "a.npy", folder / "b.npy"
+    assert "Flatten" in fails(capsys, "compare", *pair, "--map", trained_map, "--out", folder / "r")
 
 
 # what is refused
