@@ -102,8 +102,13 @@ def build_parts(header: dict[str, Any], features: nn.Module | None = None) -> di
     """
     there = [name for name in PARTS if name != "velocity" or header[name] is not None]
     recipes = {name: Recipe(**header[name]) for name in there}
-    if features is not None and recipe_of(features) not in _within(recipes["features"]):
-        raise InputError(f"it was learnt with {_difference(recipes['features'], recipe_of(features))}")
+    if features is not None:
+        own = recipe_of(features)
+        for recipe in _within(recipes["features"]):
+            if recipe.class_path == own.class_path:
+                _complete(recipe, type(features))
+        if own not in _within(recipes["features"]):
+            raise InputError(f"it was learnt with {_difference(recipes['features'], own)}")
     parts: dict[str, Any] = dict.fromkeys(PARTS)
     for name, recipe in recipes.items():
         # only learning needs what found the periods: one from elsewhere need not be built
@@ -117,6 +122,13 @@ def _within(recipe: Recipe) -> list[Recipe]:
     """A recipe, and those of its parts."""
     parts = [Recipe(**v) for v in recipe.init_args.values() if isinstance(v, dict) and "class_path" in v]
     return [recipe, *(inner for part in parts for inner in _within(part))]
+
+
+def _complete(recipe: Recipe, cls: type[nn.Module]) -> None:
+    """Arguments that an older version did not know were what is the default now."""
+    for name, parameter in inspect.signature(cls).parameters.items():
+        if recipe.class_path.startswith(PACKAGE + ".") and parameter.default is not parameter.empty:
+            recipe.init_args.setdefault(name, json.loads(json.dumps(parameter.default)))
 
 
 def _difference(stored: Recipe, given: Recipe) -> str:

@@ -8,6 +8,7 @@ from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
+from dejavu_torch.features.coder import Coder
 from dejavu_torch.types import InputError
 
 
@@ -22,6 +23,8 @@ class Embedding(nn.Module):
         resize: (height, width) in pixels that frames are brought to, antialiased.
         grid: cells along each side that maps are averaged over.
         cell: of `local_contrast` ahead of the network, pixels; 0 leaves the contrast as it is.
+        hidden: width of the hidden layer of a `Coder`, which stands for the linear layer then; 0 has none.
+        noise, kept: of the `Coder`.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
@@ -46,13 +49,17 @@ class Embedding(nn.Module):
         resize: tuple[int, int] = (96, 96),
         grid: int = 1,
         cell: int = 0,
+        hidden: int = 0,
+        noise: float = 1.0,
+        kept: int = 128,
     ) -> None:
         super().__init__()
-        if len(resize) != 2 or min(dimension, grid, *resize) < 1 or channels not in (1, 3) or cell < 0:
+        at_least_0 = min(cell, hidden) >= 0
+        if len(resize) != 2 or min(dimension, grid, *resize) < 1 or channels not in (1, 3) or not at_least_0:
             raise InputError(
                 f"Embedding got dimension={dimension}, channels={channels}, resize={tuple(resize)}, "
-                f"grid={grid}, cell={cell}; expected 1 or 3 channels, a cell of 0 or more, "
-                "the others at least 1"
+                f"grid={grid}, cell={cell}, hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 "
+                "or more, the others at least 1"
             )
         self.network = network
         self.dimension = dimension
@@ -60,6 +67,9 @@ class Embedding(nn.Module):
         self.resize = (int(resize[0]), int(resize[1]))  # a map gives a list
         self.grid = grid
         self.cell = cell
+        self.hidden = hidden
+        self.noise = noise
+        self.kept = kept
         black = torch.zeros(1, channels, *self.resize)
         modes = [(module, module.training) for module in network.modules()]
         try:
@@ -73,7 +83,10 @@ class Embedding(nn.Module):
         finally:
             for module, training in modes:
                 module.training = training
-        self.linear = nn.Linear(self._seen(output).shape[1], dimension)
+        inputs = self._seen(output).shape[1]
+        self.linear = (
+            Coder(inputs, dimension, hidden, noise, kept) if hidden else nn.Linear(inputs, dimension)
+        )
         self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
     def _seen(self, output: object) -> Tensor:
@@ -89,7 +102,8 @@ class Embedding(nn.Module):
             f"{type(self.network).__name__} made {seen}; expected maps (B,K,h,w) or vectors (B,K)"
         )
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def describe(self, frames: Tensor) -> Tensor:
+        """What the network makes of frames, one row each: (B,C,H,W) -> (B,K)."""
         if frames.ndim != 4 or frames.shape[1] not in (1, 3):
             raise InputError(f"Embedding got frames {tuple(frames.shape)}; expected (B,1,H,W) or (B,3,H,W)")
         if self.channels == 1 and frames.shape[1] == 3:
@@ -99,12 +113,19 @@ class Embedding(nn.Module):
             frames = antialiased_resize(frames, self.resize, antialias=True)
         if self.cell:
             frames = local_contrast(frames, self.cell)
-        features: Tensor = self.linear(self._seen(self.network(frames)))
+        return self._seen(self.network(frames))
+
+    def code(self, descriptors: Tensor) -> Tensor:
+        """Features of what `describe` gives: (B,K) -> (B,D)."""
+        features: Tensor = self.linear(descriptors)
         standardised: Tensor = self.standardise(features.float())
         return standardised
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return self.code(self.describe(frames))
 
     def extra_repr(self) -> str:
         return (
             f"dimension={self.dimension}, channels={self.channels}, resize={self.resize}, grid={self.grid}, "
-            f"cell={self.cell}"
+            f"cell={self.cell}, hidden={self.hidden}"
         )

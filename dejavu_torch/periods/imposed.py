@@ -25,6 +25,9 @@ class ImposedPeriods(PeriodFinder):
         templates, corrects, layers: what `supportive_periods` may spend and must give where `periods` is
             None; unused otherwise. Without `templates` it spends the least that will do.
         separate: give layer j the j-th of L equal slices of the features instead of all of them.
+        stagger: let the bins of the layers drift past each other, so that together they tell frames apart
+            that share a bin: the periods are P * bin frames and, in turn, a tenth of a bin more and less.
+            What `support` says holds for nearly all places then, not for every one.
 
     Shape: features (N,D), N >= 2 -> plan of L layers, each of period P * bin frames and P phases over 0..N.
 
@@ -49,10 +52,12 @@ class ImposedPeriods(PeriodFinder):
         corrects: int = 1,
         layers: int | None = None,
         separate: bool = False,
+        stagger: bool = False,
     ) -> None:
         super().__init__()
-        if bin < 1:
-            raise InputError(f"imposed periods got bin={bin}; expected at least 1 frame")
+        if bin < 1 + stagger:
+            least = "2 frames to stagger" if stagger else "1 frame"
+            raise InputError(f"imposed periods got bin={bin}; expected at least {least}")
         if periods is not None and not _fit(periods):
             raise InputError(f"imposed periods are {periods}; expected distinct whole numbers >= 2, in bins")
         self.periods = None if periods is None else list(periods)
@@ -61,6 +66,7 @@ class ImposedPeriods(PeriodFinder):
         self.corrects = corrects
         self.layers = layers
         self.separate = separate
+        self.stagger = stagger
 
     def periods_for(self, places: int) -> tuple[int, ...]:
         """The periods, in bins, of a route of `places` frames."""
@@ -97,8 +103,9 @@ class ImposedPeriods(PeriodFinder):
             )
         width = dimension // slices
         parts = [tuple(range(j * width, (j + 1) * width)) for j in range(slices)]
+        drift = Fraction(self.bin, 10) if self.stagger and len(periods) > 1 else Fraction(0)
         return tuple(
-            FrequencyLayer(Fraction(period * self.bin), period, 0, frames, parts[j % slices])
+            FrequencyLayer(period * self.bin + (-1) ** j * drift, period, 0, frames, parts[j % slices])
             for j, period in enumerate(periods)
         )
 
@@ -106,7 +113,7 @@ class ImposedPeriods(PeriodFinder):
         return -(-frames // self.bin)
 
     def extra_repr(self) -> str:
-        names = ("periods", "bin", "templates", "corrects", "layers", "separate")
+        names = ("periods", "bin", "templates", "corrects", "layers", "separate", "stagger")
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
 

@@ -137,6 +137,11 @@ class Augmentation(nn.Module):
         # in a tuple, which keeps kornia's buffers out of checkpoints: they hold strengths, nothing learnt
         self._steps = (VideoSequential(*steps),)
 
+    @property
+    def acts(self) -> bool:
+        """Whether any strength is above 0."""
+        return any(max(strength) > 0 for strength in self.strengths.values())
+
     @torch.no_grad()
     def forward(self, frames: Tensor) -> Tensor:
         if not self.training:

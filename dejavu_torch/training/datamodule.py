@@ -83,6 +83,7 @@ class RouteData(LightningDataModule):
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
         self.velocity = velocity
+        self.augmenting = True  # the frames that are trained on
         self.raw: Traverse  # the reference as it came
         self.reference: Traverse  # the same, at even steps where asked for
         self.sets: dict[str, StoredFrames] = {}
@@ -168,14 +169,17 @@ class RouteData(LightningDataModule):
         if batch.frames.ndim != 4 or self.trainer is None:
             return batch
         if self.trainer.training:
-            return batch._replace(frames=self._augmented(batch.frames, self.clip))
+            return (
+                batch._replace(frames=self.augmented(batch.frames, self.clip)) if self.augmenting else batch
+            )
         if (self.trainer.validating or self.trainer.sanity_checking) and "validation" not in self.sets:
             with torch.random.fork_rng():
                 torch.manual_seed(int(batch.truth.right[0, 0]))
-                return batch._replace(frames=self._augmented(batch.frames, 1))
+                return batch._replace(frames=self.augmented(batch.frames, 1))
         return batch
 
-    def _augmented(self, frames: Tensor, clip: int) -> Tensor:
+    def augmented(self, frames: Tensor, clip: int) -> Tensor:
+        """Frames (B,C,H,W), clip after clip, as on another day."""
         self.augmentation.train()
         augmented: Tensor = self.augmentation(frames.unflatten(0, (-1, clip)))
         return augmented.flatten(0, 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -14,9 +14,21 @@ from torch.optim.lr_scheduler import LambdaLR
 from dejavu_torch.types import InputError
 
 
-def adamw_of(parameters: Iterable[Parameter], lr: float, weight_decay: float, steps: float) -> dict[str, Any]:
+def adamw_of(
+    parameters: Iterable[Parameter],
+    lr: float,
+    weight_decay: float,
+    steps: float,
+    first: int = 0,
+    held: Sequence[Parameter] = (),
+) -> dict[str, Any]:
     """AdamW, and a schedule: the learning rate rises over the first tenth of the steps, then falls along a
     cosine to 0. Only what is multiplied with something decays: matrices and kernels.
+
+    Args:
+        parameters: those without gradient are left out.
+        first: steps of a stage ahead of the others, in which the rate rises and falls as well.
+        held: parameters that get no gradient after that stage, which a resumed optimizer has nevertheless.
 
     Returns:
         What Lightning's `configure_optimizers` gives.
@@ -26,18 +38,20 @@ def adamw_of(parameters: Iterable[Parameter], lr: float, weight_decay: float, st
     """
     if not math.isfinite(steps):
         raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
-    trained = [parameter for parameter in parameters if parameter.requires_grad]
+    until = {id(parameter) for parameter in held}
+    trained = [parameter for parameter in parameters if parameter.requires_grad or id(parameter) in until]
     groups = [
         {"params": [p for p in trained if p.ndim > 1], "weight_decay": weight_decay},
         {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
     ]
     optimizer = AdamW([group for group in groups if group["params"]], lr=lr)
-    rise = max(1, round(steps / 10))
 
     def height(step: int) -> float:
-        if step < rise:
-            return (step + 1) / rise
-        return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (step - rise) / max(1.0, steps - rise)))
+        past, length = (step, first) if step < first else (step - first, steps - first)
+        rise = max(1, round(length / 10))
+        if past < rise:
+            return (past + 1) / rise
+        return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (past - rise) / max(1.0, length - rise)))
 
     schedule = {"scheduler": LambdaLR(optimizer, height), "interval": "step"}
     return {"optimizer": optimizer, "lr_scheduler": schedule}

@@ -9,11 +9,11 @@ import os
 import time
 from typing import Any, Literal, cast
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
@@ -22,12 +22,12 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.scores import Reduction, combine_layers, log_posterior
-from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.checkpoint import check_trained, stored_map
-from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.descriptor import DescriptorStage, start_over
 from dejavu_torch.training.frames import Batch
 from dejavu_torch.training.freeze import freeze as freeze_part
 from dejavu_torch.training.freeze import start_from
+from dejavu_torch.training.judged import Judged
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.objective import Objective
 from dejavu_torch.training.optimizer import adamw_of, replace
@@ -37,7 +37,7 @@ from dejavu_torch.types import InputError, Training
 log = logging.getLogger("dejavu_torch")
 
 
-class PlaceRecognitionTask(pl.LightningModule):
+class PlaceRecognitionTask(Judged):
     """A `DejaVu` model that is trained: its features are made to repeat with the periods of its layers.
 
     The map's templates start as the phase means of the untrained features (eq. 1) and are parameters from
@@ -51,6 +51,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         temperature: T of `log_posterior` at the start, in units of the scores; it is learnt.
         train_templates: False leaves the templates phase means, taken anew every epoch and at the end.
         feature_weights: learn what a difference in each feature counts, at least 0.
+        descriptor: share of the steps in which the network of an `Embedding` with a hidden layer learns its
+            descriptor (`DescriptorStage`), ahead of the code.
         start: a map file of the same backbone, whose weights to start from.
         freeze: parameters of the backbone whose names begin with one of these stay as they are, and
             so do the running statistics below; "" is all of it.
@@ -78,6 +80,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         temperature: float = 0.03,
         train_templates: bool = True,
         feature_weights: bool = False,
+        descriptor: float = 0.4,
         start: str | None = None,
         freeze: list[str] | None = None,
         batch_norm: Literal["train", "frozen"] = "train",
@@ -93,6 +96,8 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"lr is {lr}, temperature {temperature}, weight_decay {weight_decay}, refresh {refresh}; "
                 "expected the first two above 0, the others 0 or more"
             )
+        if not 0 <= descriptor < 1:
+            raise InputError(f"descriptor is {descriptor}; expected a share of the steps, from 0 to below 1")
         backbone = SmallCNN() if backbone is None else backbone
         periods = ImposedPeriods() if periods is None else periods
         self.dejavu = DejaVu(
@@ -103,22 +108,14 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.log_temperature = nn.Parameter(torch.tensor(math.log(temperature)))
         self.train_templates, self.feature_weights = train_templates, feature_weights
         self.frozen = [module.eval() for module in freeze_part(backbone, freeze or [], batch_norm)]
+        self.descriptor, self.share, self._first = DescriptorStage(backbone), descriptor, 0
         self.refresh = refresh
         self.losses = Objective() if losses is None else losses
         if self.losses.support and not train_templates:
             raise InputError("the support loss is of trained templates; expected train_templates")
         self.lr, self.weight_decay = lr, weight_decay
-        self.metric: PlaceRecognition | None = None
         self.seconds = 0.0
         self._began: float | None = None
-
-    @property
-    def data(self) -> RouteData:
-        """The data module that the trainer runs with."""
-        data = getattr(self.trainer, "datamodule", None)
-        if not isinstance(data, RouteData):
-            raise InputError(f"the trainer's data module is {type(data).__name__}; expected RouteData")
-        return data
 
     def setup(self, stage: str) -> None:
         """Get ready for a route; the first map is made later, where no checkpoint brings one."""
@@ -128,6 +125,9 @@ class PlaceRecognitionTask(pl.LightningModule):
         if self.data.sets["reference"].values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")
             self.dejavu.features = HOG()  # has nothing to store
+            self.descriptor = DescriptorStage(self.dejavu.features)
+        self.data.augmenting = True
+        self.descriptor.prepare(len(self.data.sets["reference"]), self.data.tolerance)
 
     def _check_route(self, places: int) -> None:
         """Refuse a map of another route than the data's."""
@@ -157,6 +157,12 @@ class PlaceRecognitionTask(pl.LightningModule):
                 templates = self.dejavu.templates(route.weighted(self._reference_features()), route.plan)
                 route.templates = torch.cat([block.flatten() for block in templates])
 
+    def retake_map(self) -> None:
+        """What is judged are the templates of these features."""
+        if not self.dejavu.map.places:
+            self.relearn()
+        self.retake_means()
+
     def _reference_features(self) -> Tensor:
         """(N,D), as in training at its start, where running statistics are still to be gathered."""
         values, first = self.data.sets["reference"].values, not self.dejavu.map.places
@@ -178,18 +184,18 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
-        features = features_of(batch.frames, self.dejavu.pipeline, "the batch")
-        distances = self._distances(features)
-        total, parts, left_out = self.losses(
-            features,
-            distances,
-            self._scores(distances),
-            batch.truth.right,
-            self.dejavu.map,
-            self.dejavu.matcher,
-            self.log_temperature.exp(),
-            self.data.tolerance,
-        )
+        right, tolerance, route = batch.truth.right, self.data.tolerance, self.dejavu.map
+        if self.descriptor.learning:
+            frames = self.dejavu.preprocess(batch.frames)
+            total, parts, left_out = self.descriptor.losses(frames, right, tolerance, route.places)
+        else:
+            if self.descriptor.settled is None:
+                features = features_of(batch.frames, self.dejavu.pipeline, "the batch")
+            else:
+                features, right = self.descriptor.draw()
+            distances = self._distances(features)
+            given = (right, route, self.dejavu.matcher, self.log_temperature.exp(), tolerance)
+            total, parts, left_out = self.losses(features, distances, self._scores(distances), *given)
         if not total.isfinite():
             seen = ", ".join(f"{name} {float(part.detach()):g}" for name, part in parts.items())
             raise InputError(
@@ -223,55 +229,51 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Ask for the layers anew where it is time to."""
         if not self.refresh or not self.current_epoch or self.current_epoch % self.refresh:
             return self.retake_means()
-        before = self.dejavu.map
+        self._ask_anew(self.dejavu.map)
+
+    def _ask_anew(self, before: CompressedMap) -> None:
         self.relearn()
         replace(cast(Optimizer, self.optimizers(use_pl_optimizer=False)), before, self.dejavu.map)
 
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Where the descriptor's share of the steps is over, it is settled, and a code asked for."""
+        over, before = self.global_step >= self._first, self.dejavu.map
+        if self.descriptor.learning:
+            start_over(self.trainer, over)
+            if over:
+                self._settle()
+                self._ask_anew(before)
+        elif self.descriptor.settled is not None and self.descriptor.views is None:  # a resumed run
+            self.descriptor.look(self.dejavu.preprocess, self.data, self.dejavu.batch_size)
+
+    def _settle(self) -> None:
+        """The descriptor as it is from now on; the code's map is still to be made."""
+        self.frozen += self.descriptor.settle(self.global_step)
+        self.descriptor.look(self.dejavu.preprocess, self.data, self.dejavu.batch_size)
+        self.train(self.training)
+        self.dejavu.map = CompressedMap().to(self.device)  # whose first features gather statistics anew
+
     def configure_optimizers(self) -> Any:
         """For the parameters that there are once the first map is made."""
+        stage, steps = self.descriptor, float(self.trainer.estimated_stepping_batches)
+        if stage.present and not stage.learning and stage.settled is None:
+            self._settle()
         if not self.dejavu.map.places:
             self.relearn()
-        steps = float(self.trainer.estimated_stepping_batches)
-        return adamw_of(self.parameters(), self.lr, self.weight_decay, steps)
-
-    def on_validation_epoch_start(self) -> None:
-        """What is judged are the templates of these features."""
-        if not self.dejavu.map.places:
-            self.relearn()
-        self.retake_means()
-
-    def on_test_epoch_start(self) -> None:
-        """As for a validation."""
-        self.on_validation_epoch_start()
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Localize a batch, in the number type of the exported map whatever the training's."""
-        assert self.metric is not None  # setup made it
-        with torch.autocast(self.device.type, enabled=False):
-            self.metric.update(best_match(self(batch.frames)), batch.truth)
-
-    def test_step(self, batch: Batch, batch_idx: int) -> None:
-        """Localize a batch."""
-        self.validation_step(batch, batch_idx)
-
-    def on_validation_epoch_end(self) -> None:
-        """Log what `judge` says."""
-        assert self.metric is not None
-        figures = cast(dict[str, Tensor], self.metric.compute())
-        self.metric.reset()
-        stage = "test" if self.trainer.testing else "val"
-        self.log_dict({f"{stage}/{name}": value.float() for name, value in figures.items()})
-
-    def on_test_epoch_end(self) -> None:
-        """As for a validation."""
-        self.on_validation_epoch_end()
+        if math.isfinite(steps):
+            self._first = (
+                min(round(self.share * steps), int(steps) - 1) if stage.learning else stage.settled or 0
+            )
+        return adamw_of(self.parameters(), self.lr, self.weight_decay, steps, self._first, stage.held)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the clock, and what is trained."""
-        checkpoint |= {"seconds": self._elapsed(), "trained": self._trained()}
+        stage = self.descriptor.stored()
+        checkpoint |= {"seconds": self._elapsed(), "trained": self._trained(), "descriptor": stage}
 
     def _trained(self) -> list[str]:
-        return sorted(name for name, parameter in self.named_parameters() if parameter.requires_grad)
+        held = {id(parameter) for parameter in self.descriptor.held}
+        return sorted(name for name, p in self.named_parameters() if p.requires_grad or id(p) in held)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take over the checkpoint's layers; refuse those of another route, or others than imposed."""
@@ -280,16 +282,19 @@ class PlaceRecognitionTask(pl.LightningModule):
             self._check_route(route.places)
         self.dejavu.map = route.to(self.device)
         self.dejavu.map.trainable(self.train_templates, self.feature_weights)
+        if "descriptor" in checkpoint:
+            self.frozen += self.descriptor.restore(checkpoint["descriptor"], checkpoint["state_dict"])
         check_trained(checkpoint, self._trained())
         self.seconds = float(checkpoint.get("seconds", 0.0))
 
     def deployed(self) -> DejaVu:
         """The trained model by itself, whose `save` writes the map file."""
         self.retake_means()
+        if self.descriptor.lacking:
+            log.warning("the map is of a step ahead of the code, of the descriptor's")
         model = copy.deepcopy(self.dejavu).eval()
         model.map.settle()
         model.matcher.temperature = float(self.log_temperature.detach().exp())
         seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
-        given = None if seed is None else int(seed)
-        model.trained = Training(self.trainer.global_step, self._elapsed(), given)
+        model.trained = Training(self.trainer.global_step, self._elapsed(), int(seed) if seed else None)
         return model

@@ -19,7 +19,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.mapfile import read_compressed, recipe_of
+from dejavu_torch.database.mapfile import build_parts, part_recipes, read_compressed, recipe_of
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
@@ -588,7 +588,8 @@ def test_recipes_of_nested_modules() -> None:
     recipe = recipe_of(own)
     assert recipe.class_path == "dejavu_torch.features.embedding.Embedding"
     network = recipe.init_args.pop("network")
-    assert recipe.init_args == {"dimension": 5, "channels": 1, "resize": [8, 8], "grid": 2, "cell": 0}
+    coder = {"hidden": 0, "noise": 1.0, "kept": 128}
+    assert recipe.init_args == coder | {"dimension": 5, "channels": 1, "resize": [8, 8], "grid": 2, "cell": 0}
     assert network["class_path"] == "dejavu_torch.features.cnn.SmallCNN"
     assert (network["init_args"]["dimension"], network["init_args"]["widths"]) == (4, [2, 3])
     foreign = recipe_of(embedding(Patch())).init_args["network"]
@@ -754,3 +755,17 @@ def test_a_foreign_period_finder_is_not_imported_and_not_needed(
     craft(saved, periods={"class_path": class_path, "init_args": {}})
     assert torch.equal(DejaVu.load(saved).localize(waves()).index, expected.index)
     assert not trap.exists()
+
+
+def test_a_map_of_before_an_argument_was_known_takes_its_default() -> None:
+    net = Embedding(nn.Conv2d(3, 2, 3), dimension=4, resize=(8, 8))
+    header = part_recipes(DejaVu(net))
+    late = ("hidden", "noise", "kept")
+    for name in late:
+        del header["features"]["init_args"][name]
+    assert build_parts(header, net)["features"] is net
+    for name in late:
+        del header["features"]["init_args"][name]
+    other = Embedding(nn.Conv2d(3, 2, 3), dimension=4, resize=(8, 8), hidden=5)
+    with refused("of hidden=0; got hidden=5"):
+        build_parts(header, other)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from fractions import Fraction
 
 import pytest
 import torch
@@ -118,8 +119,32 @@ def test_places_that_look_alike_are_logged_in_one_line(caplog: pytest.LogCapture
     assert "\n" not in line
 
 
+def test_staggered_bins_drift_past_each_other() -> None:
+    plan = ImposedPeriods([5, 7, 9], bin=5, stagger=True).plan(torch.rand(900, 4))
+    assert [layer.period for layer in plan] == [Fraction(51, 2), Fraction(69, 2), Fraction(91, 2)]
+    assert [layer.phases for layer in plan] == [5, 7, 9]
+    (alone,) = ImposedPeriods([200], bin=5, stagger=True).plan(torch.rand(900, 4))
+    assert alone.period == 1000
+
+
+def test_staggered_layers_place_a_frame_finer_than_their_bins() -> None:
+    """Where each layer names its bin, how far off is the place that all of them agree on?"""
+    frames, errors = 900, {}
+    for stagger in (False, True):
+        finder = ImposedPeriods([5, 7, 8, 9, 11, 13], bin=5, separate=True, stagger=stagger)
+        plan = finder.plan(torch.rand(frames, 6 * 13))
+        features = one_hot(plan, torch.arange(frames))
+        found = best_match(Matcher()(features, learnt(features, plan))).index
+        errors[stagger] = (found - torch.arange(frames)).abs()
+    assert errors[False].max() == 4
+    assert errors[False].float().mean() == 2
+    near = errors[True] <= 4
+    assert near.float().mean() > 0.98
+    assert errors[True][near].float().mean() < 1
+
+
 @pytest.mark.parametrize(
-    "finder", [ImposedPeriods(), ImposedPeriods([4, 9], 3, 20, 0, 2, True), ImposedPeriods(layers=5)]
+    "finder", [ImposedPeriods(), ImposedPeriods([4, 9], 3, 20, 0, 2, True, True), ImposedPeriods(layers=5)]
 )
 def test_it_is_rebuilt_from_its_recipe(finder: ImposedPeriods) -> None:
     again = build(recipe_of(finder), PeriodFinder)
@@ -129,7 +154,8 @@ def test_it_is_rebuilt_from_its_recipe(finder: ImposedPeriods) -> None:
 
 def test_it_tells_its_arguments() -> None:
     assert repr(ImposedPeriods([4, 9], separate=True)) == (
-        "ImposedPeriods(periods=[4, 9], bin=5, templates=None, corrects=1, layers=None, separate=True)"
+        "ImposedPeriods(periods=[4, 9], bin=5, templates=None, corrects=1, layers=None, separate=True, "
+        "stagger=False)"
     )
 
 
@@ -142,6 +168,8 @@ def test_periods_that_cannot_be_imposed(periods: list[int]) -> None:
 def test_bad_input_is_refused() -> None:
     with refused("bin=0", "at least 1 frame"):
         ImposedPeriods(bin=0)
+    with refused("bin=1", "at least 2 frames to stagger"):
+        ImposedPeriods(bin=1, stagger=True)
     for shape in [(1, 4), (8,), (8, 0), (2, 3, 4)]:
         with refused(str(shape), "(N,D) with N >= 2, D >= 1"):
             ImposedPeriods().plan(torch.zeros(shape))

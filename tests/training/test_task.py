@@ -87,7 +87,11 @@ def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
 )
 def test_task_map_and_exported_program_give_the_same_scores(tmp_path: Path, settings: dict[str, Any]) -> None:
     task = new_task(**settings)
-    model = fit(tmp_path, task, data_of(batch_size=20))
+    assert_same_scores(task, fit(tmp_path, task, data_of(batch_size=20)))
+
+
+def assert_same_scores(task: PlaceRecognitionTask, model: DejaVu) -> None:
+    """Of the task, of its map, and of what is exported."""
     frames = footage(0.1)[:7, None] / 255
     with torch.no_grad():
         scores = task.eval()(frames)
