@@ -130,9 +130,8 @@ class Coder(nn.Module):
         self.whitened.fill_(True)
 
     def forward(self, descriptors: Tensor) -> Tensor:
-        with torch.autocast(
-            descriptors.device.type, enabled=False
-        ):  # bf16 would lose what whitening brings out
+        # bf16 would lose what whitening brings out
+        with torch.autocast(descriptors.device.type, enabled=False):
             components = (descriptors.to(self.mean.dtype) - self.mean) @ self.projection
             components = to_length(components)
             if self.training and self.noise:

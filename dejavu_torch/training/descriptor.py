@@ -123,6 +123,8 @@ class DescriptorStage(nn.Module):
             for _ in range(max(1, min(VIEWS, most)) if data.augmentation.acts else 1):
                 for batch in loader:
                     known = batch.truth.right[:, 0] >= 0
+                    if not known.any():
+                        continue
                     frames = data.augmented(batch.frames.to(device), data.clip)[known]
                     views.append(describe(frames).float())
                     right.append(batch.truth.right[known].to(device))

@@ -14,6 +14,7 @@ from dejavu_torch.types import InputError
 # follow the batches in training: their running statistics change without any gradient
 BATCH = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 RUNNING = (*BATCH, nn.InstanceNorm1d, nn.InstanceNorm2d, nn.InstanceNorm3d)
+CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
 
 
 def freeze(
@@ -49,12 +50,17 @@ def freeze(
 def start_from(backbone: nn.Module, path: str | Path) -> None:
     """Give a backbone the weights that a map file holds.
 
+    Of a whitened descriptor its code is left out, which is of the other route, and of any dimension.
+
     Raises:
         InputError: no map file, or one of another backbone.
     """
     tensors, header = read_map(Path(path))
     prefix = "features."
     weights = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    if bool(weights.get("linear.whitened", False)):
+        own = {name: t for name, t in backbone.state_dict().items() if name.startswith(CODE)}
+        weights = {name: t for name, t in weights.items() if not name.startswith(CODE)} | own
     try:
         backbone.load_state_dict(weights)
     except RuntimeError as error:

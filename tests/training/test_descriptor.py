@@ -143,8 +143,10 @@ def test_frames_of_no_known_place_are_not_learned_from(tmp_path: Path) -> None:
 
 def test_another_route_keeps_the_descriptor(tmp_path: Path) -> None:
     first, _ = watched(tmp_path / "first")
-    again = coded()
+    again = coded(dimension=7)
+    fresh = again.linear.layers[0].weight.clone()  # type: ignore[union-attr,operator,index]
     task = new_task(backbone=again, start=str(tmp_path / "first" / "map.safetensors"))
+    assert torch.equal(again.linear.layers[0].weight, fresh)  # type: ignore[union-attr,operator,index]
     trainer(tmp_path / "second").fit(task, data_of(footage(frames=30)))
     assert task.descriptor.settled == 0
     before, after = first.dejavu.features.state_dict(), again.state_dict()
