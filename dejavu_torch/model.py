@@ -12,20 +12,20 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import as_traverse
-from dejavu_torch.database.certificate import Certificate, certify
 from dejavu_torch.database.compressed import CompressedMap
+from dejavu_torch.database.distance import Metric
 from dejavu_torch.database.mapfile import build_parts, map_size, part_recipes, read_map, write_map
 from dejavu_torch.database.phase import PhaseTemplates
+from dejavu_torch.database.scores import Matcher, Reduction
+from dejavu_torch.database.summary import MapSummary, summarise
 from dejavu_torch.features.extract import check_frames, feature_batches, features_of, frame_shape
-from dejavu_torch.features.gather import gather
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.spacing import EvenlySpaced
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.distance import Metric
-from dejavu_torch.recognition.scores import Matcher, Reduction
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import InputError, Match, Training, Traverse
 
@@ -69,7 +69,7 @@ class DejaVu(nn.Module):
         threshold: float | None = None,
         batch_size: int = 64,
         preprocess: Preprocess | None = None,
-        velocity: VelocityNormalizer | None = None,
+        velocity: GroundOdometry | None = None,
         temperature: float | None = None,
     ) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class DejaVu(nn.Module):
         Returns:
             self, with the map in `self.map`. A route in which nothing repeats gives a map without
             layers, on which every place scores +inf. Memory does not grow with the frames: features
-            beyond `gather`'s share of it spill to a temporary file.
+            beyond `concatenate`'s share of it spill to a temporary file.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes.
@@ -117,13 +117,13 @@ class DejaVu(nn.Module):
                 single frame, and ready features, stay as they are.
 
         Raises:
-            InputError: as `EvenlySpaced`.
+            InputError: as `ResampledTraverse`.
         """
-        if self.velocity is None or isinstance(traverse, EvenlySpaced):
+        if self.velocity is None or isinstance(traverse, ResampledTraverse):
             return traverse
         if step is not None and (traverse.length == 1 or len(frame_shape(traverse)) == 1):
             return traverse
-        return EvenlySpaced(traverse, self.velocity, self.batch_size, step, progress)
+        return ResampledTraverse(traverse, self.velocity, self.batch_size, step, progress)
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
         """As `learn`, from features that are there already.
@@ -146,7 +146,7 @@ class DejaVu(nn.Module):
         with torch.no_grad():
             templates = self.templates(features, plan)
         self.step, way = None, None
-        if isinstance(traverse, EvenlySpaced):
+        if isinstance(traverse, ResampledTraverse):
             self.step, way = traverse.step, traverse.way
         places, dimension = features.shape
         self.map = CompressedMap(plan, templates, places, dimension, way).to(features.device)
@@ -198,8 +198,8 @@ class DejaVu(nn.Module):
         return feature_batches(traverse, self.pipeline, self.batch_size, self.map.size.device, progress)
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
-        """Features of a whole traverse, (N,D); many of them lie in a temporary file, see `gather`."""
-        return gather(self.extract(traverse, progress))
+        """Features of a whole traverse, (N,D); many of them lie in a temporary file, see `concatenate`."""
+        return concatenate(self.extract(traverse, progress))
 
     @property
     def pipeline(self) -> nn.Sequential:
@@ -259,9 +259,9 @@ class DejaVu(nn.Module):
         return sum(t.nbytes for t in self.features.state_dict().values() if isinstance(t, Tensor))
 
     @property
-    def certificate(self) -> Certificate:
+    def certificate(self) -> MapSummary:
         """What the map can tell apart and what it costs."""
-        return certify(self.map.plan, self.map.places, self.map_bytes)
+        return summarise(self.map.plan, self.map.places, self.map_bytes)
 
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         metric = self.matcher.metric

@@ -129,17 +129,17 @@ class Training(NamedTuple):
     seed: int | None
 
 
-class Truth(NamedTuple):
-    """The right places of each query, and what is not to be judged.
+class GroundTruth(NamedTuple):
+    """The correct places of each query, and the queries and places that are not scored.
 
-    right: (Q,R) int64, every right place of each query, -1 as padding; a row of -1 has no right answer.
-    known: (Q,) bool, False where nothing is known of a query: it is left out of every score.
-    soft: (Q,S) int64, places that count neither as right nor as wrong, -1 as padding; S may be 0.
+    positives: (Q,R) int64, every correct place of each query, -1 as padding; a row of -1 has none.
+    judged: (Q,) bool, False where the ground truth does not mention a query: it is left out of every score.
+    ignored: (Q,S) int64, places that count neither as correct nor as wrong, -1 as padding; S may be 0.
     """
 
-    right: Tensor
-    known: Tensor
-    soft: Tensor
+    positives: Tensor
+    judged: Tensor
+    ignored: Tensor
 
 
 class PRCurve(NamedTuple):

@@ -16,12 +16,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.features.gather import gather
+from dejavu_torch.database.scores import log_posterior
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.scores import log_posterior
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, Match, Training, Traverse
 
@@ -150,7 +150,7 @@ def test_features_that_spill_to_a_file_give_the_same_map(
     spilled: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain = DejaVu(batch_size=5).learn(pictures())
-    monkeypatch.setattr(model_module, "gather", partial(gather, in_memory=spilled))
+    monkeypatch.setattr(model_module, "concatenate", partial(concatenate, in_memory=spilled))
     other = DejaVu(batch_size=5).learn(pictures())
     assert other.map.plan == plain.map.plan
     assert torch.equal(other.map.templates, plain.map.templates)

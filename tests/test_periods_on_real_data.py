@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.controls import null_control
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
@@ -49,8 +49,8 @@ def test_the_paper_recognises_the_second_flight_and_its_null_is_clearly_worse(
     paper: DejaVu, flights: tuple[Tensor, Tensor]
 ) -> None:
     reference, query = flights
-    ours = judge(paper.localize(query), TRUTH, 5)
-    null = judge(null_control(paper, reference, query), TRUTH, 5)
+    ours = evaluate(paper.localize(query), TRUTH, 5)
+    null = evaluate(null_control(paper, reference, query), TRUTH, 5)
     assert ours.auc > 0.8
     assert ours.auc > null.auc + 0.2
     assert ours.recall_at_1 > null.recall_at_1 + 0.1
@@ -60,5 +60,5 @@ def test_the_paper_recognises_the_second_flight_and_its_null_is_clearly_worse(
 def test_with_a_test_against_noise_the_shuffled_flight_has_no_layers(flights: tuple[Tensor, Tensor]) -> None:
     reference, query = flights
     model = DejaVu().learn(reference)
-    assert judge(model.localize(query), TRUTH, 5).auc > 0.8
-    assert judge(null_control(model, reference, query), TRUTH, 5) == (0.0,) * 6
+    assert evaluate(model.localize(query), TRUTH, 5).auc > 0.8
+    assert evaluate(null_control(model, reference, query), TRUTH, 5) == (0.0,) * 6

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from dejavu_torch.cli import main
 from dejavu_torch.data.source import open_source
-from dejavu_torch.features.ground import ground_patch
-from dejavu_torch.features.spacing import EvenlySpaced
-from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.ground_plane import ground_patch
+from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.motion.resampling import ResampledTraverse
 
 ROOT = Path(__file__).parents[1]
 TOLD = (ROOT / "docs" / "real_routes.md").read_text()
@@ -107,7 +107,7 @@ ROAD = ((0.41, 0.66), (0.605, 0.66), (0.925, 0.985), (0.12, 0.985))
 
 def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_dir: Path) -> None:
     clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
-    ground = VelocityNormalizer(corners=ROAD).distances(clip)
+    ground = GroundOdometry(corners=ROAD).distances(clip)
     speed = ground.distance.diff()
     patches = torch.cat([ground_patch(batch, ROAD) for batch in clip.batches(64)])[:, 0]
     column = int(patches[:, :, :32].var(0).mean(0).argmax())  # the dashed line changes most
@@ -135,7 +135,7 @@ def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
     assert found is not None
     lk_lost, _, lk_mean, dis_lost, dis_mean = numbers(found[1].replace("stood still:", ""))[:5]
     for flow, lost, mean in (("lk", lk_lost, lk_mean), ("dis", dis_lost, dis_mean)):
-        ground = VelocityNormalizer(corners=ROAD, flow=flow).distances(clip)
+        ground = GroundOdometry(corners=ROAD, flow=flow).distances(clip)
         assert int((ground.confidence < 0.4).sum()) == pytest.approx(lost, abs=8)
         assert float(ground.distance.diff().mean()) == pytest.approx(mean, rel=0.03)
 
@@ -162,7 +162,7 @@ def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(da
         values = numbers(told[name][0])
         corners = tuple(zip(values[::2], values[1::2], strict=True))
         height, width = map(int, numbers(told[name][1]))
-        frames[name] = EvenlySpaced(laps, VelocityNormalizer(corners=corners, size=(height, width))).frame
+        frames[name] = ResampledTraverse(laps, GroundOdometry(corners=corners, size=(height, width))).frame
     heights, widths = {}, {}
     for name, frame in frames.items():
         lap, heights[name], widths[name], elsewhere = lap_peak(features[frame], 0.2, 0.32)

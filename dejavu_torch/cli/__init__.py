@@ -81,7 +81,7 @@ def _spelt_out(given: list[str]) -> list[str]:
     """The command line with a bare --velocity given the one value it can have."""
     following = [*given[1:], "--"]
     return [
-        "--velocity=VelocityNormalizer" if word == "--velocity" and after.startswith("--") else word
+        "--velocity=GroundOdometry" if word == "--velocity" and after.startswith("--") else word
         for word, after in zip(given, following, strict=True)
     ]
 

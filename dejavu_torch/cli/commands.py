@@ -8,7 +8,8 @@ from typing import Any
 from dejavu_torch.data.files import check_output_file, make_output_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import Shown
-from dejavu_torch.database.certificate import describe
+from dejavu_torch.database.l1 import l1_backend
+from dejavu_torch.database.summary import describe
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.evaluation.report import (
     Report,
@@ -20,7 +21,7 @@ from dejavu_torch.evaluation.report import (
 )
 from dejavu_torch.experiments import bench
 from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.evaluate import evaluate
+from dejavu_torch.experiments.evaluate import evaluate_file
 from dejavu_torch.experiments.reproduce import reproduce
 from dejavu_torch.experiments.section_five import (
     FOOTAGE,
@@ -30,12 +31,11 @@ from dejavu_torch.experiments.section_five import (
     route_lines,
     section_five,
 )
-from dejavu_torch.features.ground import check_corners
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.ground_plane import check_corners
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.stft import BACKEND
-from dejavu_torch.recognition.l1 import l1_backend
 from dejavu_torch.types import InputError, Traverse
 
 
@@ -87,7 +87,7 @@ def run_localize(
     if model.step is not None:
         traverse = model.evenly(traverse, model.step, progress=True)
         _tell_spacing(traverse)
-        frame = traverse.frame if isinstance(traverse, EvenlySpaced) else None
+        frame = traverse.frame if isinstance(traverse, ResampledTraverse) else None
         shown = Shown(frame, model.map.frame)
     queries, accepted = write_matches(out, model.matches(traverse, progress=True), shown)
     print(f"{queries} queries, {accepted} accepted; written to {out}")
@@ -132,7 +132,7 @@ def run_evaluate(
     """Judge the matches in a csv, whatever found them."""
     one, other = (None if source is None else open_source(source) for source in (reference, query))
     _make_report_folder(out, reference, query)
-    result = evaluate(matches, truth, tolerance, interpolate, one, other, map)
+    result = evaluate_file(matches, truth, tolerance, interpolate, one, other, map)
     write_report(out, result.report, result.pictures, f"{matches} judged by {truth}", command)
     _print_scores(result.report, out)
 
@@ -193,7 +193,7 @@ def _make_report_folder(out: Path, *sources: str | None) -> None:
 
 
 def _tell_spacing(traverse: Traverse) -> None:
-    if isinstance(traverse, EvenlySpaced):
+    if isinstance(traverse, ResampledTraverse):
         frames, steps = len(traverse.way), f"even steps of {traverse.step:.4g} pixels of ground"
         print(f"{frames} frames make {traverse.length} {steps}")
 

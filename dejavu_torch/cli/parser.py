@@ -28,7 +28,7 @@ TRUTH = (
 HINT = (
     "Options of the parts go by their names, such as --periods.window 512, --features.cell 4, "
     "--preprocess.contrast patch or --velocity.step 5; --features.help HOG, --periods.help "
-    "SpectrogramAnalysis, --preprocess.help and --velocity.help VelocityNormalizer list them."
+    "SpectrogramAnalysis, --preprocess.help and --velocity.help GroundOdometry list them."
 )
 PARTS = {
     "features": "dejavu_torch.HOG",

@@ -16,7 +16,7 @@ from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveCon
 
 from dejavu_torch.cli.parser import Parser, UsageError, refusal
 from dejavu_torch.data.files import make_output_folder
-from dejavu_torch.database.certificate import describe
+from dejavu_torch.database.summary import describe
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import MapExport
 from dejavu_torch.training.task import PlaceRecognitionTask
@@ -35,7 +35,7 @@ PARTS = {
     "model.backbone": "dejavu_torch.features.cnn.SmallCNN",
     "model.periods": "dejavu_torch.periods.imposed.ImposedPeriods",
     "model.preprocess": "dejavu_torch.Preprocess",
-    "data.augmentation": "dejavu_torch.training.augment.Augmentation",
+    "data.augmentation": "dejavu_torch.features.augmentation.Augmentation",
 }
 log = logging.getLogger("dejavu_torch")
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.types import InputError, Truth
+from dejavu_torch.types import GroundTruth, InputError
 
 PAIRS_AT_ONCE = 2**20
 
@@ -32,12 +32,12 @@ def unit_of(shown: Shown | None) -> str:
     return "frames" if shown is None else "evenly spaced places"
 
 
-def as_truth(truth: Tensor | Truth) -> Truth:
-    """A tensor of right places (Q,R), -1 as padding, as a Truth in which every query is known."""
-    if isinstance(truth, Truth):
+def as_truth(truth: Tensor | GroundTruth) -> GroundTruth:
+    """A tensor of right places (Q,R), -1 as padding, as a GroundTruth in which every query is known."""
+    if isinstance(truth, GroundTruth):
         return truth
     known = torch.ones(len(truth), dtype=torch.bool)
-    return Truth(truth, known, truth.new_zeros(len(truth), 0))
+    return GroundTruth(truth, known, truth.new_zeros(len(truth), 0))
 
 
 def padded(row: Tensor, place: Tensor, rows: int) -> Tensor:
@@ -135,13 +135,13 @@ def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
     return (near & (truth >= 0) & (index >= 0)[:, None]).any(1)
 
 
-def counted(index: Tensor, truth: Truth, tolerance: int) -> Tensor:
+def counted(index: Tensor, truth: GroundTruth, tolerance: int) -> Tensor:
     """Which queries a score counts: those of known truth that do not report a soft place.
 
     Shape: (Q,) -> (Q,) bool.
     """
-    soft = is_right(index, truth.soft, 0)
-    return truth.known & (is_right(index, truth.right, tolerance) | ~soft)
+    soft = is_right(index, truth.ignored, 0)
+    return truth.judged & (is_right(index, truth.positives, tolerance) | ~soft)
 
 
 def places_of_frames(frames: Tensor, shown: Shown) -> Tensor:
@@ -170,7 +170,7 @@ def places_of_frames(frames: Tensor, shown: Shown) -> Tensor:
     return torch.where(frames >= 0, shown.place_of[frames], -1)
 
 
-def truth_of_places(truth: Truth, shown: Shown) -> Truth:
+def truth_of_places(truth: GroundTruth, shown: Shown) -> GroundTruth:
     """A truth whose places are reference frames as one of evenly spaced places.
 
     Convention: where several places show the same frame, all of them are right.
@@ -189,4 +189,4 @@ def truth_of_places(truth: Truth, shown: Shown) -> Truth:
         within = torch.arange(int(count.sum())) - (count.cumsum(0) - count).repeat_interleave(count)
         return padded(row.repeat_interleave(count), start.repeat_interleave(count) + within, len(table))
 
-    return Truth(among_places(truth.right), truth.known, among_places(truth.soft))
+    return GroundTruth(among_places(truth.positives), truth.judged, among_places(truth.ignored))

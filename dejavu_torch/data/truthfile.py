@@ -1,4 +1,4 @@
-"""TRUTH, as every command takes it: text -> Truth."""
+"""TRUTH, as every command takes it: text -> GroundTruth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dejavu_torch.data.truthformats import (
     read_table,
     utm_coordinates,
 )
-from dejavu_torch.types import InputError, Traverse, Truth
+from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 EXPECTED = (
     "an integer offset such as 0, a .csv of query,place, an .npz with GThard, or utm:25 for coordinates in "
@@ -60,7 +60,7 @@ def find_truth(
     queries: int | Tensor,
     interpolate: bool = False,
     shown: Shown | None = None,
-) -> Truth | None:
+) -> GroundTruth | None:
     """The truth that a command was given, or what it can know by itself.
 
     Args:
@@ -95,7 +95,7 @@ def find_truth(
     return _answered(_spaced(as_truth(right), shown), f"within {radius:g} m of {reference.name}")
 
 
-def _spaced(truth: Truth, shown: Shown | None) -> Truth:
+def _spaced(truth: GroundTruth, shown: Shown | None) -> GroundTruth:
     return truth if shown is None else truth_of_places(truth, shown)
 
 
@@ -132,7 +132,7 @@ def read_truth(
     queries: int | Tensor,
     interpolate: bool = False,
     shown: Shown | None = None,
-) -> Truth:
+) -> GroundTruth:
     """The truth that a text means.
 
     Args:
@@ -160,7 +160,7 @@ def read_truth(
         InputError: a truth that cannot be read or does not fit, or in which no query has a right answer.
 
     Example:
-        >>> read_truth("-1", places=3, queries=3).right.tolist()
+        >>> read_truth("-1", places=3, queries=3).positives.tolist()
         [[-1], [0], [1]]
     """
     check_truth_text(truth, interpolate)
@@ -183,8 +183,8 @@ def read_truth(
     )
 
 
-def _answered(truth: Truth, told: str) -> Truth:
-    if not (truth.right >= 0).any():
+def _answered(truth: GroundTruth, told: str) -> GroundTruth:
+    if not (truth.positives >= 0).any():
         raise InputError(f"no query has a right answer {told}")
     return truth
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.truth import Shown, padded, truth_of_places
-from dejavu_torch.types import InputError, Traverse, Truth
+from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 Rows = list[tuple[int, list[str]]]  # number of a line, and its cells
 LARGEST = 2**53  # beyond it a float does not hold every whole number
@@ -58,7 +58,7 @@ def utm_coordinates(traverse: Traverse) -> Tensor:
 
 def read_table(
     path: Path, places: int | None, numbers: Tensor, interpolate: bool = False, shown: Shown | None = None
-) -> Truth:
+) -> GroundTruth:
     """A csv of `query,place[,place...]`; see `read_truth`.
 
     Args:
@@ -99,7 +99,7 @@ def _at_shown(listed: dict[int, list[float]], frames: Tensor) -> dict[int, list[
     return moved
 
 
-def _table(path: Path, listed: dict[int, list[float]], numbers: Tensor, interpolate: bool) -> Truth:
+def _table(path: Path, listed: dict[int, list[float]], numbers: Tensor, interpolate: bool) -> GroundTruth:
     queries, first, last = numbers.tolist(), min(listed), max(listed)
     if interpolate:
         knots = sorted(listed)
@@ -115,7 +115,7 @@ def _table(path: Path, listed: dict[int, list[float]], numbers: Tensor, interpol
     row = torch.arange(len(sets)).repeat_interleave(torch.tensor([len(found) for found in sets]))
     flat = torch.tensor([_rounded(place) for found in sets for place in found], dtype=torch.int64)
     right = padded(row, flat, len(sets))
-    return Truth(right, known, right.new_zeros(len(right), 0))
+    return GroundTruth(right, known, right.new_zeros(len(right), 0))
 
 
 def _listed(
@@ -179,7 +179,9 @@ def _table_rows(path: Path) -> tuple[Rows, bool]:
     return rows, of_frames
 
 
-def read_matrices(path: Path, places: int | None, queries: int | Tensor, shown: Shown | None = None) -> Truth:
+def read_matrices(
+    path: Path, places: int | None, queries: int | Tensor, shown: Shown | None = None
+) -> GroundTruth:
     """An npz of the matrices (places, queries) GThard and/or GTsoft; see `read_truth`."""
     matrices = _load_matrices(path)
     if shown is not None and _of_frames(matrices, shown):
@@ -200,7 +202,7 @@ def _of_frames(matrices: Mapping[str, np.ndarray], shown: Shown) -> bool:
 
 def _matrices(
     path: Path, matrices: Mapping[str, np.ndarray], places: int | None, queries: int | Tensor
-) -> Truth:
+) -> GroundTruth:
     for name, matrix in matrices.items():
         _check_shape(f"{path}: {name}", matrix, places, queries)
     if len({matrix.shape for matrix in matrices.values()}) > 1:
@@ -212,8 +214,8 @@ def _matrices(
     right = _columns(first)
     known = torch.ones(len(right), dtype=torch.bool)
     if not others:
-        return Truth(right, known, right.new_zeros(len(right), 0))
-    return Truth(right, known, _columns(others[0] & ~first))
+        return GroundTruth(right, known, right.new_zeros(len(right), 0))
+    return GroundTruth(right, known, _columns(others[0] & ~first))
 
 
 def _columns(which: Tensor) -> Tensor:

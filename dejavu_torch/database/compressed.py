@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.spacing import nearest_places, shown_frames
+from dejavu_torch.motion.resampling import nearest_places, shown_frames
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 

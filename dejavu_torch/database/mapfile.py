@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.files import whole_file
 from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import InputError
 
@@ -26,7 +26,7 @@ PARTS: dict[str, type[nn.Module]] = {  # what a header holds recipes of
     "preprocess": Preprocess,
     "features": nn.Module,
     "periods": PeriodFinder,
-    "velocity": VelocityNormalizer,
+    "velocity": GroundOdometry,
 }
 LAYER_COLUMNS = ["period_numerator", "period_denominator", "phases", "start", "stop"]
 

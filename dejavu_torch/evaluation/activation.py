@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.truth import counted, is_right
-from dejavu_torch.types import FrequencyLayer, Truth
+from dejavu_torch.types import FrequencyLayer, GroundTruth
 
 
 class Rate(NamedTuple):
@@ -76,7 +76,7 @@ def activation_rates(
     layers: Sequence[FrequencyLayer],
     best: Sequence[Tensor],
     index: Tensor,
-    truth: Truth,
+    truth: GroundTruth,
     tolerance: int,
     places: int,
 ) -> ActivationRates:
@@ -102,7 +102,7 @@ def activation_rates(
         tolerance: frames, inclusive. places: N.
     """
     start, stop = layers[0].start, layers[0].stop
-    right = torch.where(truth.known[:, None], truth.right, -1)
+    right = torch.where(truth.judged[:, None], truth.positives, -1)
     here = torch.where((right >= start) & (right < stop), right, -1)
     inside = (here >= 0).any(1)
     outside = (right >= 0).any(1) & ~inside

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from dejavu_torch.recognition.distance import Metric, phase_distances
+from dejavu_torch.database.distance import Metric, phase_distances
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Match
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.database.compressed import CompressedMap
-from dejavu_torch.features.gather import gather
+from dejavu_torch.database.distance import Metric, phase_distances
+from dejavu_torch.database.scores import combine_layers, log_posterior
+from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.distance import Metric, phase_distances
-from dejavu_torch.recognition.scores import combine_layers, log_posterior
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match
 
@@ -56,7 +56,7 @@ def null_control(
     """
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
     parts = order.to(reference.device).split(256)
-    shuffled, null = gather(reference[part] for part in parts), same_settings(model)
+    shuffled, null = concatenate(reference[part] for part in parts), same_settings(model)
     if same_plan:
         plan, weights = model.map.plan, model.map.weights if len(model.map.weights) else None
         templates = null.templates(model.map.weighted(shuffled), plan)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.truth import as_truth, counted, is_right
-from dejavu_torch.types import InputError, Match, PRCurve, Truth
+from dejavu_torch.types import GroundTruth, InputError, Match, PRCurve
 
 RECALL_DEFINITION = (
     "TP / all queries with a right answer; *_reported: TP / (TP + FN), a wrong report is no FN"
@@ -104,19 +104,19 @@ def threshold_of_full_precision(curve: PRCurve) -> float | None:
 
 
 def curve_of(
-    match: Match, truth: Tensor | Truth, tolerance: int, recall: Literal["all", "reported"] = "all"
+    match: Match, truth: Tensor | GroundTruth, tolerance: int, recall: Literal["all", "reported"] = "all"
 ) -> PRCurve:
-    """`pr_curve` of matches against a truth; see `judge`."""
+    """`pr_curve` of matches against a truth; see `evaluate`."""
     match, truth = _judged(match, truth, tolerance)
-    right = is_right(match.index, truth.right, tolerance)
-    return pr_curve(match.score, right, (truth.right >= 0).any(1), recall)
+    right = is_right(match.index, truth.positives, tolerance)
+    return pr_curve(match.score, right, (truth.positives >= 0).any(1), recall)
 
 
-def judge(match: Match, truth: Tensor | Truth, tolerance: int) -> Scores:
+def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Scores:
     """All scores of matches against a truth.
 
     Args:
-        truth: (Q,R) int64, every right place of each query, -1 as padding; or a Truth. Queries of which
+        truth: (Q,R) int64, every right place of each query, -1 as padding; or a GroundTruth. Queries of which
             nothing is known, and queries that report a soft place, are left out, as if they were never
             asked: of precision, of recall, and of the count of queries.
         tolerance: frames, inclusive.
@@ -127,15 +127,16 @@ def judge(match: Match, truth: Tensor | Truth, tolerance: int) -> Scores:
 
     Example:
         >>> match = Match(torch.tensor([0, 7]), torch.tensor([0.1, 0.2]), torch.tensor([True, True]))
-        >>> judge(match, torch.tensor([[0], [1]]), tolerance=0).recall_at_1
+        >>> evaluate(match, torch.tensor([[0], [1]]), tolerance=0).recall_at_1
         0.5
-        >>> truth = Truth(torch.tensor([[0], [1]]), torch.tensor([True, True]), torch.tensor([[-1], [7]]))
-        >>> judge(match, truth, tolerance=0).recall_at_1
+        >>> both = torch.tensor([True, True])
+        >>> truth = GroundTruth(torch.tensor([[0], [1]]), both, torch.tensor([[-1], [7]]))
+        >>> evaluate(match, truth, tolerance=0).recall_at_1
         1.0
     """
     match, truth = _judged(match, truth, tolerance)
-    right = is_right(match.index, truth.right, tolerance)
-    answerable = (truth.right >= 0).any(1)
+    right = is_right(match.index, truth.positives, tolerance)
+    answerable = (truth.positives >= 0).any(1)
     every = pr_curve(match.score, right, answerable, "all")
     reported = pr_curve(match.score, right, answerable, "reported")
     return Scores(
@@ -148,7 +149,7 @@ def judge(match: Match, truth: Tensor | Truth, tolerance: int) -> Scores:
     )
 
 
-def tally(match: Match, truth: Tensor | Truth, tolerance: int) -> dict[str, int]:
+def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> dict[str, int]:
     """How many queries there are, and how many of them the scores count; the keys are keys of report.json.
 
     queries = judged + unknown + ignored: unknown to the truth, or ignored because a soft place is
@@ -156,25 +157,25 @@ def tally(match: Match, truth: Tensor | Truth, tolerance: int) -> dict[str, int]
     accepted; accepted_right those accepted in a right place.
 
     Raises:
-        InputError: as `judge`.
+        InputError: as `evaluate`.
     """
     kept, right = _judged(match, truth, tolerance)
-    good = is_right(kept.index, right.right, tolerance)
-    queries, judged, unknown = len(match.index), len(kept.index), int((~as_truth(truth).known).sum())
+    good = is_right(kept.index, right.positives, tolerance)
+    queries, judged, unknown = len(match.index), len(kept.index), int((~as_truth(truth).judged).sum())
     return {
         "queries": queries,
         "judged": judged,
         "unknown": unknown,
         "ignored": queries - judged - unknown,
-        "with_answer": int((right.right >= 0).any(1).sum()),
+        "with_answer": int((right.positives >= 0).any(1).sum()),
         "accepted": int(kept.accepted.sum()),
         "accepted_right": int((kept.accepted & good).sum()),
     }
 
 
-def check_truth(match: Match, truth: Tensor | Truth, tolerance: int) -> None:
+def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> None:
     """Refuse a truth that does not fit the matches."""
-    right, *others = (truth,) if isinstance(truth, Tensor) else (truth.right, truth.known, truth.soft)
+    right, *others = (truth,) if isinstance(truth, Tensor) else (truth.positives, truth.judged, truth.ignored)
     queries = len(match.index)
     if right.ndim != 2 or len(right) != queries:
         raise InputError(f"the truth is {tuple(right.shape)}; expected ({queries}, R), a row a query")
@@ -185,14 +186,14 @@ def check_truth(match: Match, truth: Tensor | Truth, tolerance: int) -> None:
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
 
 
-def _judged(match: Match, truth: Tensor | Truth, tolerance: int) -> tuple[Match, Truth]:
+def _judged(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> tuple[Match, GroundTruth]:
     """Matches and truth of the queries that the scores count."""
     check_truth(match, truth, tolerance)
     truth = as_truth(truth)
     kept = counted(match.index, truth, tolerance)
     if not kept.any():
         raise InputError(
-            f"of {len(kept)} queries {int(truth.known.sum())} are in the truth and none is left to judge; "
+            f"of {len(kept)} queries {int(truth.judged.sum())} are in the truth and none is left to judge; "
             "expected at least one in the truth that does not report a soft place"
         )
-    return Match(*(column[kept] for column in match)), Truth(*(column[kept] for column in truth))
+    return Match(*(column[kept] for column in match)), GroundTruth(*(column[kept] for column in truth))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dejavu_torch.data.truth import as_truth, counted, is_right
 from dejavu_torch.evaluation.activation import ActivationRates
-from dejavu_torch.types import FrequencyLayer, Match, Plan, PRCurve, Truth
+from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, PRCurve
 
 Plot = tuple[Figure, Any]
 
@@ -87,7 +87,11 @@ def plot_auc(areas: Mapping[str, float]) -> Plot:
 
 
 def plot_coverage(
-    match: Match, truth: Tensor | Truth | None, tolerance: int, places: int, queries: Tensor | None = None
+    match: Match,
+    truth: Tensor | GroundTruth | None,
+    tolerance: int,
+    places: int,
+    queries: Tensor | None = None,
 ) -> Plot:
     """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9).
 
@@ -109,7 +113,7 @@ def plot_coverage(
     else:
         truth = as_truth(truth)
         judged = counted(match.index, truth, tolerance)
-        right = judged & is_right(match.index, truth.right, tolerance)
+        right = judged & is_right(match.index, truth.positives, tolerance)
         wrong = judged & reported & ~right
         dots(reported & ~judged, GREY, f"{(~judged).sum()} not judged")
         dots(wrong, RED, f"{wrong.sum()} wrong")

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from dejavu_torch.data.files import whole_file
-from dejavu_torch.evaluation.curves import Scores, curve_of, judge
+from dejavu_torch.evaluation.curves import Scores, curve_of, evaluate
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.types import Match, Truth
+from dejavu_torch.types import GroundTruth, Match
 
 PICTURES = (
     *("frames", "pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"),
@@ -47,15 +47,15 @@ class Contender(NamedTuple):
 def contend(
     name: str,
     match: Match,
-    truth: Tensor | Truth,
+    truth: Tensor | GroundTruth,
     tolerance: int,
     bytes: int | None = None,
     k: int | None = None,
 ) -> Contender:
-    """Judge matches as one contender; see `judge`."""
+    """Judge matches as one contender; see `evaluate`."""
     recall = curve_of(match, truth, tolerance).recall
     starts = float(recall[0]) if len(recall) else None
-    return Contender(name, judge(match, truth, tolerance), bytes, k, starts)
+    return Contender(name, evaluate(match, truth, tolerance), bytes, k, starts)
 
 
 class Report(NamedTuple):

@@ -15,11 +15,11 @@ from torch import Tensor
 
 import dejavu_torch
 from dejavu_torch.data.files import make_output_folder, whole_file
+from dejavu_torch.database.distance import phase_distances
+from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.evaluation.bench_plot import plot_ratios
 from dejavu_torch.experiments.race import Row, Run, Runner, race
 from dejavu_torch.features.hog import hog
-from dejavu_torch.recognition.distance import phase_distances
-from dejavu_torch.recognition.l1 import l1_backend
 from dejavu_torch.types import InputError
 
 BATCH = 64

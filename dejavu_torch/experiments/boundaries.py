@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.truth import counted, is_right
+from dejavu_torch.database.scores import Matcher
 from dejavu_torch.evaluation.controls import same_settings
 from dejavu_torch.evaluation.report import Contender, contend
 from dejavu_torch.experiments.compare import Comparison
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.scores import Matcher
-from dejavu_torch.types import InputError, Match, Truth
+from dejavu_torch.types import GroundTruth, InputError, Match
 
 
 class GivenChunks(SpectrogramAnalysis):
@@ -61,7 +61,7 @@ class BoundaryEffect(NamedTuple):
 
 
 def boundary_effect(
-    match: Match, truth: Truth, cuts: Sequence[int], tolerance: int, near: int = 32
+    match: Match, truth: GroundTruth, cuts: Sequence[int], tolerance: int, near: int = 32
 ) -> BoundaryEffect:
     """Recall@1 near to the cuts and far from them.
 
@@ -73,10 +73,10 @@ def boundary_effect(
     """
     if not cuts:
         raise InputError("there are no cuts; expected at least one frame at which something starts or stops")
-    answered = counted(match.index, truth, tolerance) & (truth.right >= 0).any(1)
-    right = is_right(match.index, truth.right, tolerance)
-    apart = (truth.right[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
-    close = torch.where(truth.right >= 0, apart, torch.iinfo(torch.int64).max).amin(1) <= near
+    answered = counted(match.index, truth, tolerance) & (truth.positives >= 0).any(1)
+    right = is_right(match.index, truth.positives, tolerance)
+    apart = (truth.positives[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
+    close = torch.where(truth.positives >= 0, apart, torch.iinfo(torch.int64).max).amin(1) <= near
 
     def recall(which: Tensor) -> float | None:
         return float(right[which].double().mean()) if which.any() else None

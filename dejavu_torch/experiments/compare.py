@@ -15,11 +15,12 @@ from torch import Tensor
 import dejavu_torch
 from dejavu_torch.data.truth import Shown, as_truth, counted, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
+from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.evaluation.controls import leave_out_match
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
+    count_queries,
     curve_of,
-    tally,
     threshold_of_full_precision,
 )
 from dejavu_torch.evaluation.plots import Picture
@@ -28,13 +29,12 @@ from dejavu_torch.evaluation.route_plots import plot_ground, plot_velocity
 from dejavu_torch.experiments.others import Other, hog_others, others_of
 from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
-from dejavu_torch.features.ground import ground_patch
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.spacing import EvenlySpaced
 from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.ground_plane import ground_patch
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.stft import BACKEND
-from dejavu_torch.recognition.l1 import l1_backend
-from dejavu_torch.types import InputError, Match, Traverse, Truth
+from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -53,7 +53,7 @@ class Comparison(NamedTuple):
     pictures: Mapping[str, Picture]
     stored: Tensor
     seen: Tensor
-    truth: Truth | None
+    truth: GroundTruth | None
     reference: Traverse
     query: Traverse
     shown: Shown | None
@@ -102,10 +102,10 @@ def compare(
     came, shown, clock = (reference, query), None, Clock()
     with clock("learn"):
         reference = model.evenly(reference, None if learn else model.step, progress)
-    if isinstance(reference, EvenlySpaced):
+    if isinstance(reference, ResampledTraverse):
         with clock("localize"):
             query = model.evenly(query, reference.step, progress)
-        frame = query.frame if isinstance(query, EvenlySpaced) else None
+        frame = query.frame if isinstance(query, ResampledTraverse) else None
         shown = Shown(frame, reference.frame, reference.place_of, came[1].length)
     early = reference.length is not None and query.length is not None
     if early:  # a truth that does not fit is told before the long work
@@ -178,20 +178,20 @@ def compare(
         "version": dejavu_torch.__version__,
         "torch": torch.__version__,
     }
-    if isinstance(reference, EvenlySpaced):
+    if isinstance(reference, ResampledTraverse):
         facts["spacing"] = {
             "step": reference.step,
             "reference_frames": len(reference.way),
-            "query_frames": len(query.way) if isinstance(query, EvenlySpaced) else None,
+            "query_frames": len(query.way) if isinstance(query, ResampledTraverse) else None,
         }
     if known is not None:
         positions = reference.place is not None and query.place is not None
-        facts |= tally(match, known, tolerance)
+        facts |= count_queries(match, known, tolerance)
         facts["truth"] = describe_truth(truth, interpolate, positions, spaced=shown is not None)
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
     ours = _judged("this map", match, known, tolerance, size)
     pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, others)
-    if isinstance(reference, EvenlySpaced):
+    if isinstance(reference, ResampledTraverse):
         motion = {"ground": _ground(reference), "velocity": _velocity(reference, query)}
         pictures = motion | pictures
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
@@ -215,7 +215,7 @@ class Clock:
 def _judged(
     name: str,
     match: Match,
-    truth: Truth | None,
+    truth: GroundTruth | None,
     tolerance: int,
     bytes: int | None = None,
     k: int | None = None,
@@ -226,7 +226,7 @@ def _judged(
     return contend(name, match, truth, tolerance, bytes, k)
 
 
-def _ground(reference: EvenlySpaced) -> Picture:
+def _ground(reference: ResampledTraverse) -> Picture:
     velocity, place = reference.normalizer, reference.length // 2
     frame = next(reference.between(place, place + 1)).cpu()
     corners = velocity.corners
@@ -238,9 +238,11 @@ def _ground(reference: EvenlySpaced) -> Picture:
     )
 
 
-def _velocity(reference: EvenlySpaced, query: Traverse) -> Picture:
+def _velocity(reference: ResampledTraverse, query: Traverse) -> Picture:
     pair = [("reference", reference), ("query", query)]
-    ways = {f"{role}: {one.name}": one.way * one.step for role, one in pair if isinstance(one, EvenlySpaced)}
+    ways = {
+        f"{role}: {one.name}": one.way * one.step for role, one in pair if isinstance(one, ResampledTraverse)
+    }
     return Picture(
         plot_velocity(ways, reference.step),
         "how fast the ground moves",

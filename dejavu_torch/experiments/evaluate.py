@@ -16,14 +16,14 @@ from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import read_compressed
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
+    count_queries,
     curve_of,
-    tally,
     threshold_of_full_precision,
 )
 from dejavu_torch.evaluation.matches import read_matches
 from dejavu_torch.evaluation.plots import Picture, plot_coverage, plot_curves
 from dejavu_torch.evaluation.report import Report, contend
-from dejavu_torch.types import InputError, Match, Traverse, Truth
+from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 
 class Evaluation(NamedTuple):
@@ -32,11 +32,11 @@ class Evaluation(NamedTuple):
     report: Report
     queries: Tensor
     match: Match
-    truth: Truth
+    truth: GroundTruth
     pictures: Mapping[str, Picture]
 
 
-def evaluate(
+def evaluate_file(
     matches: Path,
     truth: str | None,
     tolerance: int = 5,
@@ -82,7 +82,7 @@ def evaluate(
     known = find_truth(truth, reference, query, places, queries, interpolate, shown)
     if known is None:
         raise InputError("there is no truth; expected one, or two traverses that carry their positions")
-    counts = tally(match, known, tolerance)
+    counts = count_queries(match, known, tolerance)
     curve = curve_of(match, known, tolerance)
     facts = counts | {
         "accepted_precision": counts["accepted_right"] / counts["accepted"] if counts["accepted"] else None,
@@ -97,7 +97,7 @@ def evaluate(
         "torch": torch.__version__,
     }
     ours = contend(matches.name, match, known, tolerance)
-    seen = 1 + max(int(table.max()) for table in (match.index, known.right))
+    seen = 1 + max(int(table.max()) for table in (match.index, known.positives))
     pictures = {
         "pr": Picture(
             plot_curves({matches.name: curve}, f"right within {tolerance} places"),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.truth import counted
+from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.evaluation.activation import activation_rates
 from dejavu_torch.evaluation.curves import area, curve_of
 from dejavu_torch.evaluation.feature_plots import plot_features, plot_spectrogram, plot_templates
@@ -24,8 +25,7 @@ from dejavu_torch.features.extract import frame_shape
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.distance import phase_distances
-from dejavu_torch.types import FrequencyLayer, Match, Plan, Traverse, Truth
+from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Traverse
 
 CANDIDATES = 16  # features of a layer that are looked at closely
 DISTANCES_AT_ONCE = 2**22  # numbers of Q x P held at a time
@@ -37,7 +37,7 @@ def draw_pictures(
     stored: Tensor,
     seen: Tensor,
     match: Match,
-    truth: Truth | None,
+    truth: GroundTruth | None,
     tolerance: int,
     others: Mapping[str, Other],
 ) -> dict[str, Picture]:
@@ -190,7 +190,7 @@ def draw_features(model: DejaVu, reference: Traverse, stored: Tensor) -> dict[st
 
 
 def draw_activations(
-    model: DejaVu, reference: Traverse, seen: Tensor, match: Match, truth: Truth | None, tolerance: int
+    model: DejaVu, reference: Traverse, seen: Tensor, match: Match, truth: GroundTruth | None, tolerance: int
 ) -> dict[str, Picture]:
     """Two layers of one chunk answering one query, and their fusion; nothing where no chunk has two layers.
 
@@ -206,7 +206,7 @@ def draw_activations(
     query, places = len(seen) // 2, []
     rates = None
     if truth is not None:
-        right = torch.where(truth.known[:, None], truth.right, -1)
+        right = torch.where(truth.judged[:, None], truth.positives, -1)
         apart = torch.where(right >= 0, (right - (start + stop) / 2).abs(), torch.inf).amin(1)
         query = int(apart.argmin())
         places = [place for place in right[query].tolist() if start <= place < stop]

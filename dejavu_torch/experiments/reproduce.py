@@ -9,8 +9,9 @@ from torch import Tensor
 
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import places_of_frames
+from dejavu_torch.database.scores import Matcher
 from dejavu_torch.evaluation.controls import leave_out_match, same_settings
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report, contend
 from dejavu_torch.evaluation.route_plots import (
@@ -23,11 +24,10 @@ from dejavu_torch.experiments.boundaries import known_boundaries
 from dejavu_torch.experiments.compare import Comparison, compare
 from dejavu_torch.experiments.pictures import best_explained, leading_layers
 from dejavu_torch.experiments.section_five import PUBLISHED
-from dejavu_torch.features.spacing import EvenlySpaced
-from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.scores import Matcher
 from dejavu_torch.types import InputError, Traverse
 
 LENGTHS = (256, 512, 1024, 2048)
@@ -45,7 +45,7 @@ def paper_model(reference: Traverse | None = None) -> DejaVu:
     """
     periods = SpectrogramAnalysis(min_period=8, peaks="bins", false_alarm=None, short="refuse")
     ground = getattr(reference, "ground", None)
-    velocity = None if ground is None else VelocityNormalizer(ground, PATCH)
+    velocity = None if ground is None else GroundOdometry(ground, PATCH)
     return DejaVu(periods=periods, reduction="sum", velocity=velocity)
 
 
@@ -109,7 +109,7 @@ def reproduce(
         "published": PUBLISHED[dataset]._asdict(),
         "chunk_lengths": [row._asdict() for row in found],
     }
-    if isinstance(result.reference, EvenlySpaced) and isinstance(result.query, EvenlySpaced):
+    if isinstance(result.reference, ResampledTraverse) and isinstance(result.query, ResampledTraverse):
         shares = {"reference": way_share(result.reference), "query": way_share(result.query)}
         facts["way_measured"] = shares
     cuts = structure_places(result, structure_cuts(reference))
@@ -149,7 +149,7 @@ def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int]
             size, found = other.map_bytes, []
             for reduction in (model.matcher.reduction, "mean"):
                 other.matcher = Matcher(model.matcher.metric, reduction)
-                found.append(judge(other.localize(result.seen), result.truth, tolerance))
+                found.append(evaluate(other.localize(result.seen), result.truth, tolerance))
             scores = found[0].recall_at_1, found[0].auc, found[1].recall_at_1
             rows.append(Length(window, *scores, size, size / len(stored)))
     return rows
@@ -171,7 +171,7 @@ def structure_cuts(reference: Traverse) -> list[int]:
     )
 
 
-def way_share(even: EvenlySpaced) -> float | None:
+def way_share(even: ResampledTraverse) -> float | None:
     """How far the ground says that a simulated train came, as a share of how far it did; None elsewhere."""
     span, metres = (getattr(even.traverse, name, None) for name in ("ground_span", "distance"))
     if span is None or metres is None:
@@ -192,7 +192,7 @@ def _frames(result: Comparison) -> dict[str, Picture]:
     """Frames of both traverses at the same places."""
     if result.truth is None:
         return {}
-    right, places, queries = result.truth.right, [], []
+    right, places, queries = result.truth.positives, [], []
     for k in range(EXAMPLES):
         apart = (right - len(result.stored) * (k + 0.5) / EXAMPLES).abs()
         queries.append(int(torch.where(right >= 0, apart, torch.inf).amin(1).argmin()))

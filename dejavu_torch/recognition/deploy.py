@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.database.compressed import CompressedMap
-from dejavu_torch.recognition.distance import phase_distances
-from dejavu_torch.recognition.scores import Matcher, log_posterior, segments, weight_per_feature
+from dejavu_torch.database.distance import phase_distances
+from dejavu_torch.database.scores import Matcher, log_posterior, segments, weight_per_feature
 from dejavu_torch.types import InputError
 
 

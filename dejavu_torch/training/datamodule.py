@@ -12,10 +12,10 @@ from torch.utils.data import DataLoader
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import Shown, as_truth
 from dejavu_torch.data.truthfile import find_truth
-from dejavu_torch.features.spacing import EvenlySpaced
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.model import DejaVu
-from dejavu_torch.training.augment import Augmentation
+from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.training.frames import Batch, Clips, StoredFrames, store
 from dejavu_torch.types import InputError, Traverse
 
@@ -40,7 +40,7 @@ class RouteData(LightningDataModule):
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
 
-    Convention: frames are kept as bytes; what exceeds `gather`'s share of memory lies in a temporary file.
+    Convention: frames are kept as bytes; beyond `concatenate`'s share of memory they lie in a file.
 
     Raises:
         InputError: a traverse that cannot be read, no longer than the tolerance, without known places, or of
@@ -61,7 +61,7 @@ class RouteData(LightningDataModule):
         clip: int = 1,
         resize: tuple[int, int] | None = None,
         augmentation: Augmentation | None = None,
-        velocity: VelocityNormalizer | None = None,
+        velocity: GroundOdometry | None = None,
     ) -> None:
         super().__init__()
         if tolerance < 0 or clip < 1 or batch_size < 2 or batch_size % clip:
@@ -106,7 +106,7 @@ class RouteData(LightningDataModule):
     def _read(self, name: str) -> StoredFrames:
         source, truth = self.others[name]
         raw, reference = _open(source), self.sets["reference"]
-        step = self.reference.step if isinstance(self.reference, EvenlySpaced) else None
+        step = self.reference.step if isinstance(self.reference, ResampledTraverse) else None
         traverse = self._evenly(raw, step)
         values = store(traverse, self.resize)
         self._check_length(traverse.name, len(values))
@@ -117,8 +117,8 @@ class RouteData(LightningDataModule):
                 "as data.resize makes"
             )
         shown = None
-        if isinstance(self.reference, EvenlySpaced):
-            frame = traverse.frame if isinstance(traverse, EvenlySpaced) else None
+        if isinstance(self.reference, ResampledTraverse):
+            frame = traverse.frame if isinstance(traverse, ResampledTraverse) else None
             shown = Shown(frame, self.reference.frame, self.reference.place_of, raw.length)
         known = find_truth(truth, self.raw, raw, len(reference), len(values), shown=shown)
         if known is None:
@@ -145,7 +145,7 @@ class RouteData(LightningDataModule):
         lengths = [len(part) for part in parts]
         if max(lengths) < self.clip:
             raise InputError(f"clip is {self.clip} and the route has {max(lengths)} frames; expected fewer")
-        rights = [part.truth.right for part in parts]
+        rights = [part.truth.positives for part in parts]
         width = max(right.shape[1] for right in rights)
         pad = torch.nn.functional.pad
         right = torch.cat([pad(right, (0, width - right.shape[1]), value=-1) for right in rights])
@@ -174,7 +174,7 @@ class RouteData(LightningDataModule):
             )
         if (self.trainer.validating or self.trainer.sanity_checking) and "validation" not in self.sets:
             with torch.random.fork_rng():
-                torch.manual_seed(int(batch.truth.right[0, 0]))
+                torch.manual_seed(int(batch.truth.positives[0, 0]))
                 return batch._replace(frames=self.augmented(batch.frames, 1))
         return batch
 

@@ -10,10 +10,10 @@ import torch
 from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
 from torch import Tensor, nn
 
+from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.features.coder import Coder, to_length
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.recognition.distance import phase_distances
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.frames import StoredFrames
 from dejavu_torch.training.freeze import freeze
@@ -122,12 +122,12 @@ class DescriptorStage(nn.Module):
             most = NUMBERS // (len(self._coder.mean) * len(cast(StoredFrames, loader.dataset)))
             for _ in range(max(1, min(VIEWS, most)) if data.augmentation.acts else 1):
                 for batch in loader:
-                    known = batch.truth.right[:, 0] >= 0
+                    known = batch.truth.positives[:, 0] >= 0
                     if not known.any():
                         continue
                     frames = data.augmented(batch.frames.to(device), data.clip)[known]
                     views.append(describe(frames).float())
-                    right.append(batch.truth.right[known].to(device))
+                    right.append(batch.truth.positives[known].to(device))
             self.views, self.right = torch.cat(views), torch.cat(right)
             if self.lacking:
                 values, name = data.sets["reference"].values, data.reference.name

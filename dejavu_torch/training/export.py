@@ -9,7 +9,7 @@ import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 
-from dejavu_torch.database.certificate import Certificate
+from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 log = logging.getLogger("dejavu_torch")
@@ -25,7 +25,7 @@ class MapExport(Callback):
     def __init__(self, name: str = "map.safetensors") -> None:
         self.name = name
         self.began: int | None = None
-        self.written: tuple[Path, Certificate] | None = None
+        self.written: tuple[Path, MapSummary] | None = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """The step that a checkpoint brought."""

@@ -10,8 +10,8 @@ from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from dejavu_torch.features.gather import gather
-from dejavu_torch.types import InputError, Traverse, Truth
+from dejavu_torch.features.memory import concatenate
+from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 READ_AT_ONCE = 64
 
@@ -20,20 +20,20 @@ class Batch(NamedTuple):
     """frames: (B,C,H,W) or features (B,D). truth: their right places; rows of nothing known are -1."""
 
     frames: Tensor
-    truth: Truth
+    truth: GroundTruth
 
 
 class StoredFrames(Dataset[Batch]):
-    """Frames as bytes, which may lie in a temporary file (see `gather`), with their right places.
+    """Frames as bytes, which may lie in a temporary file (see `concatenate`), with their right places.
 
     Args:
         values: frames (n,C,H,W) uint8, or features (n,D) float. more: further ones behind them.
         truth: of all of them.
     """
 
-    def __init__(self, values: Tensor, truth: Truth, *more: Tensor) -> None:
+    def __init__(self, values: Tensor, truth: GroundTruth, *more: Tensor) -> None:
         self.values, self.more = values, more
-        self.truth = truth._replace(right=truth.right.masked_fill(~truth.known[:, None], -1))
+        self.truth = truth._replace(positives=truth.positives.masked_fill(~truth.judged[:, None], -1))
 
     def __len__(self) -> int:
         return len(self.values) + sum(len(part) for part in self.more)
@@ -45,7 +45,7 @@ class StoredFrames(Dataset[Batch]):
             here = (frames >= first) & (frames < first + len(part))
             chosen[here] = part[frames[here] - first]
             first += len(part)
-        return Batch(as_frames(chosen), Truth(*(part[index] for part in self.truth)))
+        return Batch(as_frames(chosen), GroundTruth(*(part[index] for part in self.truth)))
 
 
 class Clips(Sampler[list[int]]):
@@ -95,7 +95,7 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
                 raise InputError(f"{traverse.name} holds NaN or infinite values; expected finite numbers")
             yield (batch if batch.ndim == 2 else (batch * 255).round().clamp(0, 255).byte().flatten(1)).cpu()
 
-    values = gather(rows())
+    values = concatenate(rows())
     return values.view(len(values), *shape)
 
 

@@ -16,7 +16,7 @@ from dejavu_torch.types import InputError
 
 
 class Judged(pl.LightningModule):
-    """Localizes the frames of its data module, and logs what `judge` says."""
+    """Localizes the frames of its data module, and logs what `evaluate` says."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class Judged(pl.LightningModule):
         self.validation_step(batch, batch_idx)
 
     def on_validation_epoch_end(self) -> None:
-        """Log what `judge` says."""
+        """Log what `evaluate` says."""
         assert self.metric is not None
         figures = cast(dict[str, Tensor], self.metric.compute())
         self.metric.reset()

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.recognition.distance import Metric, phase_distances
-from dejavu_torch.recognition.scores import weight_per_feature
+from dejavu_torch.database.distance import Metric, phase_distances
+from dejavu_torch.database.scores import weight_per_feature
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 

@@ -1,4 +1,4 @@
-"""Place recognition as a metric of torchmetrics: `judge` over all the batches of an epoch."""
+"""Place recognition as a metric of torchmetrics: `evaluate` over all the batches of an epoch."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from dejavu_torch.data.truth import as_truth, counted, is_right
-from dejavu_torch.evaluation.curves import Scores, check_truth, judge
-from dejavu_torch.types import InputError, Match, Truth
+from dejavu_torch.evaluation.curves import Scores, check_truth, evaluate
+from dejavu_torch.types import GroundTruth, InputError, Match
 
 
 class PlaceRecognition(Metric):
-    """What `judge` says of all queries of an epoch, whatever the batches and processes (section IV-C).
+    """What `evaluate` says of all queries of an epoch, whatever the batches and processes (section IV-C).
 
     Args:
         tolerance: in the unit of the places (frames, or evenly spaced places), inclusive.
         figure: the one figure to compute, a field of `Scores` such as "auc", as `trainer.log` wants it; None
             computes all.
 
-    Shape: update(match of (Q,), truth (Q,R) int64 with -1 as padding, or a `Truth`); R may differ from
+    Shape: update(match of (Q,), truth (Q,R) int64 with -1 as padding, or a `GroundTruth`); R may differ from
         batch to batch. compute() -> float64 scalars: a dict, or the one of `figure`.
 
-    Convention: a query that `judge` leaves out (nothing known, or a soft place reported) is left out here.
+    Convention: a query that `evaluate` leaves out (nothing known, or a soft place reported) is left out here.
         Where none is left, before the first update for example, every figure is NaN: nothing was measured.
         Three numbers are kept of each query, on the device of the metric.
 
@@ -65,13 +65,15 @@ class PlaceRecognition(Metric):
         for state in ("score", "found", "right"):
             self.add_state(state, [], dist_reduce_fx="cat")
 
-    def update(self, match: Match, truth: Tensor | Truth) -> None:
+    def update(self, match: Match, truth: Tensor | GroundTruth) -> None:
         """Add the queries of a batch."""
         _check_match(match)
         check_truth(match, truth, self.tolerance)
         index, score = match.index.cpu(), match.score.detach().cpu()
-        truth = as_truth(truth.cpu() if isinstance(truth, Tensor) else Truth(*(part.cpu() for part in truth)))
-        good, answerable = is_right(index, truth.right, self.tolerance), (truth.right >= 0).any(1)
+        truth = as_truth(
+            truth.cpu() if isinstance(truth, Tensor) else GroundTruth(*(part.cpu() for part in truth))
+        )
+        good, answerable = is_right(index, truth.positives, self.tolerance), (truth.positives >= 0).any(1)
         kept = counted(index, truth, self.tolerance)
         # the same queries in a world of two places: what is reported is place 0, and it or place 1 is right
         rows = torch.stack([score, (index >= 0).double() - 1, torch.where(answerable, (~good).double(), -1)])
@@ -87,7 +89,7 @@ class PlaceRecognition(Metric):
         )
         if len(score):
             match = Match(found.long(), score, found >= 0)
-            figures = judge(match, right.long()[:, None], tolerance=0)
+            figures = evaluate(match, right.long()[:, None], tolerance=0)
         values = torch.tensor(figures, dtype=torch.float64, device=self.device)
         named = dict(zip(Scores._fields, values, strict=True))
         return named if self.figure is None else named[self.figure]

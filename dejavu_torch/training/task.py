@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from dejavu_torch.database.compressed import CompressedMap
+from dejavu_torch.database.scores import Reduction, combine_layers, log_posterior
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
@@ -21,7 +22,6 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
-from dejavu_torch.recognition.scores import Reduction, combine_layers, log_posterior
 from dejavu_torch.training.checkpoint import check_trained, stored_map
 from dejavu_torch.training.descriptor import DescriptorStage, start_over
 from dejavu_torch.training.frames import Batch
@@ -184,7 +184,7 @@ class PlaceRecognitionTask(Judged):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
-        right, tolerance, route = batch.truth.right, self.data.tolerance, self.dejavu.map
+        right, tolerance, route = batch.truth.positives, self.data.tolerance, self.dejavu.map
         if self.descriptor.learning:
             frames = self.dejavu.preprocess(batch.frames)
             total, parts, left_out = self.descriptor.losses(frames, right, tolerance, route.places)

@@ -24,7 +24,7 @@ from dejavu_torch.data.simulate.sheets import Thing, View
 from dejavu_torch.data.simulate.train import Railway
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import position_truth
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError
 
 KINDS = [Outdoor, Underground]
@@ -356,7 +356,7 @@ def test_the_ground_is_a_strip_beside_the_sleepers(kind: type[Railway], height: 
 def test_the_ground_moves_as_the_train_does(kind: type[Railway], traverse: int) -> None:
     train, start, stop = ride_of(kind, traverse), 600, 900
     frames = frames_at(train, torch.arange(start, stop))
-    shift, confidence = VelocityNormalizer(train.ground, (32, 32))(frames)
+    shift, confidence = GroundOdometry(train.ground, (32, 32))(frames)
     metres = float(shift.sum()) * train.ground_span / 31
     assert metres == pytest.approx(float(train.distance[stop - 1] - train.distance[start]), rel=0.06)
     assert confidence.median() > 0.6

@@ -18,7 +18,7 @@ from dejavu_torch.data.truth import (
     padded,
     position_truth,
 )
-from dejavu_torch.types import Truth
+from dejavu_torch.types import GroundTruth
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
 
@@ -118,9 +118,9 @@ def test_near_needs_no_table_of_all_pairs(largest_tensor: type) -> None:
 def test_a_tensor_of_places_is_a_truth_in_which_all_is_known() -> None:
     right = torch.tensor([[0, 1], [-1, -1]])
     truth = as_truth(right)
-    assert torch.equal(truth.right, right)
-    assert truth.known.tolist() == [True, True]
-    assert truth.soft.shape == (2, 0)
+    assert torch.equal(truth.positives, right)
+    assert truth.judged.tolist() == [True, True]
+    assert truth.ignored.shape == (2, 0)
     assert as_truth(truth) is truth
 
 
@@ -128,6 +128,6 @@ def test_a_soft_place_counts_neither_way_and_an_unknown_query_never() -> None:
     """Right, wrong, soft, silent, soft but right by the tolerance, not known, not known though right."""
     index = torch.tensor([10, 30, 20, -1, 11, 30, 10])
     known = torch.tensor([True] * 5 + [False] * 2)
-    truth = Truth(torch.full((7, 1), 10), known, torch.tensor([[20, 11]] * 7))
+    truth = GroundTruth(torch.full((7, 1), 10), known, torch.tensor([[20, 11]] * 7))
     assert counted(index, truth, 1).tolist() == [True, True, False, True, True, False, False]
     assert counted(index, truth, 0).tolist() == [True, True, False, True, False, False, False]

@@ -19,7 +19,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.truth import is_right
 from dejavu_torch.data.truthfile import check_truth_text, find_truth, read_truth
-from dejavu_torch.types import InputError, Traverse, Truth
+from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 
 def route(length: int, place: list[float] | None = None) -> Traverse:
@@ -59,9 +59,9 @@ def test_what_a_command_was_given_or_can_know(
 ) -> None:
     found = find_truth(truth, reference, query, reference.length, query.length or 0)
     assert found is not None
-    assert found.right[:, 0].tolist() == expected
-    assert found.known.all()
-    assert found.soft.shape == (query.length, 0)
+    assert found.positives[:, 0].tolist() == expected
+    assert found.judged.all()
+    assert found.ignored.shape == (query.length, 0)
 
 
 def test_without_a_truth_other_lengths_or_missing_traverses_give_none() -> None:
@@ -77,7 +77,7 @@ def test_numbered_queries_get_their_own_rows() -> None:
     by_length = find_truth(None, route(4), route(4), 4, numbers)
     for found, expected in ((by_offset, [5, 2]), (by_position, [1, 2]), (by_length, [3, 0])):
         assert found is not None
-        assert found.right[:, 0].tolist() == expected
+        assert found.positives[:, 0].tolist() == expected
     with refused("query 3", "below 3"):
         find_truth(None, route(3, [0, 1, 2]), route(3, [0, 1, 2]), 3, numbers)
 
@@ -87,7 +87,7 @@ def test_an_offset_without_any_right_answer_is_refused() -> None:
         read_truth("9", 5, 4)
     with refused("truth -9", "from -8"):
         read_truth("-9", None, torch.tensor([2, 8]))
-    assert read_truth("-8", None, torch.tensor([2, 8])).right.tolist() == [[-1], [0]]
+    assert read_truth("-8", None, torch.tensor([2, 8])).positives.tolist() == [[-1], [0]]
 
 
 # any text
@@ -134,9 +134,9 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_csv_by_hand(tmp_path: Path) -> None:
     truth = read_truth(written(tmp_path, TABLE), 8, 7)
-    assert sets(truth.right) == [{4}, set(), {1, 7}, set(), set(), set(), set()]
-    assert truth.known.tolist() == [True, False, True, True, False, True, False]
-    assert truth.soft.shape == (7, 0)
+    assert sets(truth.positives) == [{4}, set(), {1, 7}, set(), set(), set(), set()]
+    assert truth.judged.tolist() == [True, False, True, True, False, True, False]
+    assert truth.ignored.shape == (7, 0)
 
 
 @given(LISTED, st.booleans(), st.lists(st.integers(0, 20), min_size=1, max_size=9, unique=True))
@@ -151,9 +151,9 @@ def test_csv_holds_what_was_written(
             read_truth(path, 10, torch.tensor(numbers))
         return
     truth = read_truth(path, 10, torch.tensor(numbers))
-    assert sets(truth.right) == wanted
-    assert truth.known.tolist() == [query in listed for query in numbers]
-    assert truth.right.shape[1] == max(len(listed.get(query, [])) for query in numbers)
+    assert sets(truth.positives) == wanted
+    assert truth.judged.tolist() == [query in listed for query in numbers]
+    assert truth.positives.shape[1] == max(len(listed.get(query, [])) for query in numbers)
 
 
 @pytest.mark.parametrize(
@@ -177,8 +177,8 @@ def test_csv_holds_what_was_written(
 def test_csv_is_read_leniently(tmp_path: Path, text: str | bytes) -> None:
     expected = read_truth(written(tmp_path, TABLE), 8, 7)
     truth = read_truth(written(tmp_path, text), 8, 7)
-    assert sets(truth.right) == sets(expected.right)
-    assert truth.known.tolist() == expected.known.tolist()
+    assert sets(truth.positives) == sets(expected.positives)
+    assert truth.judged.tolist() == expected.judged.tolist()
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_a_csv_that_is_none_is_refused(tmp_path: Path, text: str | bytes, words:
 
 
 def test_places_are_not_bounded_where_the_map_is_not_known(tmp_path: Path) -> None:
-    assert read_truth(written(tmp_path, "0,100000"), None, 1).right.tolist() == [[100000]]
+    assert read_truth(written(tmp_path, "0,100000"), None, 1).positives.tolist() == [[100000]]
     with refused("place -3", "from 0,"):
         read_truth(written(tmp_path, "0,-3"), None, 1)
 
@@ -230,19 +230,19 @@ def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
     expected: dict[int, float] = dict(listed)
     for a, b in pairwise(sorted(listed)):
         expected |= {q: listed[a] + (listed[b] - listed[a]) * (q - a) / (b - a) for q in range(a, b)}
-    assert truth.known.tolist() == [query in expected for query in range(34)]
-    for query, found in enumerate(sets(truth.right)):
+    assert truth.judged.tolist() == [query in expected for query in range(34)]
+    for query, found in enumerate(sets(truth.positives)):
         assert len(found) == (query in expected)
         assert all(abs(place - expected[query]) <= 0.5 + 1e-9 for place in found)
-    assert all(sets(truth.right)[query] == {place} for query, place in listed.items())
+    assert all(sets(truth.positives)[query] == {place} for query, place in listed.items())
 
 
 def test_interpolation_by_hand(tmp_path: Path) -> None:
     path = written(tmp_path, "1,10\n5,12.4\n6,0\n")
     truth = read_truth(path, 20, 8, interpolate=True)
-    assert truth.right[:, 0].tolist() == [-1, 10, 11, 11, 12, 12, 0, -1]
+    assert truth.positives[:, 0].tolist() == [-1, 10, 11, 11, 12, 12, 0, -1]
     some = read_truth(path, 20, torch.tensor([5, 2]), interpolate=True)
-    assert some.right[:, 0].tolist() == [12, 11]
+    assert some.positives[:, 0].tolist() == [12, 11]
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ def test_a_csv_that_cannot_be_interpolated_is_refused(
 
 
 def test_convention_5_the_tolerance_applies_on_top_of_listed_places(tmp_path: Path) -> None:
-    right = read_truth(written(tmp_path, "0,3,4\n1,3,4\n2,3,4\n3,3,4"), None, 4).right
+    right = read_truth(written(tmp_path, "0,3,4\n1,3,4\n2,3,4\n3,3,4"), None, 4).positives
     index = torch.tensor([1, 2, 4, 5])
     assert is_right(index, right, 0).tolist() == [False, False, True, False]
     assert is_right(index, right, 1).tolist() == [False, True, True, True]
@@ -299,21 +299,23 @@ def test_npz_rows_are_places_and_columns_queries(scratch: Path, cells: list[list
             read_truth(path, places, queries)
         return
     truth = read_truth(path, places, queries)
-    assert sets(truth.right) == [{i for i in range(places) if hard[i, q]} for q in range(queries)]
+    assert sets(truth.positives) == [{i for i in range(places) if hard[i, q]} for q in range(queries)]
     # what is right is not soft
-    assert sets(truth.soft) == [{i for i in range(places) if cells[i][q] == "soft"} for q in range(queries)]
-    assert truth.known.all()
+    assert sets(truth.ignored) == [
+        {i for i in range(places) if cells[i][q] == "soft"} for q in range(queries)
+    ]
+    assert truth.judged.all()
     turned = read_truth(path, places, torch.arange(queries).flip(0))
-    assert sets(turned.right) == sets(truth.right)[::-1]
-    assert sets(turned.soft) == sets(truth.soft)[::-1]
+    assert sets(turned.positives) == sets(truth.positives)[::-1]
+    assert sets(turned.ignored) == sets(truth.ignored)[::-1]
 
 
 def test_npz_with_one_matrix_only(tmp_path: Path) -> None:
     matrix = np.array([[True, False], [True, False], [False, True]])
     for name in ("GThard", "GTsoft"):
         truth = read_truth(saved(tmp_path, **{name: matrix}), 3, 2)
-        assert sets(truth.right) == [{0, 1}, {2}]
-        assert truth.soft.shape == (2, 0)
+        assert sets(truth.positives) == [{0, 1}, {2}]
+        assert truth.ignored.shape == (2, 0)
 
 
 @pytest.mark.parametrize(
@@ -345,7 +347,7 @@ def test_only_what_fits_transposed_is_called_so(tmp_path: Path) -> None:
 
 def test_some_queries_of_a_larger_matrix(tmp_path: Path) -> None:
     path = saved(tmp_path, GThard=np.eye(4, 9, dtype=bool))
-    assert sets(read_truth(path, None, torch.tensor([6, 1, 2])).right) == [set(), {1}, {2}]
+    assert sets(read_truth(path, None, torch.tensor([6, 1, 2])).positives) == [set(), {1}, {2}]
 
 
 def test_other_npz_files_are_refused(tmp_path: Path) -> None:
@@ -387,11 +389,11 @@ def test_utm_makes_every_reference_frame_near_by_right(tmp_path: Path) -> None:
     for text in ("utm", "utm:25"):
         truth = find_truth(text, reference, query, 8, 3)
         assert truth is not None
-        assert sets(truth.right) == expected
-        assert truth.known.all()
+        assert sets(truth.positives) == expected
+        assert truth.judged.all()
     near = find_truth("utm:10", reference, query, 8, torch.tensor([2, 0]))
     assert near is not None
-    assert sets(near.right) == [set(), {2, 3, 4}]
+    assert sets(near.positives) == [set(), {2, 3, 4}]
     with refused("no query has a right answer", "within 1 m"):
         find_truth("utm:1", reference, query, 8, torch.tensor([2, 1]))
 
@@ -418,9 +420,9 @@ def test_utm_needs_two_folders_of_images_with_coordinates(tmp_path: Path) -> Non
 
 def test_the_corridor_truth(data_dir: Path) -> None:
     truth = read_truth(str(data_dir / "corridor" / "truth.csv"), 111, 111)
-    assert isinstance(truth, Truth)
-    assert truth.known.all()
-    found = sets(truth.right)
+    assert isinstance(truth, GroundTruth)
+    assert truth.judged.all()
+    found = sets(truth.positives)
     assert found[0] == {0, 1, 2}
     assert found[110] == {108, 109, 110}
     assert all(found)

@@ -23,8 +23,8 @@ from dejavu_torch.database.mapfile import build_parts, part_recipes, read_compre
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.velocity import VelocityNormalizer
 from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, Training
 
@@ -341,7 +341,7 @@ def test_a_map_that_is_half_evenly_spaced_is_refused(
     saved: Path, tensors: dict[str, Tensor], config: dict[str, Any]
 ) -> None:
     if "velocity" in config:
-        config = config | {"velocity": recipe_of(VelocityNormalizer())._asdict()}
+        config = config | {"velocity": recipe_of(GroundOdometry())._asdict()}
     craft(saved, tensors, **config)
     with refused(str(saved), "step", "frames"):
         DejaVu.load(saved)

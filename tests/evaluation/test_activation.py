@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dejavu_torch.data.truth import as_truth
 from dejavu_torch.evaluation.activation import Rate, activation_rates, in_phase
-from dejavu_torch.types import FrequencyLayer, Truth
+from dejavu_torch.types import FrequencyLayer, GroundTruth
 
 
 def layer(period: Fraction | int, phases: int, start: int = 0, stop: int = 40) -> FrequencyLayer:
@@ -47,14 +47,14 @@ def test_a_layer_that_covers_the_route_has_no_outside() -> None:
 
 def test_unknown_queries_and_those_without_an_answer_do_not_count() -> None:
     right = torch.tensor([[3], [13], [-1]])
-    truth = Truth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))
+    truth = GroundTruth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))
     wrong = torch.tensor([8, 3, 3])
     rates = activation_rates([layer(10, 10)], [wrong], wrong, truth, 0, 40)
     assert rates.layers[0][:2] == rates.fused[:2] == (0.0, None)
 
 
 def test_a_query_that_reports_a_soft_place_does_not_count_in_the_fusion() -> None:
-    truth = Truth(torch.tensor([[3], [5]]), torch.tensor([True, True]), torch.tensor([[20], [-1]]))
+    truth = GroundTruth(torch.tensor([[3], [5]]), torch.tensor([True, True]), torch.tensor([[20], [-1]]))
     rates = activation_rates([layer(10, 10)], [torch.tensor([0, 5])], torch.tensor([20, 5]), truth, 0, 40)
     assert rates.layers[0].inside == 0.5
     assert rates.fused.inside == 1.0

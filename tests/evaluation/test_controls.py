@@ -12,7 +12,7 @@ from helpers import Fixed, refused
 from torch import Tensor
 
 from dejavu_torch.evaluation.controls import leave_out_match, null_control, same_settings
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, InputError, Match, Plan, Training
@@ -33,7 +33,7 @@ def route(frames: int, dimension: int = 80, noise: float = 0.2, seed: int = 0) -
 
 
 def recall(match: Match, tolerance: int = 0) -> float:
-    return judge(match, torch.arange(len(match.index))[:, None], tolerance).recall_at_1
+    return evaluate(match, torch.arange(len(match.index))[:, None], tolerance).recall_at_1
 
 
 # the null control
@@ -47,7 +47,7 @@ def test_convention_8_the_null_of_a_repeating_route_finds_no_layers() -> None:
     assert recall(ours) > 0.9
     assert null.index.tolist() == [-1] * 432
     assert not null.accepted.any()
-    assert judge(null, torch.arange(432)[:, None], 5) == (0.0,) * 6
+    assert evaluate(null, torch.arange(432)[:, None], 5) == (0.0,) * 6
 
 
 def test_convention_8_the_null_of_the_paper_is_at_chance() -> None:
@@ -101,8 +101,8 @@ def test_the_null_of_the_same_plan_fails_where_the_score_comes_from_periods() ->
     model = DejaVu(periods=Fixed(layer(16, 0, 432, *range(40)), layer(27, 0, 432, *range(40, 80))))
     model.learn_features(reference)
     truth = torch.arange(432)[:, None]
-    ours = judge(model.localize(query), truth, 2).recall_at_1
-    null = judge(null_control(model, reference, query, same_plan=True), truth, 2).recall_at_1
+    ours = evaluate(model.localize(query), truth, 2).recall_at_1
+    null = evaluate(null_control(model, reference, query, same_plan=True), truth, 2).recall_at_1
     assert ours > 0.5
     assert null <= 0.3 * ours
 

@@ -17,14 +17,14 @@ from torch import Tensor
 from dejavu_torch.evaluation.curves import (
     Scores,
     area,
+    count_queries,
     curve_of,
-    judge,
+    evaluate,
     pr_curve,
     recall_at_full_precision,
-    tally,
     threshold_of_full_precision,
 )
-from dejavu_torch.types import InputError, Match, PRCurve, Truth
+from dejavu_torch.types import GroundTruth, InputError, Match, PRCurve
 
 INF = float("inf")
 Recall = Literal["all", "reported"]
@@ -192,29 +192,31 @@ def test_judge_equals_literal_loops(rows: list[tuple[float, int, list[int]]], to
         precision_at_100_recall=right / max(1, sum(score < INF for score, _, _ in queries)),
         recall_at_1=right / max(1, sum(a for _, _, a in queries)),
     )
-    assert judge(match, torch.tensor([truth for _, _, truth in rows]), tolerance) == pytest.approx(expected)
+    assert evaluate(match, torch.tensor([truth for _, _, truth in rows]), tolerance) == pytest.approx(
+        expected
+    )
 
 
 def test_a_perfect_matcher_scores_one_save_for_the_missing_starting_point() -> None:
-    scores = judge(match_of(list(range(10))), torch.arange(10)[:, None], 0)
+    scores = evaluate(match_of(list(range(10))), torch.arange(10)[:, None], 0)
     # the curve begins at recall 1/10, and no point is added before it
     assert scores.auc == scores.auc_reported == pytest.approx(0.9)
     assert scores[2:] == (1.0, 1.0, 1.0, 1.0)
 
 
 def test_a_matcher_that_reports_nothing_scores_zero() -> None:
-    assert judge(match_of([0] * 4, [INF] * 4), torch.arange(4)[:, None], 5) == (0.0,) * 6
+    assert evaluate(match_of([0] * 4, [INF] * 4), torch.arange(4)[:, None], 5) == (0.0,) * 6
 
 
 def test_without_any_right_answer_all_scores_are_zero() -> None:
-    assert judge(match_of([0, 1]), torch.full((2, 1), -1), 5) == (0.0,) * 6
+    assert evaluate(match_of([0, 1]), torch.full((2, 1), -1), 5) == (0.0,) * 6
 
 
 def test_convention_5_tolerance_is_inclusive_in_every_score() -> None:
     match, truth = match_of([5, 6]), torch.zeros(2, 1, dtype=torch.int64)
-    assert judge(match, truth, 4).recall_at_1 == 0.0
-    assert judge(match, truth, 5).recall_at_1 == 0.5
-    assert judge(match, truth, 6).recall_at_1 == 1.0
+    assert evaluate(match, truth, 4).recall_at_1 == 0.0
+    assert evaluate(match, truth, 5).recall_at_1 == 0.5
+    assert evaluate(match, truth, 6).recall_at_1 == 1.0
     assert curve_of(match, truth, 5).precision.tolist() == [1.0, 0.5]
 
 
@@ -224,7 +226,7 @@ def test_convention_6_recall_is_of_all_answerable_queries_and_reported_forgives_
     truth = torch.tensor([[0], [1], [2], [3], [-1]])
     assert curve_of(match, truth, 0).recall[-1] == 2 / 4
     assert curve_of(match, truth, 0, "reported").recall[-1] == pytest.approx(2 / 3)
-    scores = judge(match, truth, 0)
+    scores = evaluate(match, truth, 0)
     assert scores.recall_at_1 == scores.recall_at_100_precision == 2 / 4
     assert scores.recall_at_100_precision_reported == 2 / 4  # at score 2 two answerable queries are silent
     assert scores.precision_at_100_recall == 2 / 4
@@ -235,7 +237,7 @@ def test_convention_6_the_paper_s_figures_fit_the_reported_recall() -> None:
     match, truth = match_of([0] * 95 + [9] * 5), torch.zeros(100, 1, dtype=torch.int64)
     assert curve_of(match, truth, 5, "reported").recall[-1] == 1.0
     assert curve_of(match, truth, 5, "all").recall[-1] == pytest.approx(0.95)
-    assert judge(match, truth, 5).precision_at_100_recall == pytest.approx(0.95)
+    assert evaluate(match, truth, 5).precision_at_100_recall == pytest.approx(0.95)
 
 
 def test_convention_7_curves_are_plain_tensors_without_torchmetrics() -> None:
@@ -256,12 +258,12 @@ def test_convention_7_thresholds_are_the_scores_themselves() -> None:
 @pytest.mark.parametrize("truth", [torch.zeros(3, 1), torch.zeros(2), torch.zeros(2, 1, 1)])
 def test_a_truth_that_does_not_fit_is_refused(truth: Tensor) -> None:
     with pytest.raises(InputError, match=r"\Athe truth is \([^\n]*expected \(2, R\)[^\n]*\Z"):
-        judge(match_of([0, 1]), truth.long(), 5)
+        evaluate(match_of([0, 1]), truth.long(), 5)
 
 
 def test_a_negative_tolerance_is_refused() -> None:
     with pytest.raises(InputError, match=r"\Athe tolerance is -1; expected at least 0\Z"):
-        judge(match_of([0, 1]), torch.zeros(2, 1).long(), -1)
+        evaluate(match_of([0, 1]), torch.zeros(2, 1).long(), -1)
 
 
 # what is not judged
@@ -282,7 +284,7 @@ def test_queries_that_are_not_counted_are_as_if_never_asked(
 ) -> None:
     soft = [(row[4] * 12)[:3] for row in rows]
     match = match_of([row[1] for row in rows], [row[0] for row in rows])
-    truth = Truth(
+    truth = GroundTruth(
         torch.tensor([row[2] for row in rows]), torch.tensor([row[3] for row in rows]), torch.tensor(soft)
     )
     kept = []
@@ -291,16 +293,16 @@ def test_queries_that_are_not_counted_are_as_if_never_asked(
         if known and (good or place < 0 or place not in soft[i]):
             kept.append(i)
     if not kept:
-        for judging in (judge, curve_of, tally):
+        for judging in (evaluate, curve_of, count_queries):
             with refused(f"of {len(rows)} queries", "none is left", "expected"):
                 judging(match, truth, tolerance)
         return
-    rest, right = Match(*(column[kept] for column in match)), truth.right[kept]
-    assert judge(match, truth, tolerance) == judge(rest, right, tolerance)
+    rest, right = Match(*(column[kept] for column in match)), truth.positives[kept]
+    assert evaluate(match, truth, tolerance) == evaluate(rest, right, tolerance)
     for recall in ("all", "reported"):
         left, expected = curve_of(match, truth, tolerance, recall), curve_of(rest, right, tolerance, recall)
         assert points_of(left) == points_of(expected)
-    counts, rest_counts = tally(match, truth, tolerance), tally(rest, right, tolerance)
+    counts, rest_counts = count_queries(match, truth, tolerance), count_queries(rest, right, tolerance)
     assert counts["queries"] == len(rows) == counts["judged"] + counts["unknown"] + counts["ignored"]
     assert counts["unknown"] == sum(not row[3] for row in rows)
     assert rest_counts["unknown"] == rest_counts["ignored"] == 0
@@ -313,8 +315,8 @@ def test_soft_places_and_unknown_queries_by_hand() -> None:
     match = match_of([10, 40, 20, 10, 0, 40], [1.0, 2.0, 0.5, 0.1, INF, 3.0])
     match = match._replace(accepted=match.accepted & (match.score < 3))
     right = torch.tensor([[10]] * 5 + [[-1]])
-    truth = Truth(right, torch.tensor([True] * 3 + [False] + [True] * 2), torch.tensor([[20]] * 6))
-    assert tally(match, truth, 5) == {
+    truth = GroundTruth(right, torch.tensor([True] * 3 + [False] + [True] * 2), torch.tensor([[20]] * 6))
+    assert count_queries(match, truth, 5) == {
         "queries": 6,
         "judged": 4,
         "unknown": 1,
@@ -323,7 +325,7 @@ def test_soft_places_and_unknown_queries_by_hand() -> None:
         "accepted": 2,
         "accepted_right": 1,
     }
-    scores = judge(match, truth, 5)
+    scores = evaluate(match, truth, 5)
     assert scores.recall_at_1 == scores.recall_at_100_precision == pytest.approx(1 / 3)
     assert scores.precision_at_100_recall == pytest.approx(1 / 3)
     # the soft and the unknown query would else lead the curve
@@ -331,10 +333,10 @@ def test_soft_places_and_unknown_queries_by_hand() -> None:
 
 
 def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right() -> None:
-    truth = Truth(torch.tensor([[10]]), torch.tensor([True]), torch.tensor([[12]]))
-    assert judge(match_of([12]), truth, 2).recall_at_1 == 1.0
+    truth = GroundTruth(torch.tensor([[10]]), torch.tensor([True]), torch.tensor([[12]]))
+    assert evaluate(match_of([12]), truth, 2).recall_at_1 == 1.0
     with refused("none is left"):
-        judge(match_of([12]), truth, 1)
+        evaluate(match_of([12]), truth, 1)
 
 
 @pytest.mark.parametrize(
@@ -344,9 +346,9 @@ def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right() -> None:
 def test_a_truth_whose_parts_do_not_fit_is_refused(known: tuple[int, ...], soft: tuple[int, ...]) -> None:
     parts = torch.ones(known, dtype=torch.bool), torch.zeros(soft, dtype=torch.int64)
     with refused("known and soft places are", "(2,) and (2, S)"):
-        judge(match_of([0, 1]), Truth(torch.zeros(2, 1).long(), *parts), 5)
+        evaluate(match_of([0, 1]), GroundTruth(torch.zeros(2, 1).long(), *parts), 5)
     with refused("the truth is (3, 1)", "(2, R)"):
-        judge(match_of([0, 1]), Truth(torch.zeros(3, 1).long(), *parts), 5)
+        evaluate(match_of([0, 1]), GroundTruth(torch.zeros(3, 1).long(), *parts), 5)
 
 
 def test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more() -> None:

@@ -32,7 +32,7 @@ from dejavu_torch.evaluation.plots import (
     plot_curves,
 )
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, Match, PRCurve, Truth
+from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, PRCurve
 
 
 def layer(period: Fraction | int, start: int, stop: int, features: int = 2) -> FrequencyLayer:
@@ -77,7 +77,7 @@ def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
 
 def test_coverage_leaves_grey_what_is_not_judged() -> None:
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
-    truth = Truth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
+    truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
     figure, axis = plot_coverage(
         matched(0, 1, 7, -1, 9), truth, 0, 10, queries=torch.tensor([10, 20, 30, 40, 50])
     )

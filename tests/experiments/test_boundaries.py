@@ -8,7 +8,7 @@ from helpers import refused
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.truth import as_truth
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.boundaries import GivenChunks, boundary_effect, known_boundaries
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.model import DejaVu
@@ -60,11 +60,11 @@ def test_a_map_with_known_boundaries_is_learnt_and_judged_as_any_other(tmp_path:
     match = again.localize(query)
     period = torch.where(truth < 90, 10, 14)
     assert ((match.index - truth) % period == 0).double().mean() > 0.9  # known up to the period that is there
-    assert known.known.scores == judge(match, truth[:, None], 0)
+    assert known.judged.scores == evaluate(match, truth[:, None], 0)
     assert known.known_effect == boundary_effect(match, as_truth(truth[:, None]), [90], 0)
-    fixed = judge(result.match, truth[:, None], 0)  # the default's scores are comparable already
+    fixed = evaluate(result.match, truth[:, None], 0)  # the default's scores are comparable already
     assert known.fixed.scores == fixed
-    assert known.known.scores.recall_at_1 > fixed.recall_at_1
+    assert known.judged.scores.recall_at_1 > fixed.recall_at_1
     again.save(tmp_path / "map.safetensors")
     assert DejaVu.load(tmp_path / "map.safetensors").periods.chunks(256) == [(0, 90), (90, 256)]
 

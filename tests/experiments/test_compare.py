@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, InputError, SpectrogramAnalysis
 from dejavu_torch.evaluation.controls import null_control
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.types import FrequencyLayer, Training, Traverse
 
@@ -129,7 +129,7 @@ def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained:
     assert null.name == "null: templates of shuffled frames"
     assert "null_same_plan" not in result.report.contenders
     expected = null_control(trained, reference, query, 5, same_plan=True)
-    assert null.scores == judge(expected, torch.arange(240)[:, None], 5)
+    assert null.scores == evaluate(expected, torch.arange(240)[:, None], 5)
 
 
 def test_a_learnt_map_that_is_there_keeps_its_nulls(model: DejaVu) -> None:

@@ -13,11 +13,11 @@ from PIL import Image
 
 from dejavu_torch import DejaVu, FrequencyLayer, ImageFolder, Match
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.curves import RECALL_DEFINITION, judge
+from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.evaluation.report import score_table, text_table, write_report
-from dejavu_torch.experiments.evaluate import Evaluation, evaluate
-from dejavu_torch.types import Truth
+from dejavu_torch.experiments.evaluate import Evaluation, evaluate_file
+from dejavu_torch.types import GroundTruth
 
 HEADER = "query,place,score,accepted\n"
 # right, right but far, wrong, silent, accepted though wrong
@@ -52,22 +52,22 @@ def found(path: Path) -> Match:
 def test_the_file_gives_the_scores_of_the_matches_in_memory(tmp_path: Path) -> None:
     match = found(tmp_path / "m.csv")
     right = torch.arange(96)[:, None]
-    result = evaluate(tmp_path / "m.csv", "0", tolerance=3)
-    assert result.report.ours.scores == judge(match, right, 3)
+    result = evaluate_file(tmp_path / "m.csv", "0", tolerance=3)
+    assert result.report.ours.scores == evaluate(match, right, 3)
     assert 0 < scores_of(result)["recall_at_1"] < 1
     assert 0 < scores_of(result)["auc"] < 1
     # and so does a table of the same places, and a matrix
     table = written(tmp_path, "".join(f"{i},{i}\n" for i in range(96)), "truth.csv")
     np.savez(tmp_path / "truth.npz", GThard=np.eye(96, dtype=bool))
     for truth in (table, tmp_path / "truth.npz"):
-        assert evaluate(tmp_path / "m.csv", str(truth), tolerance=3).report.ours.scores == judge(
+        assert evaluate_file(tmp_path / "m.csv", str(truth), tolerance=3).report.ours.scores == evaluate(
             match, right, 3
         )
 
 
 def test_facts_by_hand(tmp_path: Path) -> None:
     path = written(tmp_path, MATCHES)
-    facts = evaluate(path, "0", tolerance=3).report.facts
+    facts = evaluate_file(path, "0", tolerance=3).report.facts
     expected = {"queries": 5, "judged": 5, "unknown": 0, "ignored": 0, "with_answer": 5, "accepted": 3}
     assert {name: facts[name] for name in expected} == expected
     assert (facts["accepted_right"], facts["accepted_precision"]) == (2, pytest.approx(2 / 3))
@@ -75,13 +75,13 @@ def test_facts_by_hand(tmp_path: Path) -> None:
     assert (facts["matches"], facts["truth"]) == (str(path), "place = query")
     assert {"version", "torch"} <= facts.keys()
     # the tolerance is inclusive, and decides over query 1
-    assert evaluate(path, "0", tolerance=2).report.facts["accepted_right"] == 1
-    assert evaluate(path, "0", tolerance=0).report.facts["accepted_right"] == 1
+    assert evaluate_file(path, "0", tolerance=2).report.facts["accepted_right"] == 1
+    assert evaluate_file(path, "0", tolerance=0).report.facts["accepted_right"] == 1
 
 
 def test_queries_the_truth_does_not_know_are_left_out(tmp_path: Path) -> None:
     path, truth = written(tmp_path, MATCHES), written(tmp_path, "1,4\n2,2\n9,9\n", "truth.csv")
-    result = evaluate(path, str(truth), tolerance=0)
+    result = evaluate_file(path, str(truth), tolerance=0)
     facts = result.report.facts
     assert [facts[k] for k in ("queries", "judged", "unknown", "accepted", "accepted_right")] == [
         5,
@@ -91,7 +91,7 @@ def test_queries_the_truth_does_not_know_are_left_out(tmp_path: Path) -> None:
         1,
     ]
     assert scores_of(result)["recall_at_1"] == 0.5
-    between = evaluate(path, str(truth), tolerance=0, interpolate=True).report.facts
+    between = evaluate_file(path, str(truth), tolerance=0, interpolate=True).report.facts
     assert [between[k] for k in ("judged", "unknown")] == [4, 1]
 
 
@@ -101,17 +101,17 @@ def test_soft_places_count_neither_way(tmp_path: Path) -> None:
     soft = hard.copy()
     soft[50, 2] = soft[4, 1] = True
     np.savez(tmp_path / "gt.npz", GThard=hard, GTsoft=soft)
-    facts = evaluate(path, str(tmp_path / "gt.npz"), tolerance=0).report.facts
+    facts = evaluate_file(path, str(tmp_path / "gt.npz"), tolerance=0).report.facts
     assert [facts[k] for k in ("judged", "ignored", "accepted", "accepted_right")] == [3, 2, 2, 1]
     # within the tolerance of a right place a soft one is right
-    assert evaluate(path, str(tmp_path / "gt.npz"), tolerance=3).report.facts["ignored"] == 1
+    assert evaluate_file(path, str(tmp_path / "gt.npz"), tolerance=3).report.facts["ignored"] == 1
 
 
 def test_numbered_queries_in_any_order(tmp_path: Path) -> None:
     path = written(tmp_path, HEADER + "40,41,0.5,1\n10,11,0.1,1\n20,7,0.9,1\n")
-    result = evaluate(path, "1", tolerance=0)
+    result = evaluate_file(path, "1", tolerance=0)
     assert result.queries.tolist() == [40, 10, 20]
-    assert result.truth.right[:, 0].tolist() == [41, 11, 21]
+    assert result.truth.positives[:, 0].tolist() == [41, 11, 21]
     assert scores_of(result)["recall_at_1"] == pytest.approx(2 / 3)
     assert scores_of(result)["recall_at_100_precision"] == pytest.approx(2 / 3)
 
@@ -124,40 +124,40 @@ def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
             Image.new("L", (2, 2)).save(folder / f"{i}@{east}@0@.png")
     path = written(tmp_path, MATCHES)
     pair = {"reference": ImageFolder(reference), "query": ImageFolder(query)}
-    facts = evaluate(path, "utm:5", tolerance=0, **pair).report.facts
+    facts = evaluate_file(path, "utm:5", tolerance=0, **pair).report.facts
     assert (facts["with_answer"], facts["accepted_right"]) == (5, 3)
     with refused("utm", "both traverses"):
-        evaluate(path, "utm:5")
+        evaluate_file(path, "utm:5")
     stored, seen = ArrayTraverse(torch.rand(60, 2)), ArrayTraverse(torch.rand(5, 2))
     with refused("no truth"):
-        evaluate(path, None, reference=stored, query=seen)
+        evaluate_file(path, None, reference=stored, query=seen)
     stored.place, seen.place = torch.arange(60.0), torch.tensor([0.0, 4.2, 2.0, 3.0, 30.0])
-    assert evaluate(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
+    assert evaluate_file(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, MATCHES)
     with refused("tolerance is -1"):
-        evaluate(path, "0", tolerance=-1)
+        evaluate_file(path, "0", tolerance=-1)
     with refused("'maybe'"):
-        evaluate(tmp_path / "none.csv", "maybe")  # the text first: it costs nothing
+        evaluate_file(tmp_path / "none.csv", "maybe")  # the text first: it costs nothing
     with refused("no truth"):
-        evaluate(path, None)
+        evaluate_file(path, None)
     with refused("place 50", "below 20"):
-        evaluate(path, "0", reference=ArrayTraverse(torch.rand(20, 2)))
+        evaluate_file(path, "0", reference=ArrayTraverse(torch.rand(20, 2)))
     np.savez(tmp_path / "gt.npz", GThard=np.eye(60, 4, dtype=bool))
     with refused("GThard is (60, 4)", "(places, 5)"):
-        evaluate(path, str(tmp_path / "gt.npz"))
+        evaluate_file(path, str(tmp_path / "gt.npz"))
     only = written(tmp_path, HEADER + "0,7,0.5,1\n", "one.csv")
     soft = np.ones((9, 1), dtype=bool)
     np.savez(tmp_path / "gt.npz", GThard=np.eye(9, 1, dtype=bool), GTsoft=soft)
     with refused("none is left to judge"):
-        evaluate(only, str(tmp_path / "gt.npz"))
+        evaluate_file(only, str(tmp_path / "gt.npz"))
 
 
 def test_report_of_an_evaluation(tmp_path: Path) -> None:
     truth = written(tmp_path, "0,0\n1,1\n2,2\n4,4\n", "truth.csv")
-    result = evaluate(written(tmp_path, MATCHES), str(truth), tolerance=3)
+    result = evaluate_file(written(tmp_path, MATCHES), str(truth), tolerance=3)
     out = tmp_path / "out"
     out.mkdir()
     write_report(out, result.report, result.pictures, "matches <judged>", "dejavu evaluate matches.csv")
@@ -185,7 +185,7 @@ def test_report_of_an_evaluation(tmp_path: Path) -> None:
 
 
 def test_a_silent_method_has_a_report_too(tmp_path: Path) -> None:
-    result = evaluate(written(tmp_path, HEADER + "0,-1,inf,0\n1,-1,inf,0\n"), "0")
+    result = evaluate_file(written(tmp_path, HEADER + "0,-1,inf,0\n1,-1,inf,0\n"), "0")
     assert set(scores_of(result).values()) == {0.0}
     assert result.report.facts["accepted_precision"] is None
     write_report(tmp_path, result.report, result.pictures, "silent", "")
@@ -195,8 +195,8 @@ def test_corridor(tmp_path: Path, data_dir: Path) -> None:
     """Matches on the diagonal of two passes, judged by the places that were listed by hand."""
     path = tmp_path / "m.csv"
     write_matches(path, [Match(torch.arange(111), torch.arange(111.0), torch.ones(111) > 0)])
-    result = evaluate(path, str(data_dir / "corridor" / "truth.csv"), tolerance=0)
-    assert isinstance(result.truth, Truth)
+    result = evaluate_file(path, str(data_dir / "corridor" / "truth.csv"), tolerance=0)
+    assert isinstance(result.truth, GroundTruth)
     assert result.report.facts["judged"] == result.report.facts["with_answer"] == 111
     rows = (data_dir / "corridor" / "truth.csv").read_text().split("\n")[1:112]
     listed = [[int(cell) for cell in row.split(",")] for row in rows]

@@ -19,7 +19,7 @@ from dejavu_torch.experiments.pictures import (
     leading_layers,
     slit_scan,
 )
-from dejavu_torch.types import FrequencyLayer, Truth
+from dejavu_torch.types import FrequencyLayer, GroundTruth
 
 ALL = ["pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"]
 
@@ -39,7 +39,7 @@ def frames(seed: int, length: int = 120, channels: int = 1) -> Tensor:
 
 
 def drawn(
-    model: DejaVu, reference: Tensor, query: Tensor, truth: Truth | None, **found: Match
+    model: DejaVu, reference: Tensor, query: Tensor, truth: GroundTruth | None, **found: Match
 ) -> dict[str, Picture]:
     traverse = ArrayTraverse(reference)
     stored, seen = model.extract_all(traverse), model.extract_all(ArrayTraverse(query))
@@ -59,7 +59,7 @@ def short(**options: object) -> DejaVu:
     return DejaVu(HOG(), SpectrogramAnalysis(window=60, min_period=4), **options)  # type: ignore[arg-type]
 
 
-def same_places(length: int = 120) -> Truth:
+def same_places(length: int = 120) -> GroundTruth:
     return as_truth(offset_truth(length, length))
 
 
@@ -102,14 +102,16 @@ def test_without_truth_nothing_is_scored() -> None:
 def test_a_truth_in_which_some_is_unknown() -> None:
     right = offset_truth(120, 120)
     known = torch.arange(120) % 3 > 0
-    pictures = drawn(short(), frames(0), frames(1), Truth(right, known, right - 5))
+    pictures = drawn(short(), frames(0), frames(1), GroundTruth(right, known, right - 5))
     assert list(pictures) == ALL
 
 
 def test_a_truth_that_judges_nothing_gives_no_curve() -> None:
     right = torch.full((120, 1), -1)
     soft = torch.arange(120).expand(120, -1)  # whatever is reported
-    pictures = drawn(short(), frames(0), frames(1), Truth(right, torch.ones(120, dtype=torch.bool), soft))
+    pictures = drawn(
+        short(), frames(0), frames(1), GroundTruth(right, torch.ones(120, dtype=torch.bool), soft)
+    )
     assert list(pictures) == ALL[2:]
 
 

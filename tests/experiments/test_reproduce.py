@@ -15,7 +15,7 @@ from dejavu_torch.cli import commands, main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import places_of_frames
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.boundaries import BoundaryEffect
 from dejavu_torch.experiments.compare import Comparison, compare
@@ -62,11 +62,11 @@ def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> No
     )
     periods = SpectrogramAnalysis(512, min_period=8, peaks="bins", false_alarm=None, short="refuse")
     other = DejaVu(periods=periods, reduction="sum").learn_features(aerial.stored)
-    scores = judge(other.localize(aerial.seen), aerial.truth, 5)
+    scores = evaluate(other.localize(aerial.seen), aerial.truth, 5)
     assert (rows[0]["auc"], rows[0]["recall_at_1"]) == (scores.auc, scores.recall_at_1)
     assert rows[0]["bytes_per_place"] == rows[0]["map_bytes"] / FRAMES
     other.matcher.reduction = "mean"
-    again = judge(other.localize(aerial.seen), aerial.truth, 5)
+    again = evaluate(other.localize(aerial.seen), aerial.truth, 5)
     assert rows[0]["recall_at_1_comparable"] == again.recall_at_1
 
 
@@ -170,7 +170,7 @@ def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> 
     assert outdoor.shown is not None
     assert outdoor.shown.place is not None
     reference, query = (open_source(f"sim:outdoor?frames=420&traverse={k}") for k in (0, 1))
-    right = outdoor.truth.right[:, 0]
+    right = outdoor.truth.positives[:, 0]
     known = right >= 0
     assert known.float().mean() > 0.7
     apart = reference.distance[outdoor.shown.place[right[known]]] - query.distance[outdoor.shown.query[known]]
@@ -194,7 +194,7 @@ def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
 def test_comparable_scores_are_means_on_the_same_map(outdoor: Comparison) -> None:
     model = DejaVu(reduction="mean")
     model.map = outdoor.model.map
-    comparable = judge(model.localize(outdoor.seen), outdoor.truth, 5)
+    comparable = evaluate(model.localize(outdoor.seen), outdoor.truth, 5)
     assert outdoor.report.contenders["comparable"].scores == comparable
     assert outdoor.report.ours.scores != comparable
 

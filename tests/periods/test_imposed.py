@@ -15,10 +15,10 @@ from torch import Tensor
 from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import build, recipe_of
 from dejavu_torch.database.phase import PhaseTemplates
+from dejavu_torch.database.scores import Matcher
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.support import support_of, supportive_periods
-from dejavu_torch.recognition.scores import Matcher
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
 

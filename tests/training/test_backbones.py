@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.augment import Augmentation
 from dejavu_torch.training.freeze import freeze, start_from
 from dejavu_torch.training.task import PlaceRecognitionTask
 

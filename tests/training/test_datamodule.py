@@ -18,10 +18,10 @@ from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.truth import as_truth
-from dejavu_torch.training.augment import Augmentation
+from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.frames import Clips, StoredFrames, as_frames, store
-from dejavu_torch.types import Truth
+from dejavu_torch.types import GroundTruth
 
 
 def numbered(frames: int, first: int = 0, side: int = 8) -> ArrayTraverse:
@@ -42,7 +42,7 @@ def drawn(data: RouteData) -> dict[int, list[list[int]]]:
     seen: dict[int, list[list[int]]] = {}
     for frames, truth in data.train_dataloader():
         assert frames.dtype == torch.float32
-        for frame, right in zip(frames, truth.right.tolist(), strict=True):
+        for frame, right in zip(frames, truth.positives.tolist(), strict=True):
             assert frame.unique().numel() == 1
             seen.setdefault(round(float(frame[0, 0, 0]) * 255), []).append([p for p in right if p >= 0])
     return seen
@@ -73,15 +73,15 @@ def test_what_is_known_and_soft_reaches_the_judge(tmp_path: Path) -> None:
     np.savez(tmp_path / "truth.npz", GThard=hard, GTsoft=soft)
     data = route(stage="test", query=numbered(6, 100), truth=str(tmp_path / "truth.npz"), batch_size=4)
     batches = [batch.truth for batch in data.test_dataloader()]
-    truth = Truth(*(torch.cat(column) for column in zip(*batches, strict=True)))
-    assert truth.right[1].tolist() == [3, 4]
-    assert truth.soft[2].tolist() == [9]
-    assert truth.known.tolist() == [True] * 6
+    truth = GroundTruth(*(torch.cat(column) for column in zip(*batches, strict=True)))
+    assert truth.positives[1].tolist() == [3, 4]
+    assert truth.ignored[2].tolist() == [9]
+    assert truth.judged.tolist() == [True] * 6
     (tmp_path / "truth.csv").write_text("0,5\n1\n2,7\n")
     data = route(stage="test", query=numbered(6, 100), truth=str(tmp_path / "truth.csv"))
     (batch,) = data.test_dataloader()
-    assert batch.truth.known.tolist() == [True] * 3 + [False] * 3
-    assert batch.truth.right.tolist() == [[5], [-1], [7], [-1], [-1], [-1]]
+    assert batch.truth.judged.tolist() == [True] * 3 + [False] * 3
+    assert batch.truth.positives.tolist() == [[5], [-1], [7], [-1], [-1], [-1]]
 
 
 def test_validation_and_query_come_in_order_as_they_are() -> None:
@@ -93,7 +93,7 @@ def test_validation_and_query_come_in_order_as_they_are() -> None:
     ):
         batches = list(loader)
         assert torch.equal(torch.cat([batch.frames for batch in batches]), as_frames(store(there)))
-        right = torch.cat([batch.truth.right[:, 0] for batch in batches])
+        right = torch.cat([batch.truth.positives[:, 0] for batch in batches])
         assert right.tolist() == list(range(shift, shift + len(right)))
     assert len(data.test_dataloader()) == 3  # the last one is not full, and counts
     assert len(route(20, batch_size=8).val_dataloader()) == 3
@@ -106,7 +106,7 @@ def test_parts_are_as_one_behind_the_other() -> None:
     index = torch.randperm(12).repeat(2)
     batch = frames[index.tolist()]
     assert torch.equal(batch.frames, as_frames(torch.cat(parts)[index]))
-    assert torch.equal(batch.truth.right[:, 0], index)
+    assert torch.equal(batch.truth.positives[:, 0], index)
     assert torch.equal(frames[[5]].frames, as_frames(parts[1][:1]))
     features = [torch.randn(4, 3, dtype=torch.float64) for _ in range(2)]
     both = StoredFrames(features[0], as_truth(torch.arange(8)[:, None]), features[1])
@@ -129,8 +129,8 @@ def test_other_traverses_come_at_the_reference_s_steps(tmp_path: Path, stage: st
     for name in {"fit": ("second", "validation"), "test": ("query",)}[stage]:
         found = data.sets[name]
         assert len(found) == 600 // 4 + 1
-        right = found.truth.right
-        assert found.truth.known.all()
+        right = found.truth.positives
+        assert found.truth.judged.all()
         apart = (right - torch.arange(151)[:, None]).abs().masked_fill(right < 0, 999).amin(1)
         assert apart.max() <= 3  # the other shows each frame twice
 
@@ -182,7 +182,7 @@ def augmented(data: RouteData, stage: str, frames: Tensor, first: int = 0) -> Te
     batch = next(iter(data.val_dataloader()))
     right = torch.arange(first, first + len(frames))[:, None]
     return data.on_after_batch_transfer(
-        batch._replace(frames=frames, truth=batch.truth._replace(right=right)), 0
+        batch._replace(frames=frames, truth=batch.truth._replace(positives=right)), 0
     )[0]
 
 
@@ -211,7 +211,7 @@ def test_ready_features_are_left_as_they_are() -> None:
     data = RouteData(ArrayTraverse(features), tolerance=2, batch_size=24)
     data.setup("fit")
     (batch,) = data.train_dataloader()
-    assert torch.equal(batch.frames, features[batch.truth.right[:, 0]])
+    assert torch.equal(batch.frames, features[batch.truth.positives[:, 0]])
     assert torch.equal(augmented(data, "fit", features), features)
 
 

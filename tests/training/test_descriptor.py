@@ -26,8 +26,8 @@ from torch import Tensor
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.augment import Augmentation
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 STILL = {name: 0.0 for name in ("rotation", "scale", "gamma", "illumination", "blur", "occlusion", "noise")}

@@ -1,4 +1,4 @@
-"""The metric is `judge` over everything it saw, however that came."""
+"""The metric is `evaluate` over everything it saw, however that came."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from torch.utils.data import DataLoader
 from torchmetrics import MetricCollection
 
 from dejavu_torch.data.truth import as_truth
-from dejavu_torch.evaluation.curves import Scores, judge
+from dejavu_torch.evaluation.curves import Scores, evaluate
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.types import Match, Truth
+from dejavu_torch.types import GroundTruth, Match
 
 INF = float("inf")
 # score, reported place, right places, known, soft places; few values, so that scores tie
@@ -41,11 +41,11 @@ def table(rows: Sequence[list[int]]) -> Tensor:
     return torch.tensor(padded, dtype=torch.int64).reshape(len(rows), width)
 
 
-def batch_of(queries: list[Any]) -> tuple[Match, Truth]:
+def batch_of(queries: list[Any]) -> tuple[Match, GroundTruth]:
     score, index, right, known, soft = zip(*queries, strict=True) if queries else ((),) * 5
     scores = torch.tensor(score, dtype=torch.float32)
     match = Match(torch.tensor(index, dtype=torch.int64), scores, scores < 1)
-    return match, Truth(table(right), torch.tensor(known, dtype=torch.bool), table(soft))
+    return match, GroundTruth(table(right), torch.tensor(known, dtype=torch.bool), table(soft))
 
 
 def same(figures: dict[str, Tensor], scores: Scores) -> bool:
@@ -71,13 +71,13 @@ def test_it_is_judge_on_all_data_whatever_the_batches(batches: list[Any], tolera
     for queries in batches:
         metric.update(*batch_of(queries))
     match, truth = batch_of([query for queries in batches for query in queries])
-    near = (match.index[:, None] - truth.right).abs() <= tolerance
-    right = (near & (truth.right >= 0) & (match.index >= 0)[:, None]).any(1)
-    soft = ((match.index[:, None] == truth.soft) & (truth.soft >= 0)).any(1)
+    near = (match.index[:, None] - truth.positives).abs() <= tolerance
+    right = (near & (truth.positives >= 0) & (match.index >= 0)[:, None]).any(1)
+    soft = ((match.index[:, None] == truth.ignored) & (truth.ignored >= 0)).any(1)
     figures = metric.compute()
     assert isinstance(figures, dict)
-    if (truth.known & (right | ~soft)).any():
-        assert same(figures, judge(match, truth, tolerance))
+    if (truth.judged & (right | ~soft)).any():
+        assert same(figures, evaluate(match, truth, tolerance))
     else:
         assert set(figures) == set(Scores._fields)
         assert all(value.isnan() for value in figures.values())
@@ -105,7 +105,7 @@ def test_close_scores_in_double_precision_stay_apart() -> None:
     truth = torch.tensor([[0], [5]])
     metric = PlaceRecognition(tolerance=0)
     metric.update(match, truth)
-    assert same(metric.compute(), judge(match, truth, 0))
+    assert same(metric.compute(), evaluate(match, truth, 0))
     assert metric.compute()["recall_at_100_precision"] == 0.5
 
 
@@ -115,24 +115,24 @@ def test_reset_forgets() -> None:
     metric.reset()
     assert all(value.isnan() for value in metric.compute().values())
     metric.update(*second)
-    assert same(metric.compute(), judge(*second, tolerance=1))
+    assert same(metric.compute(), evaluate(*second, tolerance=1))
 
 
 def test_calling_it_judges_the_batch_and_adds_it() -> None:
     first, second = some(), some()
     metric = fed(first)
-    assert same(metric.compute(), judge(*first, tolerance=1))
-    assert same(metric(*second), judge(*second, tolerance=1))
+    assert same(metric.compute(), evaluate(*first, tolerance=1))
+    assert same(metric(*second), evaluate(*second, tolerance=1))
     assert same(metric.compute(), fed_scores(first, second))
 
 
 def fed_scores(*batches: tuple[Match, Tensor]) -> Scores:
-    """`judge` of the batches joined by hand."""
+    """`evaluate` of the batches joined by hand."""
     matches, truths = zip(*batches, strict=True)
     width = max(truth.shape[1] for truth in truths)
     rows = [torch.nn.functional.pad(truth, (0, width - truth.shape[1]), value=-1) for truth in truths]
     joined = Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
-    return judge(joined, torch.cat(rows), tolerance=1)
+    return evaluate(joined, torch.cat(rows), tolerance=1)
 
 
 def test_merged_states_are_one() -> None:
@@ -149,12 +149,12 @@ def test_processes_are_joined(elsewhere: tuple[tuple[Match, Tensor], ...]) -> No
     states = [torch.cat(state) if state else torch.zeros(0) for state in other.metric_state.values()]
     theirs = iter(states)
 
-    def gather(mine: Tensor, group: object) -> list[Tensor]:
+    def concatenate(mine: Tensor, group: object) -> list[Tensor]:
         assert mine.ndim == 1  # processes exchange only tensors of the same type and number of dimensions
         assert mine.dtype == torch.float64
         return [mine, next(theirs).to(mine.dtype)]
 
-    metric = fed(*here, dist_sync_fn=gather, distributed_available_fn=lambda: True)
+    metric = fed(*here, dist_sync_fn=concatenate, distributed_available_fn=lambda: True)
     assert same(metric.compute(), fed_scores(*here, *elsewhere))
     assert same(fed(*here).compute(), fed_scores(*here))
 
@@ -162,11 +162,11 @@ def test_processes_are_joined(elsewhere: tuple[tuple[Match, Tensor], ...]) -> No
 def test_a_process_that_saw_nothing_sends_what_the_others_send() -> None:
     sent = []
 
-    def gather(mine: Tensor, group: object) -> list[Tensor]:
+    def concatenate(mine: Tensor, group: object) -> list[Tensor]:
         sent.append((mine.ndim, mine.dtype))
         return [mine, torch.zeros(1, dtype=torch.float64)]
 
-    fed(dist_sync_fn=gather, distributed_available_fn=lambda: True).compute()
+    fed(dist_sync_fn=concatenate, distributed_available_fn=lambda: True).compute()
     assert sent == [(1, torch.float64)] * 3
 
 
@@ -187,10 +187,10 @@ def test_in_a_collection_the_figures_stand_by_name() -> None:
     batch = some()
     collection = MetricCollection({"near": PlaceRecognition(0, "auc"), "far": PlaceRecognition(2, "auc")})
     collection.update(*batch)
-    near, far = judge(*batch, tolerance=0).auc, judge(*batch, tolerance=2).auc
+    near, far = evaluate(*batch, tolerance=0).auc, evaluate(*batch, tolerance=2).auc
     assert {name: value.item() for name, value in collection.compute().items()} == {"near": near, "far": far}
     assert near != far
-    assert same(MetricCollection(PlaceRecognition(0))(*batch), judge(*batch, tolerance=0))
+    assert same(MetricCollection(PlaceRecognition(0))(*batch), evaluate(*batch, tolerance=0))
 
 
 class Validated(LightningModule):
@@ -245,5 +245,5 @@ def test_errors() -> None:
     with refused("the truth is (3,)"):
         metric.update(match, truth[:, 0])
     with refused("(2,) and (3, 0)", "expected (3,)"):
-        metric.update(match, as_truth(truth)._replace(known=torch.ones(2, dtype=torch.bool)))
+        metric.update(match, as_truth(truth)._replace(judged=torch.ones(2, dtype=torch.bool)))
     assert not metric.score  # nothing of a refused batch is kept

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.truthfile import read_truth
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.deploy import Localizer
@@ -124,7 +124,7 @@ def test_the_map_tells_its_training_and_counts_the_backbone(
 
 def recall(model: DejaVu, query: Tensor) -> float:
     truth = torch.arange(len(query))[:, None]
-    return judge(model.localize(ArrayTraverse(query)), truth, tolerance=2).recall_at_1
+    return evaluate(model.localize(ArrayTraverse(query)), truth, tolerance=2).recall_at_1
 
 
 def test_training_finds_places_that_the_untrained_start_does_not(tmp_path: Path) -> None:
@@ -256,11 +256,11 @@ def test_frames_that_were_resized_are_what_the_map_expects(tmp_path: Path) -> No
 
 
 def assert_figures(running: Trainer, task: PlaceRecognitionTask, noisy: Tensor, truth: str = "0") -> None:
-    """What a test tells is what `judge` says of the map in the trainer's folder."""
+    """What a test tells is what `evaluate` says of the map in the trainer's folder."""
     data = data_of(query=ArrayTraverse(noisy), truth=truth)
     (figures,) = running.test(task, data, verbose=False)
     match = DejaVu.load(Path(running.default_root_dir) / "map.safetensors").localize(ArrayTraverse(noisy))
-    expected = judge(match, read_truth(truth, FRAMES, FRAMES), tolerance=2)._asdict()
+    expected = evaluate(match, read_truth(truth, FRAMES, FRAMES), tolerance=2)._asdict()
     assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
 
 

@@ -20,9 +20,9 @@ from training_config import CONFIG, MINE, train
 from dejavu_torch import DejaVu
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.certificate import describe
 from dejavu_torch.database.mapfile import read_map
-from dejavu_torch.evaluation.curves import judge
+from dejavu_torch.database.summary import describe
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 
 
@@ -61,7 +61,7 @@ def test_test_and_validate_judge_the_last_checkpoint(
 ) -> None:
     train("test", "--data.query", "two.npy")
     match = DejaVu.load("run/map.safetensors").localize(ArrayTraverse(footage(0.1)))
-    scores = judge(match, torch.arange(FRAMES)[:, None], tolerance=2)
+    scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
     assert told(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
     train("validate", "--data.validation", "two.npy")
     assert told(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
@@ -133,7 +133,7 @@ def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Pat
     assert type(model.features) is SmallCNN
     (config,) = (tmp_path / "run").rglob("config.yaml")
     kept = yaml.safe_load(config.read_text())["data"]["augmentation"]
-    assert kept["class_path"] == "dejavu_torch.training.augment.Augmentation"
+    assert kept["class_path"] == "dejavu_torch.features.augmentation.Augmentation"
     assert kept["init_args"]["rotation"] == 0
 
 

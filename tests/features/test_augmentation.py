@@ -12,7 +12,7 @@ import torch
 from helpers import refused
 from torch import Tensor
 
-from dejavu_torch.training.augment import LARGEST, Augmentation
+from dejavu_torch.features.augmentation import LARGEST, Augmentation
 
 OFF: dict[str, Any] = {name: 0.0 if len(most) == 1 else (0.0, 0.0) for name, most in LARGEST.items()}
 DEFAULTS = {name: argument.default for name, argument in signature(Augmentation).parameters.items()}

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -18,7 +18,7 @@ MOST = 20  # steps a frame, on average
 DOUBTFUL = 0.2  # steps backwards for each one forward
 
 
-class EvenlySpaced(Traverse):
+class ResampledTraverse(Traverse):
     """The frames of another traverse at even steps along the ground.
 
     It is read through once to measure the distances, and again each time the frames are asked for.
@@ -39,7 +39,7 @@ class EvenlySpaced(Traverse):
         distance is taken where it is first reached: standing, and going back and forth, add no frames.
 
     Raises:
-        InputError: as `VelocityNormalizer.distances`, and footage that does not move, or less than a step, or
+        InputError: as `GroundOdometry.distances`, and footage that does not move, or less than a step, or
             over 20 steps a frame.
     """
 
@@ -48,7 +48,7 @@ class EvenlySpaced(Traverse):
     def __init__(
         self,
         traverse: Traverse,
-        normalizer: VelocityNormalizer,
+        normalizer: GroundOdometry,
         batch_size: int = 64,
         step: float | None = None,
         progress: bool = False,

@@ -14,14 +14,14 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dejavu_torch import DejaVu, FrequencyLayer, ImageFolder, VelocityNormalizer
+from dejavu_torch import DejaVu, FrequencyLayer, GroundOdometry, ImageFolder
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.truth import Shown, as_truth, places_of_frames, truth_of_places
 from dejavu_torch.data.truthfile import describe_truth, find_truth
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.experiments.compare import compare
-from dejavu_torch.features.spacing import EvenlySpaced
+from dejavu_torch.motion.resampling import ResampledTraverse
 
 SIDE, STEP, CYCLE = 48, 6, 60  # pixels
 WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))  # the camera looks straight down
@@ -51,8 +51,8 @@ def footage(where: Tensor, noise: float = 0.0) -> Tensor:
     return (frames + noise * torch.randn(frames.shape, generator=random)).clamp(0, 1)
 
 
-def camera(**settings: object) -> VelocityNormalizer:
-    return VelocityNormalizer(WHOLE, (SIDE, SIDE), **{"step": float(STEP), **settings})
+def camera(**settings: object) -> GroundOdometry:
+    return GroundOdometry(WHOLE, (SIDE, SIDE), **{"step": float(STEP), **settings})
 
 
 def everything(places: int) -> Fixed:
@@ -74,7 +74,9 @@ def test_convention_11_places_are_even_steps_and_a_stop_adds_none(model: DejaVu)
 
 def test_queries_are_spaced_by_the_step_of_the_map() -> None:
     model = DejaVu(periods=everything(101), velocity=camera(step=None))
-    model.periods = everything(len(EvenlySpaced(ArrayTraverse(footage(REFERENCE)), model.velocity).frame))
+    model.periods = everything(
+        len(ResampledTraverse(ArrayTraverse(footage(REFERENCE)), model.velocity).frame)
+    )
     model.learn(footage(REFERENCE))
     assert model.step == pytest.approx(4, abs=0.05)  # the median of the moving frames
     match = model.localize(footage(QUERY))
@@ -148,9 +150,9 @@ def test_a_frame_belongs_to_the_place_nearest_to_it() -> None:
 
 def test_all_places_that_show_the_right_frame_are_right() -> None:
     """16 pixels a frame at a pixel a step: each frame is shown at 16 places."""
-    even = EvenlySpaced(ArrayTraverse(footage(positions((16, 12)))), camera(step=1.0))
+    even = ResampledTraverse(ArrayTraverse(footage(positions((16, 12)))), camera(step=1.0))
     where = Shown(None, even.frame, even.place_of)
-    right = truth_of_places(as_truth(torch.tensor([[5], [0]])), where).right
+    right = truth_of_places(as_truth(torch.tensor([[5], [0]])), where).positives
     for row, frame in zip(right, (5, 0), strict=True):
         assert row[row >= 0].tolist() == (even.frame == frame).nonzero()[:, 0].tolist()
     assert 14 <= int((right[0] >= 0).sum()) <= 18
@@ -158,14 +160,14 @@ def test_all_places_that_show_the_right_frame_are_right() -> None:
 
 def test_the_way_back_belongs_to_the_places_it_passes() -> None:
     where = positions((6, 50), (-6, 15), (6, 40))
-    even = EvenlySpaced(ArrayTraverse(footage(where)), camera())
+    even = ResampledTraverse(ArrayTraverse(footage(where)), camera())
     assert (even.place_of - where / STEP).abs().max() <= 1
-    away = EvenlySpaced(ArrayTraverse(footage(200 + positions((-6, 3), (6, 30)))), camera())
+    away = ResampledTraverse(ArrayTraverse(footage(200 + positions((-6, 3), (6, 30)))), camera())
     assert away.place_of[:5].tolist() == [0, -1, -1, -1, -1]  # behind where it began
 
 
 def test_the_map_knows_the_frames_as_the_traverse_does(model: DejaVu) -> None:
-    even = EvenlySpaced(ArrayTraverse(footage(REFERENCE)), camera())
+    even = ResampledTraverse(ArrayTraverse(footage(REFERENCE)), camera())
     assert torch.equal(model.map.frame, even.frame)
     assert torch.equal(model.map.place_of, even.place_of)
 
@@ -175,17 +177,17 @@ def test_convention_11_a_csv_says_in_its_header_what_it_counts(tmp_path: Path) -
     path.write_text("query_frame,place_frame,place_frame\n3,4\n4,0\n9,11,2\n")
     found = find_truth(str(path), None, None, 3, 2, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[1, -1], [2, 0]]
+    assert found.positives.tolist() == [[1, -1], [2, 0]]
     assert describe_truth(str(path), spaced=True).endswith("which counts frames")
     path.write_text("query,place\n0,2\n1,1\n")
     found = find_truth(str(path), None, None, 3, 2, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[2], [1]]
+    assert found.positives.tolist() == [[2], [1]]
     # where nothing is spaced, frames are places
     path.write_text("query_frame,place_frame\n0,2\n1,1\n")
     found = find_truth(str(path), None, None, 3, 2)
     assert found is not None
-    assert found.right.tolist() == [[2], [1]]
+    assert found.positives.tolist() == [[2], [1]]
 
 
 def test_a_frame_that_no_query_shows_tells_of_the_nearest_one_that_does(tmp_path: Path) -> None:
@@ -193,8 +195,8 @@ def test_a_frame_that_no_query_shows_tells_of_the_nearest_one_that_does(tmp_path
     path.write_text("query_frame,place_frame\n1,0\n10,4\n")
     found = find_truth(str(path), None, None, 3, 2, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[0], [1]]
-    assert found.known.all()
+    assert found.positives.tolist() == [[0], [1]]
+    assert found.judged.all()
 
 
 def test_frames_that_are_not_there_are_refused(tmp_path: Path) -> None:
@@ -215,7 +217,7 @@ def test_a_csv_of_frames_is_interpolated_between_frames(tmp_path: Path) -> None:
     path.write_text("query_frame,place_frame\n0,0\n10,11\n")
     found = find_truth(str(path), None, None, 3, 2, interpolate=True, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[1], [2]]  # frames 3 and 10 of the reference
+    assert found.positives.tolist() == [[1], [2]]  # frames 3 and 10 of the reference
 
 
 @pytest.mark.parametrize("head", ["query_frame,place", "query,place_frame", "query_frame,place_frame,place"])
@@ -233,12 +235,12 @@ def test_matrices_as_large_as_the_traverses_are_of_frames(tmp_path: Path) -> Non
     for count in (11, None):
         found = find_truth(str(tmp_path / "frames.npz"), None, None, 3, 2, shown=shown(count))
         assert found is not None
-        assert found.right.tolist() == [[2], [0]]
-        assert found.soft.tolist() == [[1], [-1]]
+        assert found.positives.tolist() == [[2], [0]]
+        assert found.ignored.tolist() == [[1], [-1]]
     np.savez(tmp_path / "places.npz", GThard=np.eye(3, 2, dtype=bool))
     found = find_truth(str(tmp_path / "places.npz"), None, None, 3, 2, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[0], [1]]
+    assert found.positives.tolist() == [[0], [1]]
     np.savez(tmp_path / "number.npz", GThard=np.array(True))
     with refused("number.npz", "expected a matrix"):
         find_truth(str(tmp_path / "number.npz"), None, None, 3, 2, shown=shown())
@@ -255,7 +257,7 @@ def test_coordinates_are_of_frames(tmp_path: Path) -> None:
     folders = [ImageFolder(tmp_path / name) for name in ("reference", "query")]
     found = find_truth("utm:1", *folders, 3, 2, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[1], [2]]  # frames 4 and 10 of the reference
+    assert found.positives.tolist() == [[1], [2]]  # frames 4 and 10 of the reference
 
 
 def test_as_many_even_steps_are_no_truth() -> None:
@@ -273,7 +275,7 @@ def test_positions_are_of_frames() -> None:
     reference.place, query.place = torch.arange(12.0), torch.arange(10.0) + 1
     found = find_truth(None, reference, query, 3, 2, shown=shown())
     assert found is not None
-    assert found.right.tolist() == [[1], [2]]  # positions 4 and 10
+    assert found.positives.tolist() == [[1], [2]]  # positions 4 and 10
 
 
 # the commands --------------------------------------------------------------------------------------------
@@ -300,7 +302,7 @@ def localize(folder: Path, name: str, *options: str) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / name).open()))
 
 
-def evaluate(folder: Path, truth: str, out: Path, *options: str) -> dict:
+def evaluate_file(folder: Path, truth: str, out: Path, *options: str) -> dict:
     truth = truth if truth.isdigit() else f"{folder}/{truth}"
     main(["evaluate", f"{folder}/matches.csv", "--truth", truth, "--out", str(out), *options])
     return json.loads((out / "report.json").read_text())
@@ -318,7 +320,7 @@ def test_convention_11_matches_name_the_frames_as_well(folder: Path) -> None:
 def test_truth_in_frames_and_in_places_and_positions_agree(folder: Path, tmp_path: Path) -> None:
     given = ["--map", f"{folder}/m.safetensors"]
     reports = [
-        evaluate(folder, truth, tmp_path / f"{k}", *given)
+        evaluate_file(folder, truth, tmp_path / f"{k}", *given)
         for k, truth in enumerate(("frames.csv", "places.csv", "0"))
     ]
     assert {report["places"] for report in reports} == {101}
@@ -332,7 +334,7 @@ def test_compare_is_learn_localize_and_evaluate(folder: Path, tmp_path: Path) ->
     pair, truth = [f"{folder}/reference.npy", f"{folder}/query.npy"], ["--truth", f"{folder}/frames.csv"]
     main(["compare", *pair, *truth, "--out", f"{tmp_path}/c", *OPTIONS])
     report = json.loads((tmp_path / "c" / "report.json").read_text())
-    alone = evaluate(folder, "frames.csv", tmp_path / "e", "--map", f"{folder}/m.safetensors")
+    alone = evaluate_file(folder, "frames.csv", tmp_path / "e", "--map", f"{folder}/m.safetensors")
     for key in ("auc", "recall_at_1", "recall_at_100_precision", "judged", "accepted_right"):
         assert report[key] == pytest.approx(alone[key], rel=1e-6), key
     assert report["spacing"] == {"step": STEP, "reference_frames": len(REFERENCE), "query_frames": len(QUERY)}
@@ -364,7 +366,7 @@ def test_info_tells_how_the_ground_was_measured(folder: Path, capsys: pytest.Cap
     main(["info", f"{folder}/m.safetensors"])
     told = capsys.readouterr().out
     assert "places are 6 pixels of ground apart" in told
-    assert "VelocityNormalizer: corners=((0.0, 0.0)" in told
+    assert "GroundOdometry: corners=((0.0, 0.0)" in told
 
 
 def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
@@ -430,7 +432,7 @@ def test_even_steps_at_constant_speed_may_be_judged_by_an_offset(tmp_path: Path)
     main(["localize", map_, source, "--out", f"{tmp_path}/matches.csv"])
     rows = list(csv.DictReader((tmp_path / "matches.csv").open()))
     assert [row["query"] for row in rows] == [row["query_frame"] for row in rows]
-    assert evaluate(tmp_path, "0", tmp_path / "e", "--map", map_)["judged"] == len(rows)
+    assert evaluate_file(tmp_path, "0", tmp_path / "e", "--map", map_)["judged"] == len(rows)
 
 
 def test_a_map_that_was_not_matched_is_refused(
@@ -496,7 +498,7 @@ def test_a_bare_velocity_is_understood(folder: Path, tmp_path: Path) -> None:
 def test_ground_that_moves_to_and_fro_is_told(caplog: pytest.LogCaptureFixture) -> None:
     where = 100 + positions(*[(4, 2), (-4, 1)] * 10)
     with caplog.at_level("WARNING", "dejavu_torch"):
-        EvenlySpaced(ArrayTraverse(footage(where)), camera())
+        ResampledTraverse(ArrayTraverse(footage(where)), camera())
     assert any("20 of 30 steps go forward and 10 backwards" in line for line in caplog.messages)
 
 
@@ -509,7 +511,7 @@ def test_a_step_may_be_a_whole_number(tmp_path: Path) -> None:
 def test_nan_is_told_by_the_frame_as_it_came() -> None:
     frames = footage(REFERENCE)
     velocity = camera()
-    even = EvenlySpaced(ArrayTraverse(frames), velocity)
+    even = ResampledTraverse(ArrayTraverse(frames), velocity)
     frames[30, :, :3, :3] = torch.nan
     even.traverse = ArrayTraverse(frames)
     with refused("frame 30 gives NaN"):

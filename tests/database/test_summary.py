@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 
 from dejavu_torch import FrequencyLayer
-from dejavu_torch.database.certificate import certify, describe
+from dejavu_torch.database.summary import describe, summarise
 from dejavu_torch.types import Plan
 
 PLAN: Plan = (
@@ -21,7 +21,7 @@ PLAN: Plan = (
 
 
 def test_numbers_of_a_plan_made_by_hand() -> None:
-    certificate = certify(PLAN, places=2500, map_bytes=10_000)
+    certificate = summarise(PLAN, places=2500, map_bytes=10_000)
     assert certificate.places == 2500
     assert certificate.covered == 1024 + 600  # the last two chunks overlap
     assert certificate.templates == 93 + 171 + 98 + 4 + 6 + 15
@@ -31,7 +31,7 @@ def test_numbers_of_a_plan_made_by_hand() -> None:
 
 
 def test_chunks_of_a_plan_made_by_hand() -> None:
-    first, second, third = certify(PLAN, places=2500, map_bytes=1).chunks
+    first, second, third = summarise(PLAN, places=2500, map_bytes=1).chunks
     assert (first.start, first.stop, first.periods, first.features) == (0, 1024, (93, 171), (3, 2))
     assert first.common_period == 5301  # not the product, 15903
     assert first.shared_factors == (3,)
@@ -45,7 +45,7 @@ def test_chunks_of_a_plan_made_by_hand() -> None:
 
 
 def test_the_order_of_the_layers_does_not_matter_to_the_totals() -> None:
-    a, b = certify(PLAN, 2500, 1), certify(PLAN[::-1], 2500, 1)
+    a, b = summarise(PLAN, 2500, 1), summarise(PLAN[::-1], 2500, 1)
     assert a[:6] == b[:6]
     assert [(x.start, x.stop, x.common_period) for x in a.chunks] == [
         (x.start, x.stop, x.common_period) for x in b.chunks
@@ -53,13 +53,13 @@ def test_the_order_of_the_layers_does_not_matter_to_the_totals() -> None:
 
 
 def test_a_plan_without_layers() -> None:
-    certificate = certify((), places=50, map_bytes=200)
+    certificate = summarise((), places=50, map_bytes=200)
     assert certificate == (50, 0, 0, 0, 200, 4.0, ())
-    assert certify((), places=0, map_bytes=200).bytes_per_place == 200
+    assert summarise((), places=0, map_bytes=200).bytes_per_place == 200
 
 
 def test_description_tells_the_numbers() -> None:
-    lines = describe(certify(PLAN, places=2500, map_bytes=10_000)).splitlines()
+    lines = describe(summarise(PLAN, places=2500, map_bytes=10_000)).splitlines()
     assert len(lines) == 4
     for number in ("0-1023", "93", "171", "5301", "gcd 3"):
         assert number in lines[0]
@@ -71,6 +71,6 @@ def test_description_tells_the_numbers() -> None:
 
 def test_description_of_many_layers_stays_short() -> None:
     plan = tuple(FrequencyLayer(Fraction(p), p, 0, 1024, (0,)) for p in range(8, 108))
-    first, _ = describe(certify(plan, 1024, 1)).splitlines()
+    first, _ = describe(summarise(plan, 1024, 1)).splitlines()
     assert "100 layers" in first
     assert len(first) < 300

@@ -19,10 +19,10 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.mapfile import build, recipe_of
-from dejavu_torch.features.ground import TRAPEZIUM, ground_patch, length_seen, shift_between
-from dejavu_torch.features.mend import mended
-from dejavu_torch.features.spacing import EvenlySpaced
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.motion.ground_plane import TRAPEZIUM, ground_patch, length_seen, shift_between
+from dejavu_torch.motion.mend import mended
+from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.types import Traverse
 
 PATCH, AHEAD = 96, 200  # pixels of ground: the patch, and where the drive begins
@@ -172,7 +172,7 @@ def test_corners_that_are_no_region_are_refused(corners: tuple, words: tuple[str
     with refused(*words):
         ground_patch(torch.rand(1, 1, 60, 80), corners)
     with refused(*words):
-        VelocityNormalizer(corners)
+        GroundOdometry(corners)
 
 
 def test_patches_and_frames_of_wrong_size_are_refused() -> None:
@@ -181,7 +181,7 @@ def test_patches_and_frames_of_wrong_size_are_refused() -> None:
     with refused("1 x 80", "at least 2 x 2"):
         ground_patch(torch.rand(1, 1, 1, 80))
     with refused("(31, 96)", "at least 32"):
-        VelocityNormalizer(size=(31, 96))
+        GroundOdometry(size=(31, 96))
     with refused("(40, 31)", "at least 32"):
         shift_between(torch.rand(2, 1, 40, 31), torch.rand(2, 1, 40, 31))
     two = torch.rand(2, 1, 64, 64)
@@ -249,7 +249,7 @@ def test_of_equal_peaks_the_steady_ones(start: float) -> None:
     frames = drive(position, texture=0.02, sleepers=0.3)
     patches = ground_patch(frames)
     alone, _ = shift_between(patches[:-1], patches[1:])
-    followed, _ = VelocityNormalizer()(frames)
+    followed, _ = GroundOdometry()(frames)
     wrong = (alone - position.diff()).abs()
     assert (wrong > 1).sum() >= 5
     whole = wrong[wrong > 1] / SLEEPER  # periods
@@ -267,7 +267,7 @@ def path_error(distance: Tensor, position: Tensor) -> float:
 
 
 def test_a_drive_with_stops_and_a_reversal() -> None:
-    measured = VelocityNormalizer().distances(journey())
+    measured = GroundOdometry().distances(journey())
     assert measured.distance.dtype == torch.float64
     assert path_error(measured.distance, JOURNEY) < 0.01
     assert (measured.distance - JOURNEY).abs().max() < 0.01 * JOURNEY.diff().abs().sum()
@@ -290,7 +290,7 @@ def test_motion_blur(sleepers: float) -> None:
     """The shutter stays open all the time: each frame is smeared by as much as the ground moves."""
     position = travelled((20, 20, 30))
     frames = drive(position, texture=0.05, sleepers=sleepers, blur=1.0)
-    assert path_error(VelocityNormalizer().distances(Shown(frames)).distance, position) < 0.02
+    assert path_error(GroundOdometry().distances(Shown(frames)).distance, position) < 0.02
     patches = ground_patch(frames)
     plain = single_scale(patches[:-1], patches[1:]).sum() / (position[-1] - position[0])
     assert abs(plain - 1) > 0.48  # half the way or more is lost
@@ -298,13 +298,13 @@ def test_motion_blur(sleepers: float) -> None:
 
 def test_frame_rate_changes_nothing() -> None:
     slow, fast = travelled((10, 10, 20)), travelled((5, 5, 40))
-    ways = [VelocityNormalizer().distances(Shown(drive(at))).distance[-1] for at in (slow, fast)]
+    ways = [GroundOdometry().distances(Shown(drive(at))).distance[-1] for at in (slow, fast)]
     assert ways[0].item() == pytest.approx(ways[1].item(), rel=0.01)
 
 
 def test_frames_reversed_go_the_way_back() -> None:
     there, back = (
-        VelocityNormalizer().distances(Shown(frames)).distance
+        GroundOdometry().distances(Shown(frames)).distance
         for frames in (journey().frames, journey().frames.flip(0))
     )
     torch.testing.assert_close(back, there.flip(0) - there[-1], rtol=0, atol=1.0)
@@ -313,21 +313,21 @@ def test_frames_reversed_go_the_way_back() -> None:
 @settings(max_examples=3)
 @given(size=st.integers(1, 90))
 def test_batches_do_not_matter(size: int) -> None:
-    whole = VelocityNormalizer().distances(journey(), 100)
-    parts = VelocityNormalizer().distances(journey(), size)
+    whole = GroundOdometry().distances(journey(), 100)
+    parts = GroundOdometry().distances(journey(), size)
     torch.testing.assert_close(parts.distance, whole.distance, rtol=0, atol=1e-3)
     torch.testing.assert_close(parts.confidence, whole.confidence, rtol=0, atol=1e-4)
 
 
 def test_forward_gives_the_steps_as_measured() -> None:
     frames = short().frames.expand(-1, 3, -1, -1)
-    shift, confidence = VelocityNormalizer()(frames)
+    shift, confidence = GroundOdometry()(frames)
     torch.testing.assert_close(shift, torch.full((11,), 5.0), rtol=0, atol=0.1)
     assert confidence.shape == (11,)
 
 
 def test_a_standing_camera_is_measured_within_the_dead_band() -> None:
-    shift, _ = VelocityNormalizer()(drive(torch.full((30,), 7.0, dtype=torch.float64)))
+    shift, _ = GroundOdometry()(drive(torch.full((30,), 7.0, dtype=torch.float64)))
     assert shift.abs().max() < 0.1
 
 
@@ -336,7 +336,7 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixtur
     frames = drive(position)
     frames[9] = 0  # two steps see nothing
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
-        measured = VelocityNormalizer().distances(Shown(frames))
+        measured = GroundOdometry().distances(Shown(frames))
     assert caplog.messages == [
         "the drive: no common ground in frames 8 to 10 (2 of 20 steps): the velocity there is interpolated"
     ]
@@ -347,7 +347,7 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixtur
 def test_a_cut_is_told(caplog: pytest.LogCaptureFixture) -> None:
     position = travelled((6, 6, 8), (900, 900, 1), (6, 6, 8))
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
-        way = VelocityNormalizer().distances(Shown(drive(position))).distance
+        way = GroundOdometry().distances(Shown(drive(position))).distance
     assert caplog.messages == [
         "the drive: a cut or bad view after frame 8: the velocity there is interpolated"
     ]
@@ -393,7 +393,7 @@ def test_interpolated_between_the_neighbours() -> None:
 def test_a_frame_that_is_not_finite_is_a_drop_out() -> None:
     frames = short().frames.clone()
     frames[6] = math.nan
-    measured = VelocityNormalizer().distances(Shown(frames))
+    measured = GroundOdometry().distances(Shown(frames))
     assert measured.confidence[5:7].tolist() == [0, 0]
     torch.testing.assert_close(measured.distance.diff(), torch.full((11,), 5.0).double(), rtol=0, atol=0.1)
 
@@ -418,7 +418,7 @@ def test_a_patch_finer_than_the_frames_is_told(
     height: int, width: int, size: tuple[int, int], told: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     frames = torch.rand(1, 1, height, width).expand(4, -1, -1, -1)
-    VelocityNormalizer(size=size).distances(Shown(frames), batch_size=2)
+    GroundOdometry(size=size).distances(Shown(frames), batch_size=2)
     assert len(caplog.messages) == bool(told)
     assert told in caplog.text
 
@@ -433,7 +433,7 @@ def test_slow_motion_is_better_seen_by_the_size_that_is_told() -> None:
     """What the warning says, as it is."""
     position = travelled((1, 1, 20))
     frames = avg_pool2d(drive(position, noise=0.0, exposure=False), 2)
-    far = [VelocityNormalizer(size=(n, n))(frames)[0].sum() * PATCH / n / 20 for n in (96, 61)]
+    far = [GroundOdometry(size=(n, n))(frames)[0].sum() * PATCH / n / 20 for n in (96, 61)]
     assert far[0] < 0.85
     assert far[1] > 0.9
 
@@ -441,20 +441,20 @@ def test_slow_motion_is_better_seen_by_the_size_that_is_told() -> None:
 @pytest.mark.parametrize("flow", ["lk", "dis"])
 def test_a_drive_by_optical_flow(flow: str) -> None:
     pytest.importorskip("cv2")
-    measured = VelocityNormalizer(flow=flow).distances(journey())
+    measured = GroundOdometry(flow=flow).distances(journey())
     assert path_error(measured.distance, JOURNEY) < 0.002
     assert measured.confidence.min() > 0.6
     assert (measured.distance.diff()[JOURNEY.diff() == 0] == 0).all()
     position = travelled((20, 20, 12))
     smeared = drive(position, texture=0.05, blur=1.0)
-    assert path_error(VelocityNormalizer(flow=flow).distances(Shown(smeared)).distance, position) < 0.01
+    assert path_error(GroundOdometry(flow=flow).distances(Shown(smeared)).distance, position) < 0.01
 
 
 @pytest.mark.parametrize("lost", [0, 11])
 def test_steps_lost_at_an_end_get_the_nearest_velocity(lost: int) -> None:
     frames = short().frames.clone()
     frames[lost] = 0
-    way = VelocityNormalizer().distances(Shown(frames)).distance
+    way = GroundOdometry().distances(Shown(frames)).distance
     torch.testing.assert_close(way.diff(), torch.full((11,), 5.0).double(), rtol=0, atol=0.1)
 
 
@@ -463,7 +463,7 @@ def test_steps_lost_at_an_end_get_the_nearest_velocity(lost: int) -> None:
 
 def test_places_are_evenly_spaced() -> None:
     """What is shown lies within half a frame's motion of even steps along the true way."""
-    even = EvenlySpaced(journey(), VelocityNormalizer(step=8.0))
+    even = ResampledTraverse(journey(), GroundOdometry(step=8.0))
     true = JOURNEY[even.frame]
     furthest = JOURNEY.max()
     assert even.length == len(even.frame) == len(all_of(even))
@@ -476,15 +476,15 @@ def test_places_are_evenly_spaced() -> None:
 
 def test_going_back_and_forth_adds_no_places() -> None:
     position = travelled((6, 6, 12), (-6, -6, 8), (6, 6, 16))
-    back_and_forth = EvenlySpaced(Shown(drive(position)), VelocityNormalizer(step=6.0))
-    plain = EvenlySpaced(Shown(drive(travelled((6, 6, 20)))), VelocityNormalizer(step=6.0))
+    back_and_forth = ResampledTraverse(Shown(drive(position)), GroundOdometry(step=6.0))
+    plain = ResampledTraverse(Shown(drive(travelled((6, 6, 20)))), GroundOdometry(step=6.0))
     assert abs(back_and_forth.length - plain.length) <= 1
     shown = set(back_and_forth.frame.tolist())
     assert not shown & set(range(14, 27))  # the way back, and again up to where it turned
 
 
 def test_a_blend_lies_between_its_neighbours() -> None:
-    even = EvenlySpaced(short(), VelocityNormalizer(step=2.0, blend=True))
+    even = ResampledTraverse(short(), GroundOdometry(step=2.0, blend=True))
     place = even.place
     assert place is not None
     torch.testing.assert_close(place, 2.0 * torch.arange(even.length).double(), rtol=0, atol=0.5)
@@ -496,7 +496,7 @@ def test_a_blend_lies_between_its_neighbours() -> None:
 
 def test_the_median_step_of_moving_frames_is_the_default() -> None:
     position = travelled((5, 5, 11), (0, 0, 30))
-    even = EvenlySpaced(Shown(drive(position)), VelocityNormalizer())
+    even = ResampledTraverse(Shown(drive(position)), GroundOdometry())
     assert abs(even.length - 12) <= 1
     assert even.step == pytest.approx(5, abs=0.05)
     assert even.place is None
@@ -504,7 +504,7 @@ def test_the_median_step_of_moving_frames_is_the_default() -> None:
 
 def test_a_camera_that_looks_back() -> None:
     frames = short().frames.flip(0)
-    even = EvenlySpaced(Shown(frames), VelocityNormalizer(step=5.0))
+    even = ResampledTraverse(Shown(frames), GroundOdometry(step=5.0))
     assert abs(even.length - 12) <= 1
     assert even.frame[0] == 0
 
@@ -512,7 +512,7 @@ def test_a_camera_that_looks_back() -> None:
 @pytest.mark.parametrize("blend", [False, True])
 @pytest.mark.parametrize("step", [1.5, 14.0])
 def test_any_batch_size_any_number_of_times(blend: bool, step: float) -> None:
-    even = EvenlySpaced(short(), VelocityNormalizer(step=step, blend=blend))
+    even = ResampledTraverse(short(), GroundOdometry(step=step, blend=blend))
     frames = all_of(even, 100)
     for size in (1, 2, 5, 12):
         batches = list(even.batches(size))
@@ -527,7 +527,7 @@ def test_any_batch_size_any_number_of_times(blend: bool, step: float) -> None:
 def test_few_frames_are_in_memory(largest_tensor: type) -> None:
     traverse = journey()
     with largest_tensor() as seen:
-        even = EvenlySpaced(traverse, VelocityNormalizer(step=8.0, blend=True), batch_size=4)
+        even = ResampledTraverse(traverse, GroundOdometry(step=8.0, blend=True), batch_size=4)
         for _ in even.batches(4):
             pass
     assert seen.numel < traverse.frames.numel() / 8
@@ -539,26 +539,26 @@ def test_few_frames_are_in_memory(largest_tensor: type) -> None:
 def test_footage_without_motion_is_refused() -> None:
     still = Shown(short().frames[:1].expand(6, -1, -1, -1))
     with refused("the drive stands still in all of its 6 frames", "expected motion"):
-        EvenlySpaced(still, VelocityNormalizer())
+        ResampledTraverse(still, GroundOdometry())
     with refused("pixels of ground", "at least one step, 1000"):
-        EvenlySpaced(short(), VelocityNormalizer(step=1000.0))
+        ResampledTraverse(short(), GroundOdometry(step=1000.0))
 
 
 def test_footage_without_ground_is_refused() -> None:
     with refused("none of 4 steps", "expected corners on the ground"):
-        VelocityNormalizer().distances(Shown(torch.zeros(5, 1, 60, 80)))
+        GroundOdometry().distances(Shown(torch.zeros(5, 1, 60, 80)))
 
 
 def test_one_frame_is_refused() -> None:
     with refused("the drive has 1 frame;", "at least 2"):
-        EvenlySpaced(Shown(short().frames[:1]), VelocityNormalizer())
+        ResampledTraverse(Shown(short().frames[:1]), GroundOdometry())
     with refused("there are 1 frames", "at least 2"):
-        VelocityNormalizer()(short().frames[:1])
+        GroundOdometry()(short().frames[:1])
 
 
 def test_ready_features_are_refused() -> None:
     with refused("features", "(5, 7)", "expected frames (B,C,H,W)"):
-        EvenlySpaced(ArrayTraverse(torch.rand(5, 7)), VelocityNormalizer())
+        ResampledTraverse(ArrayTraverse(torch.rand(5, 7)), GroundOdometry())
 
 
 @pytest.mark.parametrize(
@@ -572,12 +572,12 @@ def test_ready_features_are_refused() -> None:
 )
 def test_settings_out_of_range_are_refused(choice: dict, words: tuple[str, ...]) -> None:
     with refused(*words):
-        VelocityNormalizer(**choice)
+        GroundOdometry(**choice)
 
 
 def test_a_recipe_builds_the_same_module() -> None:
-    module = VelocityNormalizer(size=(64, 48), step=3.0, blend=True, flow="phase")
-    assert repr(build(recipe_of(module), VelocityNormalizer)) == repr(module)
+    module = GroundOdometry(size=(64, 48), step=3.0, blend=True, flow="phase")
+    assert repr(build(recipe_of(module), GroundOdometry)) == repr(module)
 
 
 # --- real footage
@@ -586,7 +586,7 @@ def test_a_recipe_builds_the_same_module() -> None:
 def test_a_car_on_a_motorway(data_dir: Path) -> None:
     """Nearly constant speed over the nine seconds, every step believed."""
     car = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
-    measured = VelocityNormalizer().distances(car)
+    measured = GroundOdometry().distances(car)
     speed = measured.distance.diff()
     assert (measured.confidence > 0.6).all()
     assert speed.std() < 0.1 * speed.mean()
@@ -598,7 +598,7 @@ def test_a_small_car_that_sways(data_dir: Path) -> None:
     """Coarse frames of a road almost without texture: a wide region sees it drive on, lap after lap."""
     car = open_source(f"{data_dir}/rc_car_laps/frames")
     wide = ((0.2, 0.5), (0.8, 0.5), (1.0, 0.95), (0.0, 0.95))
-    measured = VelocityNormalizer(wide, (48, 48)).distances(car)
+    measured = GroundOdometry(wide, (48, 48)).distances(car)
     assert (measured.confidence > 0.4).double().mean() > 0.95
     laps = torch.stack(
         [measured.distance[b] - measured.distance[a] for a, b in ((194, 590), (590, 982), (982, 1356))]

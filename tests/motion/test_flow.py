@@ -12,9 +12,9 @@ from helpers import refused
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from dejavu_torch.features.flow import flow_shift
-from dejavu_torch.features.ground import shift_between
-from dejavu_torch.features.velocity import VelocityNormalizer
+from dejavu_torch.motion.flow import flow_shift
+from dejavu_torch.motion.ground_plane import shift_between
+from dejavu_torch.motion.odometry import GroundOdometry
 
 pytest.importorskip("cv2")
 
@@ -129,20 +129,20 @@ def test_wrong_input_is_refused() -> None:
     with refused("'farneback'", "lk, dis"):
         flow_shift(two, two, "farneback")
     with refused("'farneback'", "lk, dis"):
-        VelocityNormalizer(flow="farneback")
+        GroundOdometry(flow="farneback")
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_without_opencv_one_line_says_what_to_install(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with refused("OpenCV", "pip install 'dejavu_torch[flow]'"):
-        VelocityNormalizer(flow=method)
-    VelocityNormalizer()(torch.rand(2, 1, 240, 320))
+        GroundOdometry(flow=method)
+    GroundOdometry()(torch.rand(2, 1, 240, 320))
 
 
 def test_opencv_is_loaded_only_when_used() -> None:
     code = (
-        "import sys; from dejavu_torch import VelocityNormalizer as V; V(); print('cv2' in sys.modules);"
+        "import sys; from dejavu_torch import GroundOdometry as V; V(); print('cv2' in sys.modules);"
         "V(flow='lk'); print('cv2' in sys.modules)"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.features.gather import gather
+from dejavu_torch.features.memory import concatenate
 
 
 @given(
@@ -22,13 +22,13 @@ from dejavu_torch.features.gather import gather
 )
 def test_whatever_the_memory_the_rows_are_the_same(rows: int, width: int, batch: int, in_memory: int) -> None:
     features = torch.randn(rows, width)
-    assert torch.equal(gather(features.split(batch), in_memory), features)
+    assert torch.equal(concatenate(features.split(batch), in_memory), features)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_spilled_rows_keep_their_type_and_can_be_changed_without_harm(dtype: torch.dtype) -> None:
     features = torch.randn(9, 3, dtype=dtype)
-    spilled = gather(features.split(2), in_memory=0)
+    spilled = concatenate(features.split(2), in_memory=0)
     assert spilled.dtype == dtype
     assert torch.equal(spilled, features)
     spilled[0] = 7
@@ -47,14 +47,14 @@ def test_memory_holds_no_more_than_its_share(tmp_path: Path, monkeypatch: pytest
             yield batch
             assert sum(ref() is not None for ref in made) <= 3  # two that fit in memory, and the next
 
-    spilled = gather(batches(), in_memory=2 * 4 * 256 * 4)
+    spilled = concatenate(batches(), in_memory=2 * 4 * 256 * 4)
     assert list(tmp_path.iterdir()) == []  # the file has no name: nothing is left, whatever happens
     assert torch.equal(spilled[::4, 0], torch.arange(100.0))
 
 
 def test_batches_that_do_not_lie_in_a_row_spill_as_they_read() -> None:
     features = torch.randn(5, 12).T
-    assert torch.equal(gather(features.split(5), in_memory=0), features)
+    assert torch.equal(concatenate(features.split(5), in_memory=0), features)
 
 
 def test_a_full_disk_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,7 +66,7 @@ def test_a_full_disk_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(tempfile, "TemporaryFile", Full)
     with refused("do not fit into a temporary file", "No space left on device", "TMPDIR"):
-        gather(torch.rand(4, 4).split(1), in_memory=0)
+        concatenate(torch.rand(4, 4).split(1), in_memory=0)
 
 
 def test_no_folder_for_the_file_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,7 +75,7 @@ def test_no_folder_for_the_file_is_told(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(tempfile, "TemporaryFile", nowhere)
     with refused("do not fit into a temporary file", "No usable temporary directory", "TMPDIR"):
-        gather(torch.rand(4, 4).split(1), in_memory=0)
+        concatenate(torch.rand(4, 4).split(1), in_memory=0)
 
 
 def test_what_the_traverse_complains_about_passes() -> None:
@@ -84,13 +84,13 @@ def test_what_the_traverse_complains_about_passes() -> None:
         raise OSError("the camera is gone")
 
     with pytest.raises(OSError, match="the camera is gone"):
-        gather(batches())
+        concatenate(batches())
 
 
 def test_mixed_and_missing_batches_are_refused() -> None:
     with refused("features 2.. are 4 of torch.float32", "expected 3 of torch.float32"):
-        gather([torch.rand(2, 3), torch.rand(2, 4)])
+        concatenate([torch.rand(2, 3), torch.rand(2, 4)])
     with refused("features 2.. are 3 of torch.float64", "expected 3 of torch.float32"):
-        gather([torch.rand(2, 3), torch.rand(2, 3).double()])
+        concatenate([torch.rand(2, 3), torch.rand(2, 3).double()])
     with refused("no features"):
-        gather([])
+        concatenate([])

@@ -15,7 +15,7 @@ from dejavu_torch.types import InputError
 IN_MEMORY = 2**29  # bytes
 
 
-def gather(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor:
+def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor:
     """The batches as one tensor, which may be larger than the memory.
 
     Args:
@@ -30,7 +30,7 @@ def gather(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor:
         InputError: batches of different D or number type, none at all, or no room for the file.
 
     Example:
-        >>> gather(torch.arange(6.0).view(3, 2).split(2)).tolist()
+        >>> concatenate(torch.arange(6.0).view(3, 2).split(2)).tolist()
         [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]
     """
     parts: list[Tensor] = []

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.features.ground import FLOOR, check_size
+from dejavu_torch.motion.ground_plane import FLOOR, check_size
 from dejavu_torch.types import InputError
 
 Array = np.ndarray[Any, Any]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.database.compressed import CompressedMap
-from dejavu_torch.recognition.distance import Metric, check_metric, phase_distances
+from dejavu_torch.database.distance import Metric, check_metric, phase_distances
 from dejavu_torch.types import InputError, Plan
 
 Reduction = Literal["mean", "sum"]

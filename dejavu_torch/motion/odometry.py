@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from dejavu_torch.features.extract import BATCH_NUMBERS, frame_shape
-from dejavu_torch.features.flow import TRACKS, check_method, flow_shift
-from dejavu_torch.features.ground import (
+from dejavu_torch.motion.flow import TRACKS, check_method, flow_shift
+from dejavu_torch.motion.ground_plane import (
     SURE,
     TRAPEZIUM,
     Corners,
@@ -23,13 +23,13 @@ from dejavu_torch.features.ground import (
     shift_peaks,
     steady,
 )
-from dejavu_torch.features.mend import mended
+from dejavu_torch.motion.mend import mended
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
 
-class Ground(NamedTuple):
+class Odometry(NamedTuple):
     """How far a traverse has come at each frame.
 
     distance: (N,) float64, pixels of ground (rows of the patch) from frame 0, negative behind it.
@@ -40,7 +40,7 @@ class Ground(NamedTuple):
     confidence: Tensor
 
 
-class VelocityNormalizer(nn.Module):
+class GroundOdometry(nn.Module):
     """Measures how fast the ground in front of the camera moves.
 
     Args:
@@ -48,14 +48,14 @@ class VelocityNormalizer(nn.Module):
             near left; its sides parallel on the ground, such as the rails. See `ground_patch`.
         size: (rows, columns) of the patch it becomes, pixels, at least 32 x 32. The fastest step that can be
             seen is about 0.42 of its rows.
-        step: pixels of ground from one frame of `EvenlySpaced` to the next; None is the median step of the
+        step: pixels of ground from one resampled frame to the next; None is the median step of the
             frames that move.
         least: confidence below which a step is not believed, in [0, 1]. The default tells a cut in patches of
             96 x 96; in those of 32 x 32 unrelated ground can agree by 0.8.
         still: pixels of ground; a shorter step of either sign counts as 0, as of a camera that stands. Noise
             of a few grey levels moves ground of clear texture by less; ground that hardly stands out from
             the noise needs more, slow footage of many frames a second less.
-        blend: `EvenlySpaced` shows a blend of the two frames next to each place instead of the nearest.
+        blend: `ResampledTraverse` shows a blend of the two frames next to each place instead of the nearest.
         flow: how patches are compared: "phase" (`shift_between`), or optical flow of OpenCV, "lk" on corners
             or "dis" on all pixels (`flow_shift`, with its limits; `pip install 'dejavu_torch[flow]'`).
 
@@ -71,7 +71,7 @@ class VelocityNormalizer(nn.Module):
             forward: fewer than two frames, or not (N,C,H,W) float.
 
     Example:
-        >>> shift, confidence = VelocityNormalizer()(torch.rand(1, 3, 120, 160).expand(5, 3, 120, 160))
+        >>> shift, confidence = GroundOdometry()(torch.rand(1, 3, 120, 160).expand(5, 3, 120, 160))
         >>> shift.abs().max().item() < 0.01, confidence.min().item() > 0.99
         (True, True)
     """
@@ -121,7 +121,7 @@ class VelocityNormalizer(nn.Module):
         path = steady(shifts, sure, self.size[0]).to(shifts.device)[:, None]
         return shifts.gather(1, path)[:, 0], sure.gather(1, path)[:, 0]
 
-    def distances(self, traverse: Traverse, batch_size: int = 64, progress: bool = False) -> Ground:
+    def distances(self, traverse: Traverse, batch_size: int = 64, progress: bool = False) -> Odometry:
         """How far the camera has come at each frame of a traverse, which is read once, batch by batch.
 
         Args:
@@ -160,7 +160,7 @@ class VelocityNormalizer(nn.Module):
         shift, confidence = self._steady(shifts, sure)
         shift = mended(shift.double(), confidence >= self.least, traverse.name)
         shift = torch.where(shift.abs() < self.still, 0.0, shift)
-        return Ground(torch.cat([shift.new_zeros(1), shift.cumsum(0)]), confidence)
+        return Odometry(torch.cat([shift.new_zeros(1), shift.cumsum(0)]), confidence)
 
     def _tell_coarse(self, batch: Tensor, name: str) -> None:
         """Tell of a patch finer than what the frames show: what is interpolated hardly moves."""

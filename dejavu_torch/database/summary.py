@@ -10,7 +10,7 @@ from dejavu_torch.periods.support import common_period, shared_factor
 from dejavu_torch.types import Plan
 
 
-class ChunkCertificate(NamedTuple):
+class ChunkSummary(NamedTuple):
     """One chunk [start, stop): its periods, how many places they can tell apart, and what they share.
 
     common_period: the least common multiple of the periods, in frames; the capacity.
@@ -27,7 +27,7 @@ class ChunkCertificate(NamedTuple):
     shared_factors: tuple[Fraction, ...]
 
 
-class Certificate(NamedTuple):
+class MapSummary(NamedTuple):
     """Capacity and storage of a map.
 
     places: N. covered: places that at least one layer covers.
@@ -41,10 +41,10 @@ class Certificate(NamedTuple):
     template_numbers: int
     map_bytes: int
     bytes_per_place: float
-    chunks: tuple[ChunkCertificate, ...]
+    chunks: tuple[ChunkSummary, ...]
 
 
-def certify(plan: Plan, places: int, map_bytes: int) -> Certificate:
+def summarise(plan: Plan, places: int, map_bytes: int) -> MapSummary:
     """The certificate of a plan over `places` places stored in `map_bytes` bytes."""
     chunks = []
     covered: set[int] = set()
@@ -52,7 +52,7 @@ def certify(plan: Plan, places: int, map_bytes: int) -> Certificate:
         members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
         periods = tuple(layer.period for layer in members)
         chunks.append(
-            ChunkCertificate(
+            ChunkSummary(
                 start,
                 stop,
                 periods,
@@ -62,7 +62,7 @@ def certify(plan: Plan, places: int, map_bytes: int) -> Certificate:
             )
         )
         covered.update(range(start, stop))
-    return Certificate(
+    return MapSummary(
         places,
         len(covered),
         sum(layer.phases for layer in plan),
@@ -73,13 +73,13 @@ def certify(plan: Plan, places: int, map_bytes: int) -> Certificate:
     )
 
 
-def describe(certificate: Certificate) -> str:
+def describe(certificate: MapSummary) -> str:
     """The plan and the certificate in lines for a person.
 
     Example:
         >>> from dejavu_torch.types import FrequencyLayer
         >>> layers = [FrequencyLayer(Fraction(p), p, 0, 1024, (0, 1)) for p in (93, 171)]
-        >>> print(describe(certify(tuple(layers), places=1024, map_bytes=4096)))
+        >>> print(describe(summarise(tuple(layers), places=1024, map_bytes=4096)))
         frames 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); lcm 5301 frames, gcd 3
         1024 of 1024 places covered; 264 templates, 528 numbers; 4096 bytes, 4.0 per place
     """

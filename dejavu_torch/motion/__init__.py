@@ -1,0 +1,1 @@
+"""Frames -> frames at even steps along the ground (section IV-B)."""
