@@ -6,60 +6,83 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     III    the whole method                      DejaVu              model
     III-A  spectrogram, two strongest periods    SpectrogramAnalysis periods.spectrogram
     III-A  layers of features of like period     FrequencyLayer      types, periods.layers
-    eq. 2  phase masks M(i, tau, k)              phase_mask          database.phase
-    eq. 1  templates mu(H, tau, k)               PhaseTemplates      database.phase
-           the map they make, as one file        CompressedMap       database.compressed, database.mapfile
+    eq. 2  phase masks M(i, tau, k)              phase_mask          database.templates
+    eq. 1  templates mu(H, tau, k)               PhaseTemplates      database.templates
+           the map they make                     TemplateMapper      database.template_map
     eq. 3  distance to every phase of a layer    phase_distances     database.distance
-    eq. 4  scores S(i) of all places             Matcher             database.scores
+    eq. 4  scores S(i) of all places             TemplateMap         database.template_map
+           any kind of map                       PlaceMap            database.place_map
+           what it can tell apart, its bytes     MapSummary          database.summary
     eq. 5  best place, eq. 6 acceptance          best_match          recognition.select
     IV-A   HOG features                          HOG, hog            features.hog
     IV-A   window slid along an aerial image     SlidingWindow       data.strip
-    IV-B   velocity from the ground              GroundOdometry  motion.odometry, motion.resampling
+    IV-B   velocity from the ground              GroundOdometry      motion.odometry, motion.resampling
     IV-A   (ours) channel, local contrast        Preprocess          features.preprocess
     IV-C   precision, recall, area               pr_curve, evaluate  evaluation.curves
+    V      (ours) beside baselines and nulls     compare             experiments.compare
+    VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
+           frames to train on                    RouteData           training.datamodule
+           any backbone                          Embedding           features.embedding
+           periods imposed instead of found      ImposedPeriods      periods.imposed
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.strip import SlidingWindow
-from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.distance import phase_distances
-from dejavu_torch.database.phase import PhaseTemplates, phase_mask
-from dejavu_torch.database.scores import Matcher
+from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.summary import MapSummary
+from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
+from dejavu_torch.database.templates import PhaseTemplates, phase_mask
 from dejavu_torch.evaluation.curves import evaluate, pr_curve
+from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG, hog
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match, PRCurve, Traverse
+
+if TYPE_CHECKING:
+    from dejavu_torch.experiments.compare import compare
+    from dejavu_torch.training.datamodule import RouteData
+    from dejavu_torch.training.task import PlaceRecognitionTask
 
 __version__ = "0.1.0"
 
 __all__ = [
     "HOG",
-    "AerialRoad",
     "ArrayTraverse",
-    "CompressedMap",
     "DejaVu",
+    "Embedding",
     "FrequencyLayer",
     "GroundOdometry",
     "ImageFolder",
+    "ImposedPeriods",
     "InputError",
     "MapSummary",
     "Match",
-    "Matcher",
     "PRCurve",
     "PhaseTemplates",
+    "PlaceMap",
+    "PlaceRecognitionTask",
     "Preprocess",
+    "RouteData",
     "SlidingWindow",
     "SpectrogramAnalysis",
+    "TemplateMap",
+    "TemplateMapper",
     "Traverse",
     "best_match",
+    "compare",
     "evaluate",
     "hog",
     "open_source",
@@ -67,3 +90,16 @@ __all__ = [
     "phase_mask",
     "pr_curve",
 ]
+
+# what loads matplotlib or Lightning, loaded when it is first asked for
+_LAZY = {
+    "PlaceRecognitionTask": "dejavu_torch.training.task",
+    "RouteData": "dejavu_torch.training.datamodule",
+    "compare": "dejavu_torch.experiments.compare",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LAZY[name]), name)

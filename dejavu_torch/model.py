@@ -12,19 +12,20 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import as_traverse
-from dejavu_torch.database.compressed import CompressedMap
-from dejavu_torch.database.distance import Metric
-from dejavu_torch.database.mapfile import build_parts, map_size, part_recipes, read_map, write_map
-from dejavu_torch.database.phase import PhaseTemplates
-from dejavu_torch.database.scores import Matcher, Reduction
-from dejavu_torch.database.summary import MapSummary, summarise
-from dejavu_torch.features.extract import check_frames, feature_batches, features_of, frame_shape
+from dejavu_torch.database.mapfile import map_size, read_map, write_map
+from dejavu_torch.database.place_map import Mapper, PlaceMap
+from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
+from dejavu_torch.database.summary import MapSummary
+from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.features.extract import check_queries, feature_batches, features_of, frame_shape
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import InputError, Match, Training, Traverse
@@ -32,8 +33,28 @@ from dejavu_torch.types import InputError, Match, Training, Traverse
 log = logging.getLogger("dejavu_torch")
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
-SETTINGS = ("metric", "reduction", "threshold", "batch_size", "temperature")
 MANY_FEATURES = 50_000  # per frame: worth a word
+
+# the classes that a map file may name; any other has to be given by the caller
+CLASSES = (
+    Preprocess,
+    HOG,
+    SmallCNN,
+    Embedding,
+    SpectrogramAnalysis,
+    ImposedPeriods,
+    TemplateMapper,
+    GroundOdometry,
+)
+REGISTRY: Registry = {cls.__name__: cls for cls in CLASSES}
+KINDS = {cls.kind: cls for cls in (TemplateMap,)}
+PARTS: dict[str, type[nn.Module]] = {
+    "preprocess": Preprocess,
+    "features": nn.Module,
+    "mapper": Mapper,
+    "velocity": GroundOdometry,
+}
+SETTINGS = ("threshold", "batch_size")
 
 
 class DejaVu(nn.Module):
@@ -41,21 +62,22 @@ class DejaVu(nn.Module):
 
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
-        periods: finds the layers; None is SpectrogramAnalysis with its defaults.
-        metric: distance of eq. 3, see `phase_distances`.
-        reduction: how layers combine in eq. 4, see `combine_layers`.
+        mapper: makes the map from the features of a traverse; None is TemplateMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
-        velocity: makes places and queries even steps along the ground (section IV-B), see `evenly`;
-            None takes the frames as they come.
-        temperature: scores are then those of `log_posterior`; None leaves S as it is.
+        velocity: measures how the ground moves, so that places and queries are even steps along it (section
+            IV-B), see `resample`; None takes the frames as they are.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
+    Convention: a match counts places; `map.frame_of` gives the reference frame that a place shows. `forward` is
+        a fixed run of tensor operations without host synchronisation: it goes through `torch.export` with a
+        dynamic batch and through `torch.compile(fullgraph=True)`.
+
     Example:
         >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])  # two features that repeat
-        >>> model = DejaVu(periods=SpectrogramAnalysis(window=64, strongest=1)).learn(wave)
+        >>> model = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(window=64, strongest=1))).learn(wave)
         >>> model.localize(wave[20:22]).index
         tensor([20, 21])
     """
@@ -63,14 +85,11 @@ class DejaVu(nn.Module):
     def __init__(
         self,
         features: nn.Module | None = None,
-        periods: PeriodFinder | None = None,
-        metric: Metric = "l1",
-        reduction: Reduction = "mean",
+        mapper: Mapper | None = None,
         threshold: float | None = None,
         batch_size: int = 64,
         preprocess: Preprocess | None = None,
         velocity: GroundOdometry | None = None,
-        temperature: float | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1:
@@ -79,40 +98,40 @@ class DejaVu(nn.Module):
             raise InputError("the threshold is NaN; expected a number")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
-        self.periods = SpectrogramAnalysis() if periods is None else periods
-        self.templates = PhaseTemplates()
-        self.matcher = Matcher(metric, reduction, temperature)
+        self.mapper = TemplateMapper() if mapper is None else mapper
         self.threshold = threshold
         self.batch_size = batch_size
         self.velocity = velocity
-        self.map = CompressedMap()
+        self.map: PlaceMap = self.mapper.empty()
         self.step: float | None = None  # pixels of ground from one place of the map to the next
-        self.learnt_from: tuple[int, ...] | None = None  # a frame's (C,H,W), or (D,) of ready features
+        self.frame_shape: tuple[int, ...] | None = (
+            None  # of the reference, (C,H,W), or (D,) of ready features
+        )
         self.trained: Training | None = None
 
     def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
-        """Section III-A: features, their periods, layers, and the templates of eq. 1.
+        """Section III-A: features, what repeats in them, and the map.
 
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
             progress: show a progress bar on a terminal.
 
         Returns:
-            self, with the map in `self.map`. A route in which nothing repeats gives a map without
+            self, with the map in `self.map`. A route in which nothing repeats gives a template map without
             layers, on which every place scores +inf. Memory does not grow with the frames: features
             beyond `concatenate`'s share of it spill to a temporary file.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes.
         """
-        traverse = self.evenly(as_traverse(traverse), progress=progress)
+        traverse = self.resample(as_traverse(traverse), progress=progress)
         return self.learn_features(self.extract_all(traverse, "learning" if progress else None), traverse)
 
-    def evenly(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
+    def resample(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
         """A traverse at even steps along the ground, where `velocity` is set; else as it is.
 
         Args:
-            traverse: frames, in order; one that is evenly spaced already stays as it is.
+            traverse: frames, in order; one that is resampled already stays as it is.
             step: pixels of ground; None is `velocity`'s own. Queries need the map's, `self.step`; of them a
                 single frame, and ready features, stay as they are.
 
@@ -131,45 +150,53 @@ class DejaVu(nn.Module):
         Args:
             features: (N,D) float.
             traverse: what they come from, where known: the map then knows what frames to expect, and,
-                where they are evenly spaced, which frame each place shows.
+                where they were resampled, which frame each place shows.
         """
         shape = () if traverse is None else frame_shape(traverse)
         if len(shape) == 3 and features.shape[1] > MANY_FEATURES:
             log.warning(
-                "each frame gives %d features; smaller frames make a smaller and faster map, as ?width=160 "
-                "behind a folder or video does",
+                "each frame gives %d features; smaller frames make a smaller and faster map",
                 features.shape[1],
             )
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast are left as they are")
-        plan = self.periods.plan(features)
         with torch.no_grad():
-            templates = self.templates(features, plan)
-        self.step, way = None, None
+            route: PlaceMap = self.mapper(features)
+        if route.places != len(features) or route.dimension != features.shape[1]:
+            raise InputError(
+                f"{type(self.mapper).__name__} made a map of {route.places} places of {route.dimension} "
+                f"features from features {tuple(features.shape)}; expected as many"
+            )
+        self.step = None
         if isinstance(traverse, ResampledTraverse):
-            self.step, way = traverse.step, traverse.way
-        places, dimension = features.shape
-        self.map = CompressedMap(plan, templates, places, dimension, way).to(features.device)
-        self.learnt_from, self.trained = shape or None, None
+            self.step, route.positions = traverse.step, traverse.positions.float().to(features.device)
+            route.check()
+        self.map = route
+        self.frame_shape, self.trained = shape or None, None
         return self
+
+    def describe(self, frames: Tensor) -> Tensor:
+        """Features of frames: preprocess, then features. (B,C,H,W) -> (B,D)"""
+        features: Tensor = self.features(self.preprocess(frames))
+        return features
 
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
-        features = features_of(queries, self.pipeline, "the query")
+        features = features_of(queries, self.describe, "the query")
         self.check_queries(tuple(queries.shape[1:]), features.shape[1], "the query")
-        scores: Tensor = self.matcher(features, self.map)
-        return scores
+        return self.map.scores(features)
 
-    def localize(self, queries: Traverse | Tensor, progress: bool = False) -> Match:
+    def localize(self, queries: Traverse | Tensor, progress: str | None = None) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
         Args:
             queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D).
+            progress: text of a progress bar on a terminal; None is no bar.
 
         Shape: -> Match of (Q,) on the CPU.
 
-        Convention: on a map of even steps the queries are spaced as evenly first, see `evenly`.
+        Convention: on a map of even steps the queries are resampled likewise first, see `resample`.
 
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
@@ -177,25 +204,25 @@ class DejaVu(nn.Module):
         matches = list(self.matches(queries, progress))
         return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
 
-    def matches(self, queries: Traverse | Tensor, progress: bool = False) -> Iterator[Match]:
+    def matches(self, queries: Traverse | Tensor, progress: str | None = None) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         queries = as_traverse(queries)
         if self.step is not None:
-            queries = self.evenly(queries, self.step, progress)
+            queries = self.resample(queries, self.step, progress is not None)
         shape = frame_shape(queries)
-        for i, features in enumerate(self.extract(queries, "localizing" if progress else None)):
+        for i, features in enumerate(self.extract(queries, progress)):
             if i == 0:
                 self.check_queries(shape, features.shape[1], queries.name)
             for part in features.split(at_once):
                 with torch.no_grad():
-                    match = best_match(self.matcher(part, self.map), self.threshold)
+                    match = best_match(self.map.scores(part), self.threshold)
                 yield Match(*(column.cpu() for column in match))
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Features of a traverse in batches (B,D), without gradients."""
-        return feature_batches(traverse, self.pipeline, self.batch_size, self.map.size.device, progress)
+        return feature_batches(traverse, self.pipeline, self.batch_size, self.map.positions.device, progress)
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
         """Features of a whole traverse, (N,D); many of them lie in a temporary file, see `concatenate`."""
@@ -206,6 +233,16 @@ class DejaVu(nn.Module):
         """What makes features of frames: preprocess, then features."""
         return nn.Sequential(self.preprocess, self.features)
 
+    def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
+        """Refuse queries that do not fit the map, and warn of frames of another size that do.
+
+        Args:
+            shape: of one query, (C,H,W) or (D,). dimension: D, how many features it gives.
+            name: of the queries, for the message.
+        """
+        resized = getattr(self.features, "resize", None) is not None
+        check_queries(shape, dimension, self.frame_shape, self.map.dimension, resized, name)
+
     def save(self, path: str | Path) -> None:
         """Write the map, with the feature module's weights, as one safetensors file.
 
@@ -213,8 +250,6 @@ class DejaVu(nn.Module):
             InputError: nothing learnt yet, or the file cannot be written.
         """
         self._require_map()
-        if callable(self.matcher.metric):
-            raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
         write_map(Path(path), *self._file())
 
     @classmethod
@@ -230,17 +265,17 @@ class DejaVu(nn.Module):
         """
         tensors, header = read_map(Path(path))
         try:
-            parts = build_parts(header, features)
-            model = cls(**parts, **{name: header[name] for name in SETTINGS})
-            model.set_extra_state(header)
-            loaded = model.load_state_dict(tensors, strict=False)
-            not_kept = ("periods.", "_extra_state")
-            missing = [name for name in loaded.missing_keys if not name.startswith(not_kept)]
+            check_kind(header["map"])
+            model = cls(**_build_parts(header, features), **{name: header[name] for name in SETTINGS})
+            model.set_extra_state({name: header[name] for name in model.get_extra_state()})
+            state: dict[str, Any] = {**tensors, "map._extra_state": header["map"]}
+            loaded = model.load_state_dict(state, strict=False)
+            missing = [name for name in loaded.missing_keys if name.startswith(("map.", "features."))]
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
-            spaced = model.velocity is not None and isinstance(model.step, float) and model.step > 0
-            if (len(model.map.way) > 0) != spaced or (model.step is not None) != spaced:
-                raise InputError(f"it has step {model.step!r} and a way of {len(model.map.way)} frames")
+            resampled = model.velocity is not None and isinstance(model.step, float) and model.step > 0
+            if (len(model.map.positions) > 0) != resampled or (model.step is not None) != resampled:
+                raise InputError(f"it has step {model.step!r} and {len(model.map.positions)} frame positions")
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         except (AttributeError, KeyError, RuntimeError, TypeError) as error:
@@ -248,53 +283,94 @@ class DejaVu(nn.Module):
             raise InputError(f"{path} does not {what}: {' '.join(str(error).split())}") from error
         return model.eval()
 
-    @property
-    def map_bytes(self) -> int:
-        """Size of the map file: all that `localize` needs beyond the installed package."""
-        return map_size(*self._file())
-
-    @property
-    def backbone_bytes(self) -> int:
-        """The part of `map_bytes` that is weights of the feature module."""
-        return sum(t.nbytes for t in self.features.state_dict().values() if isinstance(t, Tensor))
-
-    @property
-    def certificate(self) -> MapSummary:
-        """What the map can tell apart and what it costs."""
-        return summarise(self.map.plan, self.map.places, self.map_bytes)
-
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        metric = self.matcher.metric
-        header = part_recipes(self) | self.get_extra_state()
-        header |= {name: getattr(self.matcher, name) for name in ("reduction", "temperature")}
-        header |= {"threshold": self.threshold, "batch_size": self.batch_size}
-        header["metric"] = metric if isinstance(metric, str) else getattr(metric, "__name__", "callable")
-        # what found the periods is not needed any more
-        tensors = {f"map.{name}": t for name, t in self.map.state_dict().items()}
-        weights = {f"features.{n}": t for n, t in self.features.state_dict().items() if isinstance(t, Tensor)}
-        return tensors | weights, header
+        parts = {name: getattr(self, name) for name in PARTS}
+        header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
+        header |= {name: getattr(self, name) for name in SETTINGS} | self.get_extra_state()
+        header["map"] = self.map.get_extra_state()
+        tensors = {f"map.{name}": t for name, t in self.map.state_dict().items() if isinstance(t, Tensor)}
+        return tensors | self._weights(), header
 
-    def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
-        """Refuse queries that do not fit the map, and tell of frames of another size that do.
+    def _weights(self) -> dict[str, Tensor]:
+        weights = self.features.state_dict()
+        return {f"features.{name}": tensor for name, tensor in weights.items() if isinstance(tensor, Tensor)}
 
-        Args:
-            shape: of one query, (C,H,W) or (D,). dimension: D, how many features it gives.
-            name: of the queries, for the message.
-        """
-        resized = getattr(self.features, "resize", None) is not None
-        check_frames(shape, dimension, self.learnt_from, self.map.dimension, resized, name)
+    def summary(self) -> MapSummary:
+        """What the map can tell apart, and the bytes of its file by part."""
+        tensors, header = self._file()
+        summary, backbone = self.map.summary(), sum(tensor.nbytes for tensor in self._weights().values())
+        rest = map_size(tensors, header) - summary.route_bytes - backbone
+        return summary.with_fixed(backbone=backbone, header=rest)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What the state_dict holds beside the tensors."""
+        """What the state_dict holds beside the tensors and the map's own state."""
         trained = self.trained and self.trained._asdict()
-        return {"learnt_from": self.learnt_from, "step": self.step, "trained": trained}
+        return {"frame_shape": self.frame_shape, "step": self.step, "trained": trained}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` gave."""
-        shape, trained = state["learnt_from"], state.get("trained")
-        self.learnt_from, self.step = shape and tuple(shape), state.get("step")
+        shape, trained = state["frame_shape"], state["trained"]
+        self.frame_shape, self.step = shape and tuple(shape), state["step"]
         self.trained = trained and Training(**trained)
 
     def _require_map(self) -> None:
         if not self.map.places:
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
+
+
+def check_kind(state: dict[str, Any]) -> None:
+    """Refuse a map of a kind that this version does not know.
+
+    Raises:
+        InputError: naming the kinds that it knows.
+    """
+    if state["kind"] not in KINDS:
+        raise InputError(f"a map of kind {state['kind']!r}; this version knows {', '.join(KINDS)}")
+
+
+def read_place_map(path: Path) -> PlaceMap:
+    """The map of a file alone, without what made its features.
+
+    Raises:
+        InputError: as `DejaVu.load`.
+    """
+    tensors, header = read_map(path)
+    try:
+        check_kind(header["map"])
+        mapper = _build(header, "mapper", None)
+        assert isinstance(mapper, Mapper)
+        route, own = mapper.empty(), {"_extra_state": header["map"]}
+        own |= {
+            name.removeprefix("map."): tensor for name, tensor in tensors.items() if name.startswith("map.")
+        }
+        route.load_state_dict(own)
+    except (InputError, RuntimeError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())}") from error
+    return route
+
+
+def _build_parts(header: dict[str, Any], features: nn.Module | None) -> dict[str, Any]:
+    """The modules that a map's header names, by the names of `PARTS`.
+
+    Args:
+        features: the module that made the map's features, needed where it is not one of this package.
+
+    Raises:
+        InputError: modules that cannot be built, or other features than the map's.
+    """
+    if features is not None:
+        own, stored = recipe_of(features, REGISTRY), Recipe(**header["features"])
+        if own not in with_parts(stored):
+            raise InputError(f"it was learned with {difference(stored, own)}")
+    return {name: _build(header, name, features) for name in PARTS}
+
+
+def _build(header: dict[str, Any], name: str, features: nn.Module | None) -> nn.Module | None:
+    if header[name] is None:
+        return None
+    recipe = Recipe(**header[name])
+    # only learning needs what found the periods: one from elsewhere need not be built
+    periods = recipe.init_args.get("periods")
+    if name == "mapper" and isinstance(periods, dict) and periods.get("class_path") not in REGISTRY:
+        recipe = recipe._replace(init_args=recipe.init_args | {"periods": None})
+    return build(recipe, PARTS[name], REGISTRY, features)

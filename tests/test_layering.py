@@ -100,7 +100,7 @@ def test_files_stay_short(file: Path) -> None:
         ("features/deep/net.py", "from ...database import phase"),
         ("data/files.py", "def f():\n    from dejavu_torch.model import DejaVu"),
         ("data/simulate/aerial.py", "if True:\n    import dejavu_torch.evaluation as e"),
-        ("database/phase.py", "import torch, dejavu_torch.database.scores"),
+        ("database/phase.py", "import torch, dejavu_torch.database.template_map"),
         ("database/scores.py", "from ..model import DejaVu"),
         ("model.py", "from .evaluation import curves"),
         ("model.py", "from . import evaluation"),

@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.scores import log_posterior
+from dejavu_torch.database.template_map import log_posterior
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess

@@ -43,6 +43,11 @@ def check_metric(metric: Metric) -> None:
         )
 
 
+def metric_name(metric: Metric) -> str:
+    """The name that stands for a metric in a state: its own, or "callable"."""
+    return metric if isinstance(metric, str) else "callable"
+
+
 def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> Tensor:
     """Distance of each query to the template of each phase: eq. 3 for all k at once.
 
@@ -61,8 +66,15 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
     Example:
         >>> phase_distances(torch.tensor([[1.0, 2.0]]), torch.tensor([[1.0, 2.0], [0.0, 4.0]]))
         tensor([[0., 3.]])
+
+    Raises:
+        InputError: tensors that are not (Q,F) and (P,F), an unknown metric, or one that does not give (Q,P).
     """
     check_metric(metric)
+    if query.ndim != 2 or templates.ndim != 2 or query.shape[1] != templates.shape[1]:
+        raise InputError(
+            f"phase_distances got {tuple(query.shape)} and {tuple(templates.shape)}; expected (Q,F) and (P,F)"
+        )
     function = metric if callable(metric) else METRICS[metric]
     dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
     with torch.autocast(query.device.type, enabled=False):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import combinations
 from typing import NamedTuple
 
 from dejavu_torch.periods.support import common_period, shared_factor
 from dejavu_torch.types import Plan
+
+LAYERS_SHOWN = 6
+LARGE = 10**9  # a common period beyond it is no figure that a person compares
 
 
 class ChunkSummary(NamedTuple):
@@ -27,85 +32,103 @@ class ChunkSummary(NamedTuple):
     shared_factors: tuple[Fraction, ...]
 
 
-class MapSummary(NamedTuple):
-    """Capacity and storage of a map.
+@dataclass(frozen=True, repr=False)
+class MapSummary:
+    """Capacity and storage of a map; printed, it is a few lines for a person.
 
-    places: N. covered: places that at least one layer covers.
-    templates: sum of phases. template_numbers: sum of phases x features.
-    map_bytes: size of the map file. bytes_per_place: map_bytes / N.
+    Attributes:
+        kind: of the map. places: N. covered: places that at least one layer covers.
+        templates: sum of phases. template_numbers: sum of phases x features.
+        chunks: what repeats in each.
+        fixed: bytes that do not grow with the route, by part, such as the backbone.
+        route: bytes that do, by part, such as the templates.
     """
 
+    kind: str
     places: int
     covered: int
     templates: int
     template_numbers: int
-    map_bytes: int
-    bytes_per_place: float
     chunks: tuple[ChunkSummary, ...]
+    route: Mapping[str, int]
+    fixed: Mapping[str, int]
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Sum of `fixed`."""
+        return sum(self.fixed.values())
+
+    @property
+    def route_bytes(self) -> int:
+        """Sum of `route`."""
+        return sum(self.route.values())
+
+    @property
+    def map_bytes(self) -> int:
+        """Everything that `localize` needs beyond the installed package."""
+        return self.fixed_bytes + self.route_bytes
+
+    @property
+    def bytes_per_place(self) -> float:
+        """`map_bytes` over the number of places."""
+        return self.map_bytes / max(self.places, 1)
+
+    def with_fixed(self, **parts: int) -> MapSummary:
+        """The summary with further parts of a fixed size, those of 0 bytes left out."""
+        return replace(self, fixed={**self.fixed, **{name: size for name, size in parts.items() if size}})
+
+    def __repr__(self) -> str:
+        return describe(self)
 
 
-def summarise(plan: Plan, places: int, map_bytes: int) -> MapSummary:
-    """The certificate of a plan over `places` places stored in `map_bytes` bytes."""
+def summarise(plan: Plan, places: int, route: Mapping[str, int]) -> MapSummary:
+    """The summary of a plan over `places` places, whose parts take these bytes."""
     chunks = []
     covered: set[int] = set()
     for start, stop in sorted({(layer.start, layer.stop) for layer in plan}):
         members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
         periods = tuple(layer.period for layer in members)
-        chunks.append(
-            ChunkSummary(
-                start,
-                stop,
-                periods,
-                tuple(len(layer.features) for layer in members),
-                common_period(periods),
-                tuple(shared_factor(a, b) for a, b in combinations(periods, 2)),
-            )
-        )
+        features = tuple(len(layer.features) for layer in members)
+        shared = tuple(shared_factor(a, b) for a, b in combinations(periods, 2))
+        chunks.append(ChunkSummary(start, stop, periods, features, common_period(periods), shared))
         covered.update(range(start, stop))
-    return MapSummary(
-        places,
-        len(covered),
-        sum(layer.phases for layer in plan),
-        sum(layer.phases * len(layer.features) for layer in plan),
-        map_bytes,
-        map_bytes / max(places, 1),
-        tuple(chunks),
-    )
+    templates = sum(layer.phases for layer in plan)
+    numbers = sum(layer.phases * len(layer.features) for layer in plan)
+    return MapSummary("templates", places, len(covered), templates, numbers, tuple(chunks), route, {})
 
 
-def describe(certificate: MapSummary) -> str:
-    """The plan and the certificate in lines for a person.
+def describe(summary: MapSummary) -> str:
+    """The chunks with their periods, and what is stored, in lines for a person.
 
     Example:
         >>> from dejavu_torch.types import FrequencyLayer
         >>> layers = [FrequencyLayer(Fraction(p), p, 0, 1024, (0, 1)) for p in (93, 171)]
-        >>> print(describe(summarise(tuple(layers), places=1024, map_bytes=4096)))
-        frames 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); lcm 5301 frames, gcd 3
-        1024 of 1024 places covered; 264 templates, 528 numbers; 4096 bytes, 4.0 per place
+        >>> print(summarise(tuple(layers), places=1024, route={"templates": 2112, "layers": 1984}))
+        frames 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); together 5301 frames
+        1024 of 1024 places covered; 264 templates, 528 numbers
+        4096 bytes, 4.0 per place: templates 2112, layers 1984
     """
-    lines = []
-    for chunk in certificate.chunks:
-        largest = sorted(range(len(chunk.periods)), key=lambda j: -chunk.features[j])[:6]
-        shown = ", ".join(
-            f"{_number(chunk.periods[j])} ({chunk.features[j]} features)" for j in sorted(largest)
-        )
-        more = len(chunk.periods) - len(largest)
-        lcm = _number(chunk.common_period) if chunk.common_period < 10**9 else "over 1e9"
-        layers = f"{len(chunk.periods)} layer{'s' * (len(chunk.periods) > 1)}"
-        line = f"frames {chunk.start}-{chunk.stop - 1}: {layers}, periods {shown}" + (
-            f" and {more} smaller layer{'s' * (more > 1)}" if more else ""
-        )
-        line += f"; lcm {lcm} frames"
-        if chunk.shared_factors:
-            low, high = min(chunk.shared_factors), max(chunk.shared_factors)
-            line += f", gcd {_number(low)}" + ("" if low == high else f" to {_number(high)}")
-        lines.append(line)
+    lines = [_chunk_line(chunk) for chunk in summary.chunks]
     lines.append(
-        f"{certificate.covered} of {certificate.places} places covered; {certificate.templates} templates, "
-        f"{certificate.template_numbers} numbers; {certificate.map_bytes} bytes, "
-        f"{certificate.bytes_per_place:.1f} per place"
+        f"{summary.covered} of {summary.places} places covered; {summary.templates} templates, "
+        f"{summary.template_numbers} numbers"
     )
+    parts = ", ".join(f"{name} {size}" for name, size in {**summary.route, **summary.fixed}.items())
+    lines.append(f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: {parts}")
     return "\n".join(lines)
+
+
+def _chunk_line(chunk: ChunkSummary) -> str:
+    largest = sorted(range(len(chunk.periods)), key=lambda j: -chunk.features[j])[:LAYERS_SHOWN]
+    shown = ", ".join(f"{_number(chunk.periods[j])} ({chunk.features[j]} features)" for j in sorted(largest))
+    more = len(chunk.periods) - len(largest)
+    layers = f"{len(chunk.periods)} layer{'s' * (len(chunk.periods) > 1)}"
+    line = f"frames {chunk.start}-{chunk.stop - 1}: {layers}, periods {shown}"
+    if more:
+        line += f" and {more} smaller layer{'s' * (more > 1)}"
+    if len(chunk.periods) > 1 and chunk.common_period < LARGE:
+        line += f"; together {_number(chunk.common_period)} frames"
+    return line
 
 
 def _number(value: Fraction) -> str:

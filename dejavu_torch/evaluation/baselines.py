@@ -1,18 +1,39 @@
-"""What a user would store instead: all the frames, or every k-th."""
+"""What a user would store instead of the map, and the null controls: every contender of a report."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from dejavu_torch.database.distance import Metric, phase_distances
+from dejavu_torch.database.template_map import TemplateMap
+from dejavu_torch.evaluation.controls import leave_out_match, null_control
+from dejavu_torch.features.extract import frame_shape
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import Match
+from dejavu_torch.types import InputError, Match, Traverse
+
+log = logging.getLogger("dejavu_torch")
 
 DISTANCES_AT_ONCE = 2**22
+
+
+class Baseline(NamedTuple):
+    """Matches of another way to store the route.
+
+    name: for tables. bytes: that it stores. k: where it stores every k-th frame.
+    """
+
+    name: str
+    match: Match
+    bytes: int | None = None
+    k: int | None = None
 
 
 def nearest_frames(
@@ -20,14 +41,14 @@ def nearest_frames(
     query: Tensor,
     strides: Sequence[int] = (1,),
     metric: Metric = "l1",
-    progress: bool = False,
+    progress: str | None = None,
 ) -> list[Match]:
     """Nearest stored frame of each query, where every k-th reference frame is stored.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
         strides: each k; 1 stores all frames. All are found in one pass over the distances.
-        progress: show a progress bar on a terminal.
+        progress: text of a progress bar on a terminal; None is no bar.
 
     Returns:
         For each k a Match of (Q,), index in reference frames.
@@ -36,7 +57,7 @@ def nearest_frames(
     parts: list[list[Match]] = [[] for _ in strides]
     with torch.no_grad():
         batches = query.split(rows)
-        for batch in tqdm(batches, "baselines", disable=None if progress else True, leave=False):
+        for batch in tqdm(batches, progress, disable=None if progress else True, leave=False):
             distances = phase_distances(batch, reference, metric)
             for found, k in zip(parts, strides, strict=True):
                 match = best_match(distances[:, ::k])
@@ -57,9 +78,89 @@ def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tole
         >>> fair_stride(frames=1000, dimension=10, itemsize=4, map_bytes=8000, tolerance=5)
         5
     """
-    fair = [
-        k
-        for k in range(1, max(1, 2 * tolerance) + 1)
-        if stride_bytes(frames, dimension, itemsize, k) >= map_bytes
-    ]
+    strides = range(1, max(1, 2 * tolerance) + 1)
+    fair = [k for k in strides if stride_bytes(frames, dimension, itemsize, k) >= map_bytes]
     return max(fair, default=1)
+
+
+def baselines_of(
+    model: DejaVu,
+    reference: Tensor,
+    query: Tensor,
+    tolerance: int,
+    seed: int = 0,
+    leave_out: int | None = None,
+    progress: bool = False,
+) -> dict[str, Baseline]:
+    """The baselines and null controls that every report sets beside the map, by their keys in report.json.
+
+    Args:
+        model: with the map. reference: (N,D) its features. query: (Q,D) those of the queries.
+        tolerance: the coarsest stride is twice as much. seed: of the shuffle of the null controls.
+        leave_out: also query the reference with itself, see `leave_out_match`.
+        progress: show progress bars on a terminal.
+    """
+    frames, dimension = reference.shape
+    summary, itemsize = model.summary(), reference.element_size()
+    backbone = summary.fixed.get("backbone", 0)  # frames need it as well
+    fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
+    strides = {"uncompressed": 1, "stride": fair, "stride_coarsest": max(1, 2 * tolerance)}
+    of = "" if isinstance(model.features, HOG) else "same features, "
+    names = {
+        "uncompressed": f"{of}all {frames} frames",
+        "stride": f"{of}{_every(fair)} (at least the map's bytes)",
+        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'])} (2 x tolerance)",
+    }
+    metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
+    text = "baselines: frames stored as they are" if progress else None
+    nearest = nearest_frames(reference, query, tuple(strides.values()), metric, text)
+    found = {
+        key: Baseline(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k)
+        for (key, k), match in zip(strides.items(), nearest, strict=True)
+    }
+    text = "null control: shuffled frames" if progress else None
+    if model.trained is None:
+        anew = null_control(model, reference, query, seed, progress=text)
+        found["null"] = Baseline("null: everything learned from shuffled frames", anew)
+    if isinstance(model.map, TemplateMap):
+        same = null_control(model, reference, query, seed, same_plan=True, progress=text)
+        if model.trained is None:
+            found["null_same_plan"] = Baseline("null: this map's layers, shuffled frames", same)
+        else:  # training anew is a run of its own
+            found["null"] = Baseline("null: templates of shuffled frames", same)
+    if leave_out is not None:
+        itself = leave_out_match(model, reference, leave_out)
+        found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
+    return found
+
+
+def hog_baselines(
+    reference: Traverse, query: Traverse, batch_size: int, tolerance: int, progress: bool = False
+) -> dict[str, Baseline]:
+    """What a map of other features is set beside: HOG of all frames, and of every k-th, k = 2 x tolerance.
+
+    Nothing where the traverses hold ready features, or frames too small for HOG.
+    """
+    if len(frame_shape(reference)) != 3:
+        return {}
+    plain = DejaVu(batch_size=batch_size)
+    try:
+        stored = plain.extract_all(reference, "baselines: HOG of the reference" if progress else None)
+        queries = plain.extract_all(query, "baselines: HOG of the query" if progress else None)
+    except InputError as error:
+        log.info("no HOG to compare with: %s", error)
+        return {}
+    strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
+    text = "baselines: HOG of all frames" if progress else None
+    nearest = nearest_frames(stored, queries, tuple(strides.values()), progress=text)
+    frames, dimension = stored.shape
+    return {
+        key: Baseline(
+            f"HOG, {_every(k)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
+        )
+        for (key, k), match in zip(strides.items(), nearest, strict=True)
+    }
+
+
+def _every(k: int) -> str:
+    return "every frame" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } frame"

@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.distance import Metric, phase_distances
-from dejavu_torch.database.scores import combine_layers, log_posterior
+from dejavu_torch.database.place_map import Mapper
+from dejavu_torch.database.template_map import TemplateMap, log_posterior
+from dejavu_torch.database.templates import PhaseTemplates
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 
-def same_settings(model: DejaVu) -> DejaVu:
-    """A model with the settings of another and no map."""
-    matcher = model.matcher
-    return DejaVu(
-        model.features,
-        model.periods,
-        matcher.metric,
-        matcher.reduction,
-        model.threshold,
-        model.batch_size,
-        model.preprocess,
-        model.velocity,
-        matcher.temperature,
-    )
+def with_mapper(model: DejaVu, mapper: Mapper) -> DejaVu:
+    """A model with the settings and the feature module of another, this mapper, and no map."""
+    return DejaVu(model.features, mapper, model.threshold, model.batch_size, model.preprocess, model.velocity)
+
+
+def template_map_of(model: DejaVu, what: str) -> TemplateMap:
+    """The model's map, where it is one of templates.
+
+    Args:
+        what: needs one, for the message.
+
+    Raises:
+        InputError: a map of another kind.
+    """
+    if not isinstance(model.map, TemplateMap):
+        raise InputError(f"{what} is of template maps; got a map of kind {model.map.kind!r}")
+    return model.map
 
 
 def null_control(
@@ -36,36 +42,43 @@ def null_control(
     query: Tensor,
     seed: int = 0,
     same_plan: bool = False,
-    progress: bool = False,
+    progress: str | None = None,
 ) -> Match:
-    """Matches of a map learnt from the reference in shuffled order.
+    """Matches of a map learned from the reference in shuffled order.
 
     Nothing repeats in time any more, so what such a map still recognises does not come from periods
     but from templates that hold few frames each, as any store of frames does.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
-        same_plan: keep the layers of the model and learn only the templates anew. Otherwise the periods
-            are sought anew too; the default preset then finds none, since shuffled frames are noise
-            in time, and reports nothing.
-        progress: show a progress bar on a terminal.
+        same_plan: keep the layers of the model's template map and learn only the templates anew. Otherwise
+            the periods are sought anew too; the default preset then finds none, since shuffled frames are
+            noise in time, and reports nothing.
+        progress: text of a progress bar on a terminal; None is no bar.
 
     Returns:
         Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
         the map reports nothing.
     """
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
-    parts = order.to(reference.device).split(256)
-    shuffled, null = concatenate(reference[part] for part in parts), same_settings(model)
+    shuffled = concatenate(reference[part] for part in order.to(reference.device).split(256))
+    null = with_mapper(model, model.mapper)
     if same_plan:
-        plan, weights = model.map.plan, model.map.weights if len(model.map.weights) else None
-        templates = null.templates(model.map.weighted(shuffled), plan)
-        null.map = CompressedMap(plan, templates, len(order), shuffled.shape[1], weights=weights)
-        null.map.to(shuffled.device)
+        null.map = _same_layers(template_map_of(model, "the null of the same layers"), shuffled)
     else:
         null.learn_features(shuffled)
     match = null.localize(query, progress)
     return match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
+
+
+def _same_layers(route: TemplateMap, features: Tensor) -> TemplateMap:
+    """The layers and settings of a map, with the phase means of other features."""
+    templates = PhaseTemplates()(route.weighted(features), route.plan)
+    null = copy.deepcopy(route)
+    null.positions = null.positions[:0]
+    if templates:
+        null.templates = torch.cat([block.flatten() for block in templates])
+    return null
 
 
 def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
@@ -75,34 +88,39 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
     template's mean. On sliding footage width = 0 cures nothing, the neighbours carry the answer.
 
     Args:
-        reference: (N,D), the features the map was learnt from.
+        reference: (N,D), the features the map was learned from.
         width: w, frames to each side.
 
     Returns:
         Match of (N,). A phase left without frames scores +inf at its places.
+
+    Raises:
+        InputError: a width below 0, features of another shape than the map's, or a map whose templates are
+            not means of them: one of another kind, or a trained one.
     """
-    if width < 0 or tuple(reference.shape) != (model.map.places, model.map.dimension):
+    route = template_map_of(model, "leave_out")
+    if width < 0 or tuple(reference.shape) != (route.places, route.dimension):
         raise InputError(
             f"leave-out got width {width} and features {tuple(reference.shape)}; "
-            f"expected width >= 0 and ({model.map.places}, {model.map.dimension})"
+            f"expected width >= 0 and ({route.places}, {route.dimension})"
         )
     if model.trained is not None:
-        raise InputError("leave-out got trained templates, no means; expected a map that was learnt")
-    plan, blocks, matcher = model.map.plan, model.map.blocks(), model.matcher
-    if not plan:
+        raise InputError("leave-out got trained templates, no means; expected a map that was not trained")
+    if not route.plan:
         return model.localize(reference)
-    matches, reference = [], model.map.weighted(reference)
+    matches, reference = [], route.weighted(reference)
+    layers = list(zip(route.plan, route.blocks(), route.layer_features(), strict=True))
     with torch.no_grad():
         for frames in torch.arange(len(reference), device=reference.device).split(256):
-            distances = [
-                _distances_without(reference[:, index], layer, block, frames, width, matcher.metric)
-                for layer, block, index in zip(plan, blocks, model.map.layer_features(), strict=True)
-            ]
-            scores = combine_layers(distances, plan, len(reference), matcher.metric, matcher.reduction)
-            if matcher.temperature is not None:
-                scores = log_posterior(scores, matcher.temperature)
-            match = best_match(scores, model.threshold)
-            matches.append(Match(*(column.cpu() for column in match)))
+            scores = route.combine(
+                [
+                    _distances_without(reference[:, index], layer, block, frames, width, route.metric)
+                    for layer, block, index in layers
+                ]
+            )
+            if route.temperature is not None:
+                scores = log_posterior(scores, route.temperature)
+            matches.append(Match(*(column.cpu() for column in best_match(scores, model.threshold))))
     return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 import dejavu_torch
 from dejavu_torch.data.truth import Shown, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
-from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import read_compressed
+from dejavu_torch.database.template_map import CompressedMap
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     count_queries,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import places_of_frames
-from dejavu_torch.database.scores import Matcher
+from dejavu_torch.database.template_map import Matcher
 from dejavu_torch.evaluation.controls import leave_out_match, same_settings
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import Picture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor, nn
@@ -68,8 +68,8 @@ def feature_batches(
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
 
 
-def features_of(batch: Tensor, module: nn.Module, name: str = "the input") -> Tensor:
-    """Features of one batch: (B,C,H,W) frames through the module, (B,D) features as they are."""
+def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
+    """Features of one batch: (B,C,H,W) frames are described, (B,D) features stay as they are."""
     if batch.ndim == 2 and batch.is_floating_point():
         return batch
     if batch.ndim != 4 or not batch.is_floating_point():
@@ -77,11 +77,13 @@ def features_of(batch: Tensor, module: nn.Module, name: str = "the input") -> Te
             f"{name} gives batches {tuple(batch.shape)} {batch.dtype}; "
             "expected float frames (B,C,H,W) in [0, 1] or float features (B,D)"
         )
-    features: Tensor = module(batch)
-    if features.ndim != 2 or len(features) != len(batch):
-        maker = module[-1] if isinstance(module, nn.Sequential) else module
+    features = describe(batch)
+    if features.ndim != 2 or features.shape[0] != batch.shape[0]:
+        maker = describe[-1] if isinstance(describe, nn.Sequential) else describe
+        owner = maker if isinstance(maker, nn.Module) else getattr(maker, "__self__", None)
+        owner = getattr(owner, "features", owner)
         raise InputError(
-            f"{type(maker).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
+            f"{type(owner).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
             f"expected features ({len(batch)}, D)"
         )
     return features
@@ -94,37 +96,36 @@ def frame_shape(traverse: Traverse) -> tuple[int, ...]:
     raise InputError(f"{traverse.name} holds no frames; expected at least one")
 
 
-def check_frames(
+def check_queries(
     shape: tuple[int, ...],
     dimension: int,
-    learnt_from: tuple[int, ...] | None,
+    reference: tuple[int, ...] | None,
     expected: int,
     resized: bool,
     name: str,
 ) -> None:
-    """Refuse queries that do not fit a map, and tell of frames of another size that do.
+    """Refuse queries that do not fit a map, and warn of frames of another size that do.
 
     Args:
         shape: of one query, (C,H,W) or (D,). dimension: how many features it gives.
-        learnt_from: shape of what the map was learnt from, None where unknown. expected: its features.
+        reference: shape of a frame of the reference, None where unknown. expected: features of the map.
         resized: whether the features are made of frames brought to one size.
         name: of the queries, for the message.
     """
-    if learnt_from is None or len(shape) != 3:
+    if reference is None or len(shape) != 3:
         return
-    if len(learnt_from) == 1:
+    if len(reference) == 1:
         raise InputError(
-            f"{name} holds frames, but the map was learnt from ready features; "
+            f"{name} holds frames, but the map was learned from ready features; "
             f"expected features (Q, {expected})"
         )
     if dimension != expected:
         raise InputError(
             f"{name}: frames of {_by(shape)} give {dimension} features; the map expects "
-            f"{expected}, as frames of {_by(learnt_from)} give, into which ?width= and "
-            "?height= turn folders and videos"
+            f"{expected}, as frames of {_by(reference)} give"
         )
-    if shape[1:] != learnt_from[1:] and not resized:
-        log.warning("%s has frames of %s, the map was learnt from %s", name, _by(shape), _by(learnt_from))
+    if shape[1:] != reference[1:] and not resized:
+        log.warning("%s has frames of %s, the map was learned from %s", name, _by(shape), _by(reference))
 
 
 def _by(shape: tuple[int, ...]) -> str:

@@ -18,7 +18,9 @@ VALUES_AT_ONCE = 2**19  # of the frames of one part, so that what lies between s
 
 
 def parts(frames: Tensor) -> tuple[Tensor, ...]:
-    """A batch in parts of at most VALUES_AT_ONCE values, at least one frame each."""
+    """A batch in parts of at most VALUES_AT_ONCE values, at least one frame each; whole where compiled."""
+    if torch.compiler.is_compiling():  # the number of parts would fix the batch
+        return (frames,)
     return torch.split(frames, max(1, VALUES_AT_ONCE // max(1, math.prod(frames.shape[1:]))))
 
 

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.positions import NEAR, first_reached, nearest_places
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-NEAR = 1e-4  # steps: what is so near to a place has reached it
 MOST = 20  # steps a frame, on average
 DOUBTFUL = 0.2  # steps backwards for each one forward
 
@@ -64,17 +64,17 @@ class ResampledTraverse(Traverse):
         step = normalizer.step if step is None else step
         self.step = float(moved.abs()[moved != 0].median()) if step is None else float(step)
         _tell_doubtful(moved, self.name)
-        self.way = (way / self.step).float().double()  # as a map keeps it
-        most = float(self.way.max())
+        self.positions = (way / self.step).float().double()  # as a map keeps it
+        most = float(self.positions.max())
         if not 1 <= most + NEAR < MOST * len(way):
             raise InputError(
                 f"{self.name} moves by {float(way.max()):.3g} pixels of ground in {len(way)} frames; "
                 f"expected at least one step, {self.step:g}, and at most {MOST} a frame"
             )
-        low, high, share = first_reached(self.way)
+        low, high, share = first_reached(self.positions)
         self.length = len(low)
         self.frame = torch.where(share < 0.5, low, high)
-        self.place_of = nearest_places(self.way)
+        self.place_of = nearest_places(self.positions)
         self._low, self._high, self._share = low, high, share
         if not normalizer.blend:
             self._low, self._high, self._share = self.frame, self.frame, torch.zeros_like(share)
@@ -107,34 +107,6 @@ class ResampledTraverse(Traverse):
             done, last = ready, frames[-1:]
             if done == stop:
                 return
-
-
-def first_reached(way: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where each whole number of steps is first reached: between two frames, and at what share of the way.
-
-    Args:
-        way: (N,) float64, steps from the first place of each frame.
-
-    Shape: -> low, high (M,) int64 frames, share (M,) in [0, 1]; M places.
-    """
-    furthest = way.cummax(0).values + NEAR
-    goal = torch.arange(int(furthest[-1]) + 1, dtype=torch.float64)
-    high = torch.searchsorted(furthest, goal).clamp(max=len(way) - 1)
-    low = (high - 1).clamp(min=0)
-    # also after a reversal the frame before the first to reach a distance lies short of it
-    return low, high, ((goal - way[low]) / (way[high] - way[low]).clamp(min=1e-12)).clamp(0, 1)
-
-
-def shown_frames(way: Tensor) -> Tensor:
-    """The frame nearest to each place, where it is first reached: (N,) steps -> (M,) int64."""
-    low, high, share = first_reached(way.double())
-    return torch.where(share < 0.5, low, high)
-
-
-def nearest_places(way: Tensor) -> Tensor:
-    """The place nearest to each frame, -1 behind the first: (N,) steps -> (N,) int64."""
-    last = int(float(way.max()) + NEAR)
-    return way.double().round().long().clamp(-1, last)
 
 
 def _tell_doubtful(moved: Tensor, name: str) -> None:

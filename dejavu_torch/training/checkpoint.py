@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from dejavu_torch.database.compressed import CompressedMap
+from dejavu_torch.database.template_map import CompressedMap
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.types import InputError, Plan

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.database.distance import Metric, phase_distances
-from dejavu_torch.database.scores import weight_per_feature
+from dejavu_torch.database.template_map import weight_per_feature
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.compressed import CompressedMap
-from dejavu_torch.database.scores import Matcher, weight_per_feature
+from dejavu_torch.database.template_map import CompressedMap, Matcher, weight_per_feature
 from dejavu_torch.training.losses import (
     aliased_pairs,
     decorrelation_loss,

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from dejavu_torch.database.compressed import CompressedMap
-from dejavu_torch.database.scores import Reduction, combine_layers, log_posterior
+from dejavu_torch.database.template_map import CompressedMap, Reduction, combine_layers, log_posterior
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG

@@ -12,7 +12,7 @@ from helpers import refused
 from torch import Tensor
 
 from dejavu_torch import CompressedMap, FrequencyLayer, Matcher, PhaseTemplates
-from dejavu_torch.database.scores import combine_layers, log_posterior
+from dejavu_torch.database.template_map import combine_layers, log_posterior
 from dejavu_torch.training.losses import (
     decorrelation_loss,
     periodicity_loss,

@@ -10,9 +10,11 @@ from torch import Tensor, nn
 
 from dejavu_torch.types import FrequencyLayer, InputError
 
+MASKED_AT_ONCE = 2**14  # frames of a mask that is summed over
+
 
 def phase_mask(
-    n: int,
+    frames: int | Tensor,
     period: Fraction | int,
     phases: int | None = None,
     start: int = 0,
@@ -22,10 +24,10 @@ def phase_mask(
     """The masks M(i, tau, k) of one period, all phases at once (eq. 2).
 
     Args:
-        n: number of frames.
+        frames: how many, counted from 0, or (n,) int64 the frames themselves.
         period: tau, frames; whole or rational.
         phases: P; None is the paper's case, one phase per frame of a whole period.
-        start, stop: the chunk [start, stop); None is n. M is 0 outside.
+        start, stop: the chunk [start, stop); a stop of None has no end. M is 0 outside.
 
     Shape: -> (P,n), 1 where frame i of the chunk has phase k, else 0.
 
@@ -33,7 +35,7 @@ def phase_mask(
         M(i, tau, k) = 1 where mod(i - k, tau) = 0.
 
     Raises:
-        InputError: a fractional period without `phases`, or a chunk outside the n frames.
+        InputError: a fractional period without `phases`, or a chunk that ends behind a number of frames.
 
     Example:
         >>> phase_mask(5, 2)
@@ -43,25 +45,16 @@ def phase_mask(
     period = Fraction(period)
     if phases is None and period.denominator != 1:
         raise InputError(f"phase_mask got period {period} and no phases; expected phases for a fraction")
+    index = torch.arange(frames) if isinstance(frames, int) else frames
+    if isinstance(frames, int) and stop is not None and stop > frames:
+        raise InputError(f"phase_mask got the chunk [{start}, {stop}); expected it inside {frames} frames")
+    last = max(start, int(index.max()) if len(index) else 0) + 1
     layer = FrequencyLayer(
-        period, period.numerator if phases is None else phases, start, n if stop is None else stop, (0,)
+        period, period.numerator if phases is None else phases, start, last if stop is None else stop, (0,)
     )
-    if layer.stop > n:
-        raise InputError(f"phase_mask got the chunk [{start}, {layer.stop}); expected it inside {n} frames")
-    mask = torch.zeros(layer.phases, n, dtype=dtype)
-    mask[layer.place_phases, torch.arange(layer.start, layer.stop)] = 1
-    return mask
-
-
-def phase_means(values: Tensor, phase: Tensor, phases: int) -> Tensor:
-    """Mean of the frames of each phase: eq. 1 with the masks of eq. 2, summed without building them.
-
-    Shape: values (n,F), phase (n,) int64 -> (P,F). A phase that no frame has gets 0; no place of
-        the chunk has that phase, so nothing ever reads it.
-    """
-    total = values.new_zeros(phases, values.shape[1]).index_add(0, phase, values)
-    count = values.new_zeros(phases).index_add(0, phase, torch.ones_like(values[:, 0]))
-    return total / count.clamp(min=1)[:, None]
+    mask = torch.zeros(layer.phases, len(index), dtype=dtype, device=index.device)
+    inside = ((index >= layer.start) & (index < layer.stop)).to(mask.dtype)
+    return mask.scatter_(0, layer.phase(index)[None], inside[None])
 
 
 class PhaseTemplates(nn.Module):
@@ -69,8 +62,9 @@ class PhaseTemplates(nn.Module):
 
     Shape: features (N,D), plan of L layers -> tuple of L tensors (P,F).
 
-    Convention: the mean runs over the layer's own chunk only. Gradients reach the features; the
-        plan is exact numbers and gets none.
+    Convention: the mean runs over the layer's own chunk only. A phase that no frame of the chunk has gets 0;
+        no place of the chunk has that phase, so nothing reads it. Gradients reach the features; the plan is
+        exact numbers and gets none.
 
     Raises:
         InputError: a layer that reaches beyond the N frames or the D features.
@@ -85,14 +79,22 @@ class PhaseTemplates(nn.Module):
         if features.ndim != 2:
             raise InputError(f"the features are {tuple(features.shape)}; expected (N,D)")
         frames, dimension = features.shape
-        templates = []
         for layer in plan:
             if layer.stop > frames or layer.features[-1] >= dimension:
                 raise InputError(
                     f"a layer covers [{layer.start}, {layer.stop}) and feature {layer.features[-1]}; "
                     f"expected it inside {frames} frames of {dimension} features"
                 )
-            chosen = torch.tensor(layer.features, device=features.device)
-            values = features[layer.start : layer.stop].index_select(1, chosen)
-            templates.append(phase_means(values, layer.place_phases.to(features.device), layer.phases))
-        return tuple(templates)
+        return tuple(_means(features, layer) for layer in plan)
+
+
+def _means(features: Tensor, layer: FrequencyLayer) -> Tensor:
+    """Eq. 1 for one layer, a stretch of its chunk at a time: (N,D) -> (P,F)."""
+    chosen = torch.tensor(layer.features, device=features.device)
+    total = features.new_zeros(layer.phases, len(layer.features))
+    count = features.new_zeros(layer.phases, 1)
+    for frames in torch.arange(layer.start, layer.stop, device=features.device).split(MASKED_AT_ONCE):
+        mask = phase_mask(frames, layer.period, layer.phases, dtype=features.dtype)
+        total = total + mask @ features[frames[0] : frames[-1] + 1].index_select(1, chosen)
+        count = count + mask.sum(1, keepdim=True)
+    return total / count.clamp(min=1)

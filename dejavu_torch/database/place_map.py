@@ -1,0 +1,162 @@
+"""What every kind of map offers, and what makes one from descriptors."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.data.positions import nearest_places, shown_frames
+from dejavu_torch.database.summary import MapSummary
+from dejavu_torch.types import InputError
+
+EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
+
+
+class PlaceMap(nn.Module):
+    """A route in a form that scores: the seam between how a map is made and how places are found on it.
+
+    A new kind of map subclasses it and implements `scores`, `settings`, `summary` and `disagreement`; a
+    `Mapper` makes it from descriptors.
+
+    Attributes:
+        kind: a name of the kind, stored with the map.
+        places: N, the number of places. dimension: D, features per frame. Plain ints.
+        positions: (F,) float32, how many even steps each reference frame lies from the first place, where
+            frames were resampled (section IV-B); (0,) where place i is reference frame i.
+
+    Shape: queries (Q,D) -> scores (Q,N), lower is better, +inf where nothing covers a place.
+
+    Convention: the state is whole: everything that changes a score is in `state_dict`, settings included,
+        and a state of another kind or of other settings is refused. Loading takes the shapes of what is
+        loaded, so an empty map of the same settings can receive any map.
+    """
+
+    kind: ClassVar[str]
+    positions: Tensor
+
+    def __init__(self, places: int = 0, dimension: int = 0) -> None:
+        super().__init__()
+        self.places, self.dimension = places, dimension
+        self.register_buffer("positions", torch.zeros(0))
+
+    @abstractmethod
+    def scores(self, queries: Tensor) -> Tensor:
+        """Scores of all places: (Q,D) -> (Q,N), lower is better, differentiable."""
+
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """What a state must share with the map that loads it, such as the metric, as JSON values."""
+
+    @abstractmethod
+    def summary(self) -> MapSummary:
+        """What the map can tell apart, and its bytes by part."""
+
+    @abstractmethod
+    def disagreement(self) -> str:
+        """The first buffer that does not fit the others, in words; empty where all fit."""
+
+    def forward(self, queries: Tensor) -> Tensor:
+        return self.scores(queries)
+
+    def extend(self, features: Tensor) -> None:
+        """Add the places of (n,D) features behind the last one.
+
+        Raises:
+            InputError: a kind of map that cannot grow.
+        """
+        raise InputError(f"a map of kind {self.kind!r} cannot be extended; expected to learn the route anew")
+
+    def frame_of(self, places: Tensor) -> Tensor:
+        """The reference frame that each place shows; -1, no place, stays -1. int64 of any shape."""
+        if not len(self.positions):
+            return places
+        frames = shown_frames(self.positions).to(places.device)
+        return torch.where(places >= 0, frames[places], -1)
+
+    def place_of(self, frames: Tensor) -> Tensor:
+        """The place nearest to each reference frame; -1, no frame, stays -1. int64 of any shape.
+
+        Raises:
+            InputError: a frame that the reference does not have.
+        """
+        count = len(self.positions) or self.places
+        if frames.numel() and int(frames.max()) >= count:
+            raise InputError(
+                f"frame {int(frames.max())} of the reference; expected frames from 0 to {count - 1}"
+            )
+        if not len(self.positions):
+            return frames
+        return torch.where(frames >= 0, nearest_places(self.positions).to(frames.device)[frames], -1)
+
+    def check(self) -> None:
+        """Refuse buffers that do not fit together.
+
+        Raises:
+            InputError: naming the first disagreement.
+        """
+        problem = self.disagreement()
+        positions = self.positions
+        if not problem and not (
+            positions.ndim == 1 and positions.is_floating_point() and positions.isfinite().all()
+        ):
+            problem = f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)"
+        if not problem and len(positions) and len(shown_frames(positions)) != self.places:
+            problem = f"positions of {len(shown_frames(positions))} places; expected {self.places}"
+        if problem:
+            raise InputError(f"the map does not fit together: {problem}")
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What the state holds beside the tensors."""
+        return {"kind": self.kind, "places": self.places, "dimension": self.dimension, **self.settings()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take over what `get_extra_state` gave.
+
+        Raises:
+            InputError: a state of another kind, or of other settings.
+        """
+        own = {"kind": self.kind, **self.settings()}
+        if not isinstance(state, dict):
+            raise InputError(f"the map's state is a {type(state).__name__}; expected its kind and settings")
+        for name, value in own.items():
+            if state.get(name) != value:
+                raise InputError(f"the map's {name} is {state.get(name)!r}; expected {value!r}")
+        sizes = state.get("places"), state.get("dimension")
+        if not all(isinstance(size, int) and size >= 0 for size in sizes):
+            raise InputError(
+                f"the map has {sizes[0]!r} places of {sizes[1]!r} features; expected whole numbers"
+            )
+        self.places, self.dimension = state["places"], state["dimension"]
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        if prefix + EXTRA in state_dict:  # before any tensor is touched
+            self.set_extra_state(state_dict[prefix + EXTRA])
+        for name, own in [*self.named_buffers(recurse=False), *self.named_parameters(recurse=False)]:
+            given = state_dict.get(prefix + name)
+            if given is not None and (own.shape, own.dtype) != (given.shape, given.dtype):
+                new = torch.empty_like(given, device=own.device)
+                setattr(self, name, nn.Parameter(new) if isinstance(own, nn.Parameter) else new)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self.loaded()
+        self.check()
+
+    def loaded(self) -> None:
+        """Called when a state was loaded: work out what follows from the buffers."""
+
+
+class Mapper(nn.Module):
+    """Makes a map from descriptors. Subclass it, and `PlaceMap`, to bring another kind of map.
+
+    Shape: features (N,D) float -> PlaceMap of N places.
+    """
+
+    @abstractmethod
+    def forward(self, features: Tensor) -> PlaceMap:
+        """Learn a map of N places from their features (N,D)."""
+
+    @abstractmethod
+    def empty(self) -> PlaceMap:
+        """A map without places, which can load any map of this mapper."""

@@ -1,0 +1,95 @@
+"""How a module was made, as data: its class by name and its arguments."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+from torch import nn
+
+from dejavu_torch.types import InputError
+
+M = TypeVar("M", bound=nn.Module)
+Registry = Mapping[str, type[nn.Module]]
+
+
+class Recipe(NamedTuple):
+    """How to build a module: the name of its class and its constructor arguments."""
+
+    class_path: str
+    init_args: dict[str, Any]
+
+
+def recipe_of(module: nn.Module, registry: Registry) -> Recipe:
+    """Recipe of a module.
+
+    Args:
+        registry: the classes that a map may name, which keep each constructor argument under its own name.
+            Of any other module only the class path is recorded, and the caller gives the object when loading.
+    """
+    cls = type(module)
+    known = registry.get(cls.__name__) is cls
+    arguments = {name: getattr(module, name) for name in inspect.signature(cls).parameters} if known else {}
+    for name, value in arguments.items():
+        if isinstance(value, nn.Module):
+            arguments[name] = recipe_of(value, registry)._asdict()
+        elif callable(value):
+            raise InputError(
+                f"{cls.__name__} has a callable {name}, which a file cannot hold; expected a name"
+            )
+    # as JSON gives it back, so that a recipe read from a file equals the module's own
+    return Recipe(
+        cls.__name__ if known else f"{cls.__module__}.{cls.__qualname__}", json.loads(json.dumps(arguments))
+    )
+
+
+def inner_recipes(recipe: Recipe) -> Iterator[tuple[str, Recipe]]:
+    """The parts that a recipe names, by argument."""
+    for name, value in recipe.init_args.items():
+        if isinstance(value, dict) and "class_path" in value:
+            yield name, Recipe(**value)
+
+
+def with_parts(recipe: Recipe) -> list[Recipe]:
+    """A recipe, and those of all its parts."""
+    return [recipe, *(inner for _, part in inner_recipes(recipe) for inner in with_parts(part))]
+
+
+def build(recipe: Recipe, kind: type[M], registry: Registry, given: nn.Module | None = None) -> M:
+    """Build a module from its recipe; nothing is ever imported by name.
+
+    Args:
+        kind: what it has to be. registry: the classes that may be built.
+        given: a module from elsewhere, used where the recipe, or a part of it, is its own.
+
+    Raises:
+        InputError: a class outside the registry, one that is no `kind`, or arguments it does not take.
+    """
+    name = recipe.class_path
+    if isinstance(given, kind) and recipe_of(given, registry) == recipe:
+        return given
+    if name not in registry:
+        raise InputError(
+            f"the map's features come from {name}, which only the caller can load; expected "
+            f"--features {name} with the arguments it was made with, or features=... in Python"
+        )
+    cls = registry[name]
+    if not issubclass(cls, kind):
+        raise InputError(f"the map names {name}, which is no {kind.__name__}")
+    parts = {key: build(part, nn.Module, registry, given) for key, part in inner_recipes(recipe)}
+    try:
+        return cls(**recipe.init_args | parts)
+    except TypeError as error:
+        raise InputError(f"the map names {name}, which cannot be built: {error}") from error
+
+
+def difference(stored: Recipe, given: Recipe) -> str:
+    """Where two recipes differ, in words."""
+    if stored.class_path != given.class_path:
+        return f"{stored.class_path}; got {given.class_path}"
+    names = [name for name, value in stored.init_args.items() if given.init_args.get(name) != value]
+    expected = ", ".join(f"{name}={stored.init_args[name]}" for name in names)
+    got = ", ".join(f"{name}={given.init_args.get(name)}" for name in names)
+    return f"{stored.class_path} of {expected}; got {got}"
