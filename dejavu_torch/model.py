@@ -71,9 +71,9 @@ class DejaVu(nn.Module):
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
-    Convention: a match counts places; `map.frame_of` gives the reference frame that a place shows. `forward` is
-        a fixed run of tensor operations without host synchronisation: it goes through `torch.export` with a
-        dynamic batch and through `torch.compile(fullgraph=True)`.
+    Convention: a match counts places; `map.frame_of` gives the reference frame that a place shows. `forward`
+        is a fixed run of tensor operations without host synchronisation: it goes through `torch.export` with
+        a dynamic batch and through `torch.compile(fullgraph=True)`.
 
     Example:
         >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])  # two features that repeat

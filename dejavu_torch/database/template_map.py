@@ -365,6 +365,7 @@ class TemplateMapper(Mapper):
     Args:
         periods: finds the layers; None is `SpectrogramAnalysis` with its defaults.
         metric, reduction, temperature: of the maps, see `TemplateMap`.
+        trainable: make the templates nn.Parameters, to be fine-tuned, instead of buffers.
 
     Shape: features (N,D) -> TemplateMap of N places; one without layers, on which every place scores +inf,
         where nothing repeats.
@@ -386,8 +387,10 @@ class TemplateMapper(Mapper):
         metric: Metric = "l1",
         reduction: Reduction = "mean",
         temperature: float | None = None,
+        trainable: bool = False,
     ) -> None:
         super().__init__()
+        self.trainable = trainable
         self.periods = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
         self.templates = PhaseTemplates()
@@ -400,7 +403,10 @@ class TemplateMapper(Mapper):
     def map_of(self, plan: Plan, templates: Sequence[Tensor], places: int, dimension: int) -> TemplateMap:
         """A map of these layers and templates with the mapper's settings."""
         settings = self.metric, self.reduction, self.temperature
-        return TemplateMap(plan, templates, places, dimension, *settings)
+        route = TemplateMap(plan, templates, places, dimension, *settings)
+        if self.trainable:
+            route.trainable()
+        return route
 
     def empty(self) -> TemplateMap:
         return self.map_of((), (), 0, 0)
