@@ -92,6 +92,10 @@ class DejaVu(nn.Module):
         velocity: GroundOdometry | None = None,
     ) -> None:
         super().__init__()
+        if mapper is not None and not isinstance(mapper, Mapper):
+            raise InputError(
+                f"the mapper is a {type(mapper).__name__}; expected a Mapper such as TemplateMapper"
+            )
         if batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; expected at least 1")
         if threshold is not None and math.isnan(threshold):
@@ -250,6 +254,8 @@ class DejaVu(nn.Module):
             InputError: nothing learnt yet, or the file cannot be written.
         """
         self._require_map()
+        if callable(getattr(self.mapper, "metric", None)):
+            raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
         write_map(Path(path), *self._file())
 
     @classmethod
@@ -366,7 +372,7 @@ def _build_parts(header: dict[str, Any], features: nn.Module | None) -> dict[str
 
 
 def _build(header: dict[str, Any], name: str, features: nn.Module | None) -> nn.Module | None:
-    if header[name] is None:
+    if header[name] is None and name == "velocity":
         return None
     recipe = Recipe(**header[name])
     # only learning needs what found the periods: one from elsewhere need not be built

@@ -7,8 +7,10 @@ from contextlib import contextmanager
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
+from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import FrequencyLayer, InputError, Plan, Traverse
 
@@ -36,3 +38,30 @@ class Fixed(PeriodFinder):
 
     def plan(self, features: Tensor) -> Plan:
         return self.layers
+
+
+def scored(
+    queries: Tensor,
+    route: TemplateMap,
+    metric: object = "l1",
+    reduction: str = "mean",
+    temperature: float | None = None,
+) -> Tensor:
+    """Scores of the layers and templates of a map with other settings."""
+    settings = metric, reduction, temperature
+    weights = route.weights if len(route.weights) else None
+    other = TemplateMap(route.plan, route.blocks(), route.places, route.dimension, *settings, weights)  # type: ignore[arg-type]
+    return other.scores(queries)
+
+
+def template_model(
+    features: nn.Module | None = None,
+    periods: PeriodFinder | None = None,
+    metric: object = "l1",
+    reduction: str = "mean",
+    temperature: float | None = None,
+    **settings: object,
+) -> DejaVu:
+    """A model whose map is of templates, with what its mapper is told beside the model's own settings."""
+    mapper = TemplateMapper(periods, metric, reduction, temperature)  # type: ignore[arg-type]
+    return DejaVu(features, mapper, **settings)  # type: ignore[arg-type]

@@ -134,11 +134,9 @@ class PlaceMap(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         if prefix + EXTRA in state_dict:  # before any tensor is touched
             self.set_extra_state(state_dict[prefix + EXTRA])
-        for name, own in [*self.named_buffers(recurse=False), *self.named_parameters(recurse=False)]:
-            given = state_dict.get(prefix + name)
-            if given is not None and (own.shape, own.dtype) != (given.shape, given.dtype):
-                new = torch.empty_like(given, device=own.device)
-                setattr(self, name, nn.Parameter(new) if isinstance(own, nn.Parameter) else new)
+        for name, own in list(self.named_buffers(recurse=False)):  # what trains keeps its shape
+            if prefix + name in state_dict:
+                setattr(self, name, torch.empty_like(state_dict[prefix + name], device=own.device))
         super()._load_from_state_dict(state_dict, prefix, *args)
         self.loaded()
         self.check()

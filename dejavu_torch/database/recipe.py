@@ -35,10 +35,8 @@ def recipe_of(module: nn.Module, registry: Registry) -> Recipe:
     for name, value in arguments.items():
         if isinstance(value, nn.Module):
             arguments[name] = recipe_of(value, registry)._asdict()
-        elif callable(value):
-            raise InputError(
-                f"{cls.__name__} has a callable {name}, which a file cannot hold; expected a name"
-            )
+        elif callable(value):  # a name alone, which no file can bring back
+            arguments[name] = getattr(value, "__name__", "callable")
     # as JSON gives it back, so that a recipe read from a file equals the module's own
     return Recipe(
         cls.__name__ if known else f"{cls.__module__}.{cls.__qualname__}", json.loads(json.dumps(arguments))

@@ -390,6 +390,10 @@ class TemplateMapper(Mapper):
         trainable: bool = False,
     ) -> None:
         super().__init__()
+        if periods is not None and not isinstance(periods, PeriodFinder):
+            raise InputError(
+                f"periods is a {type(periods).__name__}; expected a PeriodFinder such as SpectrogramAnalysis"
+            )
         self.trainable = trainable
         self.periods = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature

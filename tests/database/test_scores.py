@@ -9,21 +9,22 @@ from itertools import pairwise
 import pytest
 import reference
 import torch
+from helpers import scored
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import (
-    CompressedMap,
     DejaVu,
     FrequencyLayer,
     InputError,
-    Matcher,
     PhaseTemplates,
+    TemplateMap,
+    TemplateMapper,
     best_match,
     phase_distances,
 )
-from dejavu_torch.database.template_map import combine_layers, log_posterior, segments
+from dejavu_torch.database.template_map import log_posterior, segments
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import common_period
 from dejavu_torch.types import Plan
@@ -36,8 +37,8 @@ def whole(period: int, stop: int, features: tuple[int, ...] = (0,), start: int =
     return FrequencyLayer(Fraction(period), period, start, stop, features)
 
 
-def make(values: Tensor, plan: Plan) -> CompressedMap:
-    return CompressedMap(plan, PhaseTemplates()(values, plan), *values.shape)
+def make(values: Tensor, plan: Plan) -> TemplateMap:
+    return TemplateMap(plan, PhaseTemplates()(values, plan), *values.shape)
 
 
 MIXED: Plan = (
@@ -59,7 +60,7 @@ def test_scores_equal_reference(reduction: str, route: reference.Route, seed: in
     queries[0] = values[seed % len(values)]
     mus = [reference.templates(values.tolist(), layer) for layer in plan]
     expected = [reference.scores(row, len(values), plan, mus, reduction) for row in queries.tolist()]
-    scores = Matcher(reduction=reduction)(queries, make(values, plan))  # type: ignore[arg-type]
+    scores = scored(queries, make(values, plan), reduction=reduction)  # type: ignore[arg-type]
     torch.testing.assert_close(scores, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
@@ -68,9 +69,9 @@ def test_the_place_found_is_the_references(route: reference.Route) -> None:
     """Whole-number templates, so that ties are ties in both."""
     values, plan = route
     mus = [torch.randint(-3, 4, (x.phases, len(x.features))).double() for x in plan]
-    found = CompressedMap(plan, mus, *values.shape)
+    found = TemplateMap(plan, mus, *values.shape)
     queries = torch.randint(-3, 4, (5, values.shape[1])).double()
-    scores = Matcher(reduction="sum")(queries, found)
+    scores = scored(queries, found, reduction="sum")
     match = best_match(scores, threshold=4.0)
     lists = [mu.tolist() for mu in mus]
     rows = [reference.scores(row, len(values), plan, lists) for row in queries.tolist()]
@@ -83,7 +84,7 @@ def test_the_place_found_is_the_references(route: reference.Route) -> None:
 def test_a_score_is_the_sum_of_the_distances_of_its_phases(metric: str) -> None:
     values = torch.randn(50, 4, dtype=torch.float64)
     route, queries = make(values, MIXED), torch.randn(3, 4, dtype=torch.float64)
-    scores = Matcher(metric, "sum")(queries, route)
+    scores = scored(queries, route, metric, "sum")
     parts = [
         phase_distances(queries[:, list(layer.features)], mu, metric)
         for layer, mu in zip(MIXED, route.blocks(), strict=True)
@@ -109,11 +110,11 @@ def test_score_is_0_exactly_at_the_common_period(periods: tuple[Fraction, ...], 
         cycle = torch.stack([torch.arange(phases) / 8, torch.randperm(phases) / 4], 1).double()
         columns.append(cycle[plan[-1].place_phases])
     values = torch.cat(columns, 1)
-    scores = Matcher(reduction=reduction)(values, make(values, tuple(plan)))  # type: ignore[arg-type]
+    scores = scored(values, make(values, tuple(plan)), reduction=reduction)  # type: ignore[arg-type]
     i, q = torch.arange(frames), torch.arange(frames)[:, None]
     assert torch.equal(scores == 0, (i - q) % common == 0)
     irrational = values * math.pi
-    scores = Matcher(reduction=reduction)(irrational, make(irrational, tuple(plan)))  # type: ignore[arg-type]
+    scores = scored(irrational, make(irrational, tuple(plan)), reduction=reduction)  # type: ignore[arg-type]
     assert torch.equal(scores <= 1e-12, (i - q) % common == 0)
 
 
@@ -122,7 +123,7 @@ def test_shifting_the_route_shifts_the_scores(shift: int) -> None:
     values = torch.randint(-16, 17, (48, 3)).double() / 8  # 48: whole turns of both layers
     plan = (whole(12, 48, (0, 1)), whole(16, 48, (1, 2)))
     queries = torch.randn(5, 3, dtype=torch.float64)
-    scores, shifted = (Matcher()(queries, make(v, plan)) for v in (values, values.roll(shift, 0)))
+    scores, shifted = (scored(queries, make(v, plan)) for v in (values, values.roll(shift, 0)))
     torch.testing.assert_close(shifted, scores.roll(shift, 1), rtol=0, atol=1e-12)
 
 
@@ -135,14 +136,14 @@ def test_permuting_features_changes_nothing(route: reference.Route, random: obje
         FrequencyLayer(x.period, x.phases, x.start, x.stop, tuple(sorted(order.index(j) for j in x.features)))
         for x in plan
     )
-    before = Matcher()(values, make(values, plan))
-    after = Matcher()(values[:, order], make(values[:, order], moved))
+    before = scored(values, make(values, plan))
+    after = scored(values[:, order], make(values[:, order], moved))
     torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
 
 
 def test_the_order_of_the_layers_changes_nothing() -> None:
     values = torch.randn(50, 4, dtype=torch.float64)
-    before, after = (Matcher()(values, make(values, plan)) for plan in (MIXED, MIXED[::-1]))
+    before, after = (scored(values, make(values, plan)) for plan in (MIXED, MIXED[::-1]))
     torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
 
 
@@ -152,7 +153,7 @@ def test_the_order_of_the_layers_changes_nothing() -> None:
 def test_convention_1_h_is_the_querys_and_l_the_covering_layers() -> None:
     values = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
     plan = (whole(1, 2), whole(1, 4, start=1))  # templates 0.5 and 2
-    scores = Matcher(reduction="sum")(torch.tensor([[10.0]]), make(values, plan))
+    scores = scored(torch.tensor([[10.0]]), make(values, plan), reduction="sum")
     assert scores.tolist() == [[9.5, 9.5 + 8, 8, 8]]
 
 
@@ -160,7 +161,7 @@ def test_convention_1_h_is_the_querys_and_l_the_covering_layers() -> None:
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 def test_convention_2_uncovered_places_score_inf(reduction: str, metric: str) -> None:
     values = torch.rand(60, 4)
-    scores = Matcher(metric, reduction)(values[:5], make(values, MIXED))  # type: ignore[arg-type]
+    scores = scored(values[:5], make(values, MIXED), metric, reduction)  # type: ignore[arg-type]
     uncovered = torch.zeros(60, dtype=torch.bool)
     uncovered[25:30] = uncovered[50:] = True
     assert torch.equal(scores.isposinf(), uncovered.expand(5, 60))
@@ -168,7 +169,7 @@ def test_convention_2_uncovered_places_score_inf(reduction: str, metric: str) ->
 
 
 def test_convention_2_a_plan_without_layers_covers_nothing() -> None:
-    scores = Matcher()(torch.rand(3, 4), CompressedMap((), (), 20, 4))
+    scores = scored(torch.rand(3, 4), TemplateMap((), (), 20, 4))
     assert scores.shape == (3, 20)
     assert scores.isposinf().all()
     assert best_match(scores).index.tolist() == [-1, -1, -1]
@@ -183,8 +184,8 @@ def test_convention_3_sum_is_the_letter_and_the_default_is_comparable() -> None:
     route = make(values, plan)
     queries = values + 0.3 * (torch.rand_like(values).round() - 0.5).sign()
     own_chunk = torch.arange(40) < 20
-    by_sum = best_match(Matcher(reduction="sum")(queries, route)).index
-    by_mean = best_match(Matcher()(queries, route)).index
+    by_sum = best_match(scored(queries, route, reduction="sum")).index
+    by_mean = best_match(scored(queries, route)).index
     assert ((by_sum < 20) & own_chunk).sum() == 0
     assert ((by_mean < 20) == own_chunk).all()
     assert by_mean[:20].tolist() == list(range(20))
@@ -193,7 +194,7 @@ def test_convention_3_sum_is_the_letter_and_the_default_is_comparable() -> None:
 def test_convention_3_mean_is_the_sum_over_its_number_of_features() -> None:
     values = torch.rand(50, 4)
     route = make(values, MIXED)
-    ratio = Matcher(reduction="sum")(values, route) / Matcher()(values, route)
+    ratio = scored(values, route, reduction="sum") / scored(values, route)
     torch.testing.assert_close(ratio[:, :5], torch.full((50, 5), 2.0))
     torch.testing.assert_close(ratio[:, 5:20], torch.full((50, 15), 4.0))
     torch.testing.assert_close(ratio[:, 30:], torch.full((50, 20), 3.0))
@@ -205,8 +206,7 @@ def test_mean_does_not_grow_with_the_number_of_features(metric: object) -> None:
     values = torch.rand(20, 3)
     once = make(values, (whole(5, 20, (0, 1, 2)),))
     often = make(values.repeat(1, 9), (whole(5, 20, tuple(range(27))),))
-    matcher = Matcher(metric)  # type: ignore[arg-type]
-    torch.testing.assert_close(matcher(values.repeat(1, 9), often), matcher(values, once))
+    torch.testing.assert_close(scored(values.repeat(1, 9), often, metric), scored(values, once, metric))
 
 
 @given(route=reference.routes())
@@ -221,12 +221,13 @@ def test_segments_cut_the_route_where_coverage_changes(route: reference.Route) -
             assert members == tuple(j for j, layer in enumerate(plan) if layer.start <= i < layer.stop)
 
 
-def test_combine_layers_of_a_plan_by_hand() -> None:
+def test_combine_the_layers_of_a_plan_by_hand() -> None:
     distances = [torch.tensor([[1.0, 2.0]]), torch.tensor([[10.0, 20.0, 30.0]])]
     plan = (whole(2, 4), whole(3, 6, (0, 1), start=2))
-    total = combine_layers(distances, plan, 7, reduction="sum")
+    blocks = [torch.zeros(layer.phases, len(layer.features)) for layer in plan]
+    total = TemplateMap(plan, blocks, 7, 2, reduction="sum").combine(distances)
     assert total.tolist() == [[1, 2, 31, 12, 20, 30, math.inf]]
-    mean = combine_layers(distances, plan, 7, reduction="mean")
+    mean = TemplateMap(plan, blocks, 7, 2).combine(distances)
     torch.testing.assert_close(mean, torch.tensor([[1, 2, 31 / 3, 4, 10, 15, math.inf]]))
 
 
@@ -239,10 +240,9 @@ def test_gradients_are_right_towards_queries_and_templates(metric: str, reductio
     plan = (whole(3, 8, (0, 2)), FrequencyLayer(Fraction(5, 2), 2, 4, 10, (0, 1)))
     queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
     blocks = [torch.randn(x.phases, len(x.features), dtype=torch.float64, requires_grad=True) for x in plan]
-    matcher = Matcher(metric, reduction)  # type: ignore[arg-type]
 
     def covered(queries: Tensor, *blocks: Tensor) -> Tensor:
-        return matcher(queries, CompressedMap(plan, blocks, 10, 3))
+        return TemplateMap(plan, blocks, 10, 3, metric, reduction).scores(queries)  # type: ignore[arg-type]
 
     assert torch.autograd.gradcheck(covered, (queries, *blocks))
 
@@ -251,13 +251,13 @@ def test_gradients_reach_the_reference_features() -> None:
     values = torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
     queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
     plan = (whole(3, 10, (0, 2)), whole(4, 10, (1,)))
-    assert torch.autograd.gradcheck(lambda q, v: Matcher()(q, make(v, plan)), (queries, values))
+    assert torch.autograd.gradcheck(lambda q, v: scored(q, make(v, plan)), (queries, values))
 
 
 def test_uncovered_places_leave_gradients_finite() -> None:
     values = torch.rand(60, 4)
     queries = torch.rand(3, 4, requires_grad=True)
-    scores = Matcher()(queries, make(values, MIXED))
+    scores = scored(queries, make(values, MIXED))
     torch.logsumexp(-scores, 1).sum().backward()
     assert queries.grad is not None
     assert queries.grad.isfinite().all()
@@ -267,28 +267,27 @@ def test_uncovered_places_leave_gradients_finite() -> None:
 @pytest.mark.parametrize("metric", METRICS)
 def test_a_batch_is_its_queries_one_by_one(metric: str) -> None:
     values = torch.rand(60, 4)
-    route, matcher = make(values, MIXED), Matcher(metric)
-    queries = torch.rand(9, 4)
-    together = matcher(queries, route)
+    route, queries = TemplateMap(MIXED, make(values, MIXED).blocks(), 60, 4, metric), torch.rand(9, 4)
+    together = route(queries)
     assert together.shape == (9, 60)
-    torch.testing.assert_close(torch.cat([matcher(row[None], route) for row in queries]), together)
+    torch.testing.assert_close(torch.cat([route(row[None]) for row in queries]), together)
     order = torch.randperm(9)
-    torch.testing.assert_close(matcher(queries[order], route), together[order])
+    torch.testing.assert_close(route(queries[order]), together[order])
 
 
 def test_convention_10_scores_are_float32_whatever_the_autocast() -> None:
     values = torch.rand(50, 4)
     route = make(values, MIXED)
-    plain = Matcher()(values, route)
+    plain = scored(values, route)
     with torch.autocast("cpu", torch.bfloat16):
-        cast = Matcher()(values, route)
-        low = Matcher()(values.bfloat16(), route)
+        cast = scored(values, route)
+        low = scored(values.bfloat16(), route)
     assert cast.dtype == low.dtype == torch.float32
     assert torch.equal(cast, plain)
 
 
 def test_convention_10_also_on_a_map_without_layers() -> None:
-    scores = Matcher()(torch.rand(3, 4).bfloat16(), CompressedMap((), (), 20, 4))
+    scores = scored(torch.rand(3, 4).bfloat16(), TemplateMap((), (), 20, 4))
     assert scores.dtype == torch.float32
 
 
@@ -299,7 +298,7 @@ def test_convention_10_nothing_of_queries_times_phases_times_features_is_built(
     queries, phases, features, places = 40, 50, 60, 300
     route = make(torch.rand(places, features), (whole(phases, places, tuple(range(features))),))
     with largest_tensor() as seen:
-        Matcher(metric)(torch.rand(queries, features), route)
+        scored(torch.rand(queries, features), route, metric)
     assert seen.numel <= queries * places < queries * phases * features
 
 
@@ -316,7 +315,9 @@ class Given(PeriodFinder):
 
 def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: type) -> None:
     values = torch.rand(500, 8)
-    model = DejaVu(periods=Given((whole(50, 500, tuple(range(8))),)), batch_size=16).learn(values)
+    model = DejaVu(mapper=TemplateMapper(Given((whole(50, 500, tuple(range(8))),))), batch_size=16).learn(
+        values
+    )
 
     def largest(queries: int) -> int:
         with largest_tensor() as seen:
@@ -329,26 +330,22 @@ def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: typ
 
 def test_double_maps_give_double_scores() -> None:
     values = torch.rand(50, 4)
-    assert Matcher()(values, make(values, MIXED).double()).dtype == torch.float64
+    assert scored(values, make(values, MIXED).double()).dtype == torch.float64
 
 
 def test_half_maps_are_matched_in_single_precision() -> None:
     values = torch.rand(50, 4)
     route = make(values, MIXED)
-    exact = Matcher()(values, route)
-    half = Matcher()(values, route.half())
+    exact = scored(values, route)
+    half = scored(values, route.half())
     assert half.dtype == torch.float32
     torch.testing.assert_close(half, exact, rtol=0, atol=1e-3)
-
-
-def test_state_dict_round_trip() -> None:
-    Matcher().load_state_dict(Matcher().state_dict())
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (3, 3), (4,), (2, 3, 4)])
 def test_queries_of_another_dimension_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match=r"query features are .*; the map expects \(Q, 4\)"):
-        Matcher()(torch.rand(shape), make(torch.rand(50, 4), MIXED))
+        scored(torch.rand(shape), make(torch.rand(50, 4), MIXED))
 
 
 @pytest.mark.parametrize(
@@ -364,7 +361,7 @@ def test_queries_of_another_dimension_are_refused(shape: tuple[int, ...]) -> Non
 )
 def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Matcher(**arguments)
+        TemplateMap(**arguments)
 
 
 # ------------------------------------------------------------------ temperature
@@ -414,8 +411,8 @@ def test_log_posterior_does_not_see_what_fits_no_place() -> None:
 def test_a_temperature_leaves_the_order_of_places(reduction: str) -> None:
     values = torch.rand(60, 4, dtype=torch.float64)
     route, queries = make(values, MIXED), torch.rand(7, 4, dtype=torch.float64)
-    plain = Matcher(reduction=reduction)(queries, route)  # type: ignore[arg-type]
-    scores = Matcher(reduction=reduction, temperature=0.2)(queries, route)  # type: ignore[arg-type]
+    plain = scored(queries, route, reduction=reduction)  # type: ignore[arg-type]
+    scores = scored(queries, route, reduction=reduction, temperature=0.2)  # type: ignore[arg-type]
     torch.testing.assert_close(scores, log_posterior(plain, 0.2))
     assert torch.equal(scores.argsort(dim=1, stable=True), plain.argsort(dim=1, stable=True))
     assert torch.equal(best_match(scores).index, best_match(plain).index)
@@ -425,10 +422,10 @@ def test_a_temperature_leaves_the_order_of_places(reduction: str) -> None:
 
 def test_convention_2_a_temperature_leaves_uncovered_places_at_inf() -> None:
     values = torch.rand(60, 4)
-    plain, scores = (Matcher(temperature=t)(values[:5], make(values, MIXED)) for t in (None, 0.1))
+    plain, scores = (scored(values[:5], make(values, MIXED), temperature=t) for t in (None, 0.1))
     assert plain.isposinf().any()
     assert torch.equal(scores.isposinf(), plain.isposinf())
-    nowhere = Matcher(temperature=0.1)(torch.rand(3, 4), CompressedMap((), (), 20, 4))
+    nowhere = scored(torch.rand(3, 4), TemplateMap((), (), 20, 4), temperature=0.1)
     assert nowhere.isposinf().all()
     assert best_match(log_posterior(torch.full((2, 3), math.inf), 0.1)).index.tolist() == [-1, -1]
 
@@ -465,19 +462,19 @@ def test_gradients_reach_queries_and_templates_through_a_temperature() -> None:
     blocks = [torch.randn(x.phases, len(x.features), dtype=torch.float64, requires_grad=True) for x in plan]
 
     def covered(queries: Tensor, *blocks: Tensor) -> Tensor:
-        return Matcher(temperature=0.5)(queries, CompressedMap(plan, blocks, 10, 3))
+        return scored(queries, TemplateMap(plan, blocks, 10, 3), temperature=0.5)
 
     assert torch.autograd.gradcheck(covered, (queries, *blocks))
 
 
 def test_distances_are_those_of_each_layer_and_combine_to_the_scores() -> None:
-    values, queries, matcher = torch.rand(60, 4), torch.rand(3, 4), Matcher()
+    values, queries = torch.rand(60, 4), torch.rand(3, 4)
     route = make(values, MIXED)
-    distances = matcher.distances(queries, route)
+    distances = route.distances(queries)
     assert [tuple(part.shape) for part in distances] == [(3, 4), (3, 3), (3, 7)]
     for part, layer, block in zip(distances, MIXED, route.blocks(), strict=True):
         torch.testing.assert_close(part, (queries[:, None, list(layer.features)] - block).abs().sum(2))
-    assert torch.equal(combine_layers(distances, MIXED, 60), matcher(queries, route))
-    assert matcher.distances(queries, CompressedMap((), (), 20, 4)) == []
+    assert torch.equal(route.combine(distances), route.scores(queries))
+    assert TemplateMap((), (), 20, 4).distances(queries) == []
     with pytest.raises(InputError, match=r"query features are \(3, 5\); the map expects \(Q, 4\)"):
-        matcher.distances(torch.rand(3, 5), route)
+        route.distances(torch.rand(3, 5))

@@ -21,17 +21,17 @@ PLAN: Plan = (
 
 
 def test_numbers_of_a_plan_made_by_hand() -> None:
-    certificate = summarise(PLAN, places=2500, map_bytes=10_000)
-    assert certificate.places == 2500
-    assert certificate.covered == 1024 + 600  # the last two chunks overlap
-    assert certificate.templates == 93 + 171 + 98 + 4 + 6 + 15
-    assert certificate.template_numbers == 93 * 3 + 171 * 2 + 98 + 4 * 2 + 6 + 15
-    assert certificate.map_bytes == 10_000
-    assert certificate.bytes_per_place == pytest.approx(4.0)
+    summary = summarise(PLAN, places=2500, route={"templates": 9000}).with_fixed(header=1000, backbone=0)
+    assert summary.places == 2500
+    assert summary.covered == 1024 + 600  # the last two chunks overlap
+    assert summary.templates == 93 + 171 + 98 + 4 + 6 + 15
+    assert summary.template_numbers == 93 * 3 + 171 * 2 + 98 + 4 * 2 + 6 + 15
+    assert (summary.map_bytes, summary.route_bytes, summary.fixed_bytes) == (10_000, 9000, 1000)
+    assert summary.bytes_per_place == pytest.approx(4.0)
 
 
 def test_chunks_of_a_plan_made_by_hand() -> None:
-    first, second, third = summarise(PLAN, places=2500, map_bytes=1).chunks
+    first, second, third = summarise(PLAN, places=2500, route={}).chunks
     assert (first.start, first.stop, first.periods, first.features) == (0, 1024, (93, 171), (3, 2))
     assert first.common_period == 5301  # not the product, 15903
     assert first.shared_factors == (3,)
@@ -45,32 +45,43 @@ def test_chunks_of_a_plan_made_by_hand() -> None:
 
 
 def test_the_order_of_the_layers_does_not_matter_to_the_totals() -> None:
-    a, b = summarise(PLAN, 2500, 1), summarise(PLAN[::-1], 2500, 1)
-    assert a[:6] == b[:6]
+    a, b = summarise(PLAN, 2500, {}), summarise(PLAN[::-1], 2500, {})
+    assert (a.covered, a.templates, a.template_numbers) == (b.covered, b.templates, b.template_numbers)
     assert [(x.start, x.stop, x.common_period) for x in a.chunks] == [
         (x.start, x.stop, x.common_period) for x in b.chunks
     ]
 
 
 def test_a_plan_without_layers() -> None:
-    certificate = summarise((), places=50, map_bytes=200)
-    assert certificate == (50, 0, 0, 0, 200, 4.0, ())
-    assert summarise((), places=0, map_bytes=200).bytes_per_place == 200
+    summary = summarise((), places=50, route={"layers": 200})
+    assert (summary.places, summary.covered, summary.templates, summary.chunks) == (50, 0, 0, ())
+    assert (summary.map_bytes, summary.bytes_per_place) == (200, 4.0)
+    assert summarise((), places=0, route={"layers": 200}).bytes_per_place == 200
 
 
 def test_description_tells_the_numbers() -> None:
-    lines = describe(summarise(PLAN, places=2500, map_bytes=10_000)).splitlines()
-    assert len(lines) == 4
-    for number in ("0-1023", "93", "171", "5301", "gcd 3"):
+    lines = describe(
+        summarise(PLAN, places=2500, route={"templates": 9000}).with_fixed(header=1000, backbone=0)
+    ).splitlines()
+    assert len(lines) == 5
+    for number in ("0-1023", "93", "171", "5301"):
         assert number in lines[0]
     assert "97.5" in lines[1]
-    assert "gcd 1 to 3" in lines[2]
-    for number in ("1624 of 2500", "387 templates", "748 numbers", "10000 bytes", "4.0 per place"):
+    for number in ("1624 of 2500", "387 templates", "748 numbers"):
         assert number in lines[3]
+    for number in ("10000 bytes", "4.0 per place", "templates 9000", "header 1000"):
+        assert number in lines[4]
+    assert "backbone" not in lines[4]
 
 
 def test_description_of_many_layers_stays_short() -> None:
     plan = tuple(FrequencyLayer(Fraction(p), p, 0, 1024, (0,)) for p in range(8, 108))
-    first, _ = describe(summarise(plan, 1024, 1)).splitlines()
+    first, *_ = describe(summarise(plan, 1024, {})).splitlines()
     assert "100 layers" in first
     assert len(first) < 300
+
+
+def test_a_summary_prints_as_lines_for_a_person() -> None:
+    summary = summarise(PLAN, 2500, {"templates": 1})
+    assert str(summary) == repr(summary) == describe(summary)
+    assert "Fraction" not in str(summary)

@@ -5,13 +5,13 @@ from fractions import Fraction
 
 import pytest
 import torch
+from dejavu_torch.experiments.others import Other
 from helpers import Fixed
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, SlidingWindow, SpectrogramAnalysis
 from dejavu_torch.data.truth import as_truth, offset_truth
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.experiments.others import Other
 from dejavu_torch.experiments.pictures import (
     best_explained,
     best_phases,

@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.database.template_map import CompressedMap
 from dejavu_torch.database.mapfile import build, recipe_of
+from dejavu_torch.database.template_map import CompressedMap, Matcher
 from dejavu_torch.database.templates import PhaseTemplates
-from dejavu_torch.database.template_map import Matcher
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.support import support_of, supportive_periods

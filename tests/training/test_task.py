@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from dejavu_torch.recognition.deploy import Localizer
 from helpers import Fixed
 from pytorch_lightning import Callback, Trainer
 from test_evenly import QUERY, REFERENCE, STEP, camera
@@ -20,7 +21,6 @@ from dejavu_torch.data.truthfile import read_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.periods.imposed import ImposedPeriods
-from dejavu_torch.recognition.deploy import Localizer
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import MapExport
 from dejavu_torch.training.objective import Objective
