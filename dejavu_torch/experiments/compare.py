@@ -1,4 +1,4 @@
-"""Learn, localize, judge, and set it beside the baselines and the null control."""
+"""Learn, localize, evaluate, and set it beside the baselines and the null controls."""
 
 from __future__ import annotations
 
@@ -7,56 +7,62 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.truth import Shown, as_truth, counted, unit_of
-from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
+from dejavu_torch.data.ground_truth import (
+    as_ground_truth,
+    check_ground_truth,
+    describe_ground_truth,
+    find_ground_truth,
+    ground_truth_in_places,
+)
 from dejavu_torch.database.l1 import l1_backend
-from dejavu_torch.evaluation.controls import leave_out_match
+from dejavu_torch.database.place_map import PlaceMap
+from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines
+from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     count_queries,
     curve_of,
     threshold_of_full_precision,
 )
+from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.report import Contender, Report, contend
-from dejavu_torch.evaluation.route_plots import plot_ground, plot_velocity
-from dejavu_torch.experiments.others import Other, hog_others, others_of
-from dejavu_torch.experiments.pictures import draw_pictures
-from dejavu_torch.features.extract import feature_batches, frame_shape
+from dejavu_torch.evaluation.report import Report
+from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
+SAMPLED = 256  # reference frames that a given map is tried on
+NEAR = 10  # places within which it should find them, at least
+
 
 class Comparison(NamedTuple):
-    """A comparison's figures, matches and pictures.
+    """A comparison's figures and pictures, and what was compared.
 
-    model holds the map; stored (N,D) and seen (Q,D) are the features of reference and query; truth is
-    None where there is none; reference and query are the traverses as they were learnt and localized, shown
-    tells the frames of both where they are evenly spaced, else None.
+    model holds the map; reference and query are the traverses as they were learned and localized, resampled
+    where the model asks for it; reference_features (N,D) and query_features (Q,D) are those of the places and
+    of the queries; match and truth count places, truth is None where nothing tells the right places.
     """
 
     report: Report
-    match: Match
-    model: DejaVu
     pictures: Mapping[str, Picture]
-    stored: Tensor
-    seen: Tensor
-    truth: GroundTruth | None
+    model: DejaVu
     reference: Traverse
     query: Traverse
-    shown: Shown | None
+    reference_features: Tensor
+    query_features: Tensor
+    match: Match
+    truth: GroundTruth | None
 
 
 def compare(
@@ -64,139 +70,70 @@ def compare(
     query: Traverse,
     truth: str | None = None,
     model: DejaVu | None = None,
+    *,
     tolerance: int = 5,
     leave_out: int | None = None,
     seed: int = 0,
     interpolate: bool = False,
     progress: bool = False,
-    learn: bool = True,
 ) -> Comparison:
-    """Learn the reference, find the queries on it, and judge that against what else could be stored.
+    """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
 
     Args:
         reference: the traverse to learn. query: a second traverse of the route.
-        truth: see `find_truth`; without a truth there are matches and pictures but no scores.
-        model: settings; None is DejaVu with its defaults. It is taught the reference.
-        tolerance: frames within which a place is right, inclusive.
+        truth: see `find_ground_truth`; without one there are matches and pictures but no scores.
+        model: settings; None is DejaVu with its defaults. A model that has a map keeps it, and is evaluated as
+            it is: the map has to be of this very reference.
+        tolerance: places within which one is right, inclusive.
         leave_out: also query the reference with itself, leaving out this many frames to each side of
             the query from every mean; a diagnostic.
         seed: of the shuffle of the null control.
-        interpolate: see `read_truth`.
+        interpolate: see `find_ground_truth`.
         progress: show progress bars on a terminal.
-        learn: False judges the map that the model has, of this very reference, as training made it.
 
     Raises:
         InputError: bad input of any of the stages, or a map of another number of places.
     """
-    if tolerance < 0 or (leave_out is not None and leave_out < 0):
-        raise InputError(f"tolerance is {tolerance}, leave_out {leave_out}; expected at least 0")
-    if leave_out is not None and not learn and model is not None and model.trained is not None:
-        raise InputError(
-            f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"
-        )
-    if truth is not None:
-        check_truth_text(truth, interpolate)
-    known = None
     model = DejaVu() if model is None else model
+    _check_arguments(model, truth, tolerance, leave_out, interpolate)
     _check_sizes(model, reference, query)
-    came, shown, clock = (reference, query), None, Clock()
+    clock, sources, has_map = Clock(), (reference, query), model.map.places > 0
     with clock("learn"):
-        reference = model.evenly(reference, None if learn else model.step, progress)
-    if isinstance(reference, ResampledTraverse):
-        with clock("localize"):
-            query = model.evenly(query, reference.step, progress)
-        frame = query.frame if isinstance(query, ResampledTraverse) else None
-        shown = Shown(frame, reference.frame, reference.place_of, came[1].length)
+        reference = model.resample(reference, model.step if has_map else None, progress)
+    with clock("localize"):
+        query = model.resample(query, getattr(reference, "step", None), progress)
+    known = None
     early = reference.length is not None and query.length is not None
-    if early:  # a truth that does not fit is told before the long work
-        known = find_truth(truth, *came, reference.length, query.length or 0, interpolate, shown)
-        if not learn:
-            _check_places(model, reference, reference.length or 0)
+    if early:  # a ground truth that does not fit is refused before the long work
+        known = _ground_truth(truth, sources, reference, query, interpolate)
     if reference.name == query.name:
         log.warning(
-            "%s is matched with itself, every frame with its own; judge on a second traverse", query.name
+            "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
         )
     with clock("learn"):
-        stored = model.extract_all(reference, "learning" if progress else None)
-        if learn:
-            model.learn_features(stored, reference)
-        else:
-            _check_places(model, reference, len(stored))
-            _check_own(model, stored, tolerance, reference.name)
+        reference_features = _learn(model, reference, has_map, tolerance, progress)
     with clock("localize"):
-        seen = model.extract_all(query, "localizing" if progress else None)
-        model.check_queries(frame_shape(query), seen.shape[1], query.name)
-        match = model.localize(seen)
-
+        query_features = model.extract_all(query, "describing the query" if progress else None)
+        model.check_queries(query.frame_shape, query_features.shape[1], query.name)
+        match = model.localize(query_features)
     if not early:
-        known = find_truth(truth, *came, len(stored), len(seen), interpolate, shown)
-    others = others_of(model, stored, seen, tolerance, seed, progress)
-    if not isinstance(model.features, HOG) and len(frame_shape(reference)) == 3:
-        others |= hog_others(reference, query, model.batch_size, tolerance, progress)
-    if leave_out is not None:
-        itself = leave_out_match(model, stored, leave_out)
-        others["leave_out"] = Other(f"reference on itself, +-{leave_out} left out", itself)
-    contenders = {}
-    for key, (name, other, bytes, k) in others.items():
-        own = as_truth(torch.arange(len(stored))[:, None]) if key == "leave_out" else known
-        contenders[key] = _judged(name, other, own, tolerance, bytes, k)
-
-    size = model.map_bytes
-    plan = model.map.plan
-    chunks = model.certificate.chunks
-    facts = {
-        "frames": len(stored),
-        "queries": len(seen),
-        "tolerance": tolerance,
-        "unit": unit_of(shown),
-        "recall_definition": RECALL_DEFINITION,
-        "map_bytes": size,
-        "backbone_bytes": model.backbone_bytes,
-        "bytes_per_place": size / len(stored),
-        "full_bytes": stored.numel() * model.map.templates.element_size(),
-        "templates": sum(layer.phases for layer in plan),
-        "template_numbers": model.map.templates.numel(),
-        "periods": sorted({_plain(layer.period) for layer in plan}),
-        "chunks": [
-            {
-                "start": c.start,
-                "stop": c.stop,
-                "periods": [_plain(period) for period in c.periods],
-                "features": list(c.features),
-            }
-            for c in chunks
-        ],
-        "seconds_learn": clock.seconds["learn"] + (model.trained.seconds if model.trained else 0.0),
-        "seconds_localize": clock.seconds["localize"],
-        "accepted": int(match.accepted.sum()),
-        "l1_backend": l1_backend(),
-        "spectrogram_backend": BACKEND,
-        "threshold": model.threshold,
-        "trained": model.trained and model.trained._asdict(),
-        "reference": reference.name,
-        "query": query.name,
-        "version": dejavu_torch.__version__,
-        "torch": torch.__version__,
-    }
-    if isinstance(reference, ResampledTraverse):
-        facts["spacing"] = {
-            "step": reference.step,
-            "reference_frames": len(reference.way),
-            "query_frames": len(query.way) if isinstance(query, ResampledTraverse) else None,
-        }
+        lengths = len(reference_features), len(query_features)
+        known = _ground_truth(truth, sources, reference, query, interpolate, lengths)
     if known is not None:
-        positions = reference.place is not None and query.place is not None
+        known = ground_truth_in_places(known, model.map.place_of)
+    match = _of_shown_frames(match, model.map)
+    run = Localization(model, reference, query, reference_features, query_features, match, known, tolerance)
+    contenders = _contenders(run, seed, leave_out, progress)
+    facts = _facts(run, clock)
+    if known is not None:
+        positions = all(source.place is not None for source in sources)
         facts |= count_queries(match, known, tolerance)
-        facts["truth"] = describe_truth(truth, interpolate, positions, spaced=shown is not None)
+        facts["truth"] = describe_ground_truth(truth, interpolate, positions)
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
-    ours = _judged("this map", match, known, tolerance, size)
-    pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, others)
-    if isinstance(reference, ResampledTraverse):
-        motion = {"ground": _ground(reference), "velocity": _velocity(reference, query)}
-        pictures = motion | pictures
+    pictures = draw_pictures(run, contenders)
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
-    report = Report(ours, contenders, facts)
-    return Comparison(report, match, model, pictures, stored, seen, known, reference, query, shown)
+    report = Report(contenders.pop("map"), contenders, facts)
+    return Comparison(report, pictures, *run[:-1])
 
 
 class Clock:
@@ -212,74 +149,152 @@ class Clock:
         self.seconds[name] += time.perf_counter() - began
 
 
-def _judged(
-    name: str,
-    match: Match,
-    truth: GroundTruth | None,
-    tolerance: int,
-    bytes: int | None = None,
-    k: int | None = None,
-) -> Contender:
-    """Scores where there is a truth that counts any of the queries."""
-    if truth is None or not counted(match.index, truth, tolerance).any():
-        return Contender(name, None, bytes, k)
-    return contend(name, match, truth, tolerance, bytes, k)
-
-
-def _ground(reference: ResampledTraverse) -> Picture:
-    velocity, place = reference.normalizer, reference.length // 2
-    frame = next(reference.between(place, place + 1)).cpu()
-    corners = velocity.corners
-    return Picture(
-        plot_ground(frame[0], corners, ground_patch(frame, corners, velocity.size)[0]),
-        "the ground that is measured",
-        "Right if what lies straight ahead runs straight down the view from above, and what repeats along "
-        "the way repeats at even distances there.",
-    )
-
-
-def _velocity(reference: ResampledTraverse, query: Traverse) -> Picture:
-    pair = [("reference", reference), ("query", query)]
-    ways = {
-        f"{role}: {one.name}": one.way * one.step for role, one in pair if isinstance(one, ResampledTraverse)
-    }
-    return Picture(
-        plot_velocity(ways, reference.step),
-        "how fast the ground moves",
-        "The motion of the ground from frame to frame, forward above the grey line. Places are even steps "
-        "along it: a camera that stands, or goes back and forth, adds none. A vehicle's speed changes "
-        "smoothly: a curve that jumps, or falls below the line, tells of corners that show no clear ground.",
-    )
+def _check_arguments(
+    model: DejaVu, truth: str | None, tolerance: int, leave_out: int | None, interpolate: bool
+) -> None:
+    if tolerance < 0 or (leave_out is not None and leave_out < 0):
+        raise InputError(f"tolerance is {tolerance}, leave_out {leave_out}; expected at least 0")
+    if leave_out is not None and model.map.places and model.trained is not None:
+        raise InputError(
+            f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"
+        )
+    if truth is not None:
+        check_ground_truth(truth, interpolate)
 
 
 def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
     """Refuse, before the long work, traverses whose frames do not give as many features."""
-    told, counts = [], []
-    for traverse in (reference, query):
-        counts.append(next(feature_batches(traverse, model.pipeline, 1)).shape[1])
-        size = " x ".join(map(str, frame_shape(traverse)))
-        told.append(f"{traverse.name} gives {counts[-1]} features a frame of {size}")
+    counts = [next(feature_batches(traverse, model.pipeline, 1)).shape[1] for traverse in (reference, query)]
     if counts[0] != counts[1]:
-        raise InputError(f"{' and '.join(told)}; expected as many, as ?width= and ?height= behind both make")
+        seen = " and ".join(
+            f"{traverse.name} gives {count} features a frame of {' x '.join(map(str, traverse.frame_shape))}"
+            for traverse, count in zip((reference, query), counts, strict=True)
+        )
+        raise InputError(f"{seen}; expected as many, as frames of one size give")
 
 
-def _check_places(model: DejaVu, reference: Traverse, places: int) -> None:
-    if places != model.map.places:
+def _ground_truth(
+    truth: str | None,
+    sources: tuple[Traverse, Traverse],
+    reference: Traverse,
+    query: Traverse,
+    interpolate: bool,
+    lengths: tuple[int, int] | None = None,
+) -> GroundTruth | None:
+    """The ground truth of the queries, in frames of the reference's source."""
+    resampled = isinstance(reference, ResampledTraverse)
+    places, queries = (reference.length, query.length) if lengths is None else lengths
+    frames = len(reference.positions) if isinstance(reference, ResampledTraverse) else places
+    numbers = query.frame if isinstance(query, ResampledTraverse) else queries
+    assert numbers is not None
+    return find_ground_truth(truth, *sources, frames, numbers, interpolate, resampled)
+
+
+def _learn(model: DejaVu, reference: Traverse, has_map: bool, tolerance: int, progress: bool) -> Tensor:
+    """Features of the reference, learned where the model has no map of it yet."""
+    if has_map and reference.length is not None:
+        _check_places(model.map, reference.name, reference.length)
+    features = model.extract_all(reference, "describing the reference" if progress else None)
+    if not has_map:
+        model.learn_features(features, reference)
+        return features
+    _check_places(model.map, reference.name, len(features))
+    sample = torch.arange(0, len(features), max(1, len(features) // SAMPLED))
+    found = (model.localize(features[sample]).index - sample).abs() <= max(tolerance, NEAR)
+    if found.float().mean() < 0.5 and model.map.summary().covered:
+        log.warning(
+            "the map finds %d of %d frames of %s; expected the reference that it was made of",
+            *(int(found.sum()), len(sample), reference.name),
+        )
+    return features
+
+
+def _check_places(route: PlaceMap, name: str, places: int) -> None:
+    if places != route.places:
         raise InputError(
-            f"{reference.name} gives {places} places, the map holds {model.map.places}; "
+            f"{name} gives {places} places, the map holds {route.places}; "
             "expected the reference that it was made of"
         )
 
 
-def _check_own(model: DejaVu, stored: Tensor, tolerance: int, name: str) -> None:
-    """Tell of a map that finds few of the frames that it should be made of."""
-    sample = torch.arange(0, len(stored), max(1, len(stored) // 256))
-    right = (model.localize(stored[sample]).index - sample).abs() <= tolerance
-    if model.map.plan and right.float().mean() < 0.5:
-        told = "the map finds %d of %d frames of %s; expected the reference that it was made of"
-        log.warning(told, int(right.sum()), len(sample), name)
+def _of_shown_frames(match: Match, route: PlaceMap) -> Match:
+    """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
+    return match._replace(index=route.place_of(route.frame_of(match.index)))
 
 
-def _plain(period: object) -> int | float:
+def _contenders(run: Localization, seed: int, leave_out: int | None, progress: bool) -> dict[str, Contender]:
+    """The map and what it is set beside, by their keys in report.json; the map's own is `map`."""
+    model, tolerance = run.model, run.tolerance
+    features = run.reference_features, run.query_features
+    baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress)
+    if not isinstance(model.features, HOG):
+        baselines |= hog_baselines(run.reference, run.query, model.batch_size, tolerance, progress)
+    size = model.summary().map_bytes
+    contenders = {"map": contend("this map", run.match, run.truth, tolerance, size)}
+    for key, (name, match, bytes, k) in baselines.items():
+        truth, match = run.truth, _of_shown_frames(match, model.map)
+        if key == "leave_out":  # its queries are the places themselves
+            truth = ground_truth_in_places(as_ground_truth(_own_frames(model.map)), model.map.place_of)
+        contenders[key] = contend(name, match, truth, tolerance, bytes, k)
+    return contenders
+
+
+def _own_frames(route: PlaceMap) -> Tensor:
+    return route.frame_of(torch.arange(route.places))[:, None]
+
+
+def _facts(run: Localization, clock: Clock) -> dict[str, Any]:
+    """What report.json holds beside the scores."""
+    model, reference, query = run.model, run.reference, run.query
+    summary, features = model.summary(), run.reference_features
+    facts = {
+        "frames": len(features),
+        "queries": len(run.match.index),
+        "tolerance": run.tolerance,
+        "unit": "places at even steps" if len(model.map.positions) else "frames",
+        "recall_definition": RECALL_DEFINITION,
+        "kind": summary.kind,
+        "map_bytes": summary.map_bytes,
+        "backbone_bytes": summary.fixed.get("backbone", 0),
+        "fixed_bytes": summary.fixed_bytes,
+        "route_bytes": summary.route_bytes,
+        "bytes_per_place": summary.bytes_per_place,
+        "route_bytes_per_place": summary.route_bytes / len(features),
+        "full_bytes": features.numel() * features.element_size(),
+        "templates": summary.templates,
+        "template_numbers": summary.template_numbers,
+        "periods": sorted({plain_number(period) for chunk in summary.chunks for period in chunk.periods}),
+        "chunks": [
+            {
+                "start": chunk.start,
+                "stop": chunk.stop,
+                "periods": [plain_number(period) for period in chunk.periods],
+                "features": list(chunk.features),
+            }
+            for chunk in summary.chunks
+        ],
+        "seconds_learn": clock.seconds["learn"] + (model.trained.seconds if model.trained else 0.0),
+        "seconds_localize": clock.seconds["localize"],
+        "accepted": int(run.match.accepted.sum()),
+        "l1_backend": l1_backend(),
+        "spectrogram_backend": BACKEND,
+        "threshold": model.threshold,
+        "trained": model.trained and model.trained._asdict(),
+        "reference": reference.name,
+        "query": query.name,
+        "version": dejavu_torch.__version__,
+        "torch": torch.__version__,
+    }
+    if isinstance(reference, ResampledTraverse):
+        facts["resampling"] = {
+            "step": reference.step,
+            "reference_frames": len(reference.positions),
+            "query_frames": len(query.positions) if isinstance(query, ResampledTraverse) else None,
+        }
+    return facts
+
+
+def plain_number(period: object) -> int | float:
+    """An exact period as a number of JSON."""
     value = float(period)  # type: ignore[arg-type]
     return int(value) if value.is_integer() else value
