@@ -16,7 +16,7 @@ from dejavu_torch.database.mapfile import map_size, read_map, write_map
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
 from dejavu_torch.database.summary import MapSummary
-from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
+from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import check_queries, feature_batches, features_of, frame_shape
@@ -47,7 +47,7 @@ CLASSES = (
     GroundOdometry,
 )
 REGISTRY: Registry = {cls.__name__: cls for cls in CLASSES}
-KINDS = {cls.kind: cls for cls in (TemplateMap,)}
+KINDS = [cls.kind for cls in CLASSES if issubclass(cls, Mapper)]
 PARTS: dict[str, type[nn.Module]] = {
     "preprocess": Preprocess,
     "features": nn.Module,
@@ -173,7 +173,8 @@ class DejaVu(nn.Module):
             )
         self.step = None
         if isinstance(traverse, ResampledTraverse):
-            self.step, route.positions = traverse.step, traverse.positions.float().to(features.device)
+            self.step = traverse.step
+            route.positions = traverse.positions.float().to(features.device)
             route.check()
         self.map = route
         self.frame_shape, self.trained = shape or None, None

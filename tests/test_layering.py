@@ -1,4 +1,4 @@
-"""Imports point one way (CONTRIBUTING.md, the house), and files stay short."""
+"""Imports point one way (CONTRIBUTING.md, the house)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ORDER = [
     {"cli"},
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
-LONGEST = 300
+ONLY = {"motion": {"types", "data"}}  # rooms that use less than all to their left
 
 
 def room_of(file: Path) -> str:
@@ -69,7 +69,7 @@ def wrong_arrows(source: str, file: Path) -> list[str]:
     return [
         f"{file}:{line}: {here} imports {room or 'the front door'}"
         for line, room in rooms_imported(source, file)
-        if room != here and ranks[room] >= RANK[here]
+        if room != here and (ranks[room] >= RANK[here] or room not in ONLY.get(here, ranks))
     ]
 
 
@@ -80,11 +80,6 @@ def test_every_file_stands_in_a_room() -> None:
 @pytest.mark.parametrize("file", FILES, ids=NAMES)
 def test_imports_point_one_way(file: Path) -> None:
     assert wrong_arrows((PACKAGE / file).read_text(encoding="utf-8"), file) == []
-
-
-@pytest.mark.parametrize("file", FILES, ids=NAMES)
-def test_files_stay_short(file: Path) -> None:
-    assert len((PACKAGE / file).read_text(encoding="utf-8").splitlines()) <= LONGEST
 
 
 @pytest.mark.parametrize(
@@ -100,7 +95,9 @@ def test_files_stay_short(file: Path) -> None:
         ("features/deep/net.py", "from ...database import phase"),
         ("data/files.py", "def f():\n    from dejavu_torch.model import DejaVu"),
         ("data/simulate/aerial.py", "if True:\n    import dejavu_torch.evaluation as e"),
-        ("database/phase.py", "import torch, dejavu_torch.database.template_map"),
+        ("database/templates.py", "import torch, dejavu_torch.recognition.select"),
+        ("recognition/select.py", "from dejavu_torch.motion import resampling"),
+        ("motion/odometry.py", "from dejavu_torch.features.preprocess import select_channel"),
         ("database/scores.py", "from ..model import DejaVu"),
         ("model.py", "from .evaluation import curves"),
         ("model.py", "from . import evaluation"),

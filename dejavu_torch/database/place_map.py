@@ -148,8 +148,13 @@ class PlaceMap(nn.Module):
 class Mapper(nn.Module):
     """Makes a map from descriptors. Subclass it, and `PlaceMap`, to bring another kind of map.
 
+    Attributes:
+        kind: of its maps, the name that they store.
+
     Shape: features (N,D) float -> PlaceMap of N places.
     """
+
+    kind: ClassVar[str]
 
     @abstractmethod
     def forward(self, features: Tensor) -> PlaceMap:

@@ -381,6 +381,8 @@ class TemplateMapper(Mapper):
         tensor(20)
     """
 
+    kind = TemplateMap.kind
+
     def __init__(
         self,
         periods: PeriodFinder | None = None,

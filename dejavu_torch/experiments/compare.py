@@ -82,8 +82,8 @@ def compare(
     Args:
         reference: the traverse to learn. query: a second traverse of the route.
         truth: see `find_ground_truth`; without one there are matches and pictures but no scores.
-        model: settings; None is DejaVu with its defaults. A model that has a map keeps it, and is evaluated as
-            it is: the map has to be of this very reference.
+        model: settings; None is DejaVu with its defaults. A model that has a map keeps it and is
+            evaluated as it is: the map has to be of this very reference.
         tolerance: places within which one is right, inclusive.
         leave_out: also query the reference with itself, leaving out this many frames to each side of
             the query from every mean; a diagnostic.
