@@ -1,0 +1,185 @@
+"""Another kind of map behind the seam: one class, one mapper, one line of registration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from torch import Tensor, nn
+
+from dejavu_torch import model as model_module
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.place_map import Mapper, PlaceMap
+from dejavu_torch.database.summary import MapSummary
+from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
+from dejavu_torch.evaluation.controls import leave_out_match, null_control
+from dejavu_torch.experiments.compare import compare
+from dejavu_torch.model import DejaVu, read_place_map
+from dejavu_torch.types import FrequencyLayer
+
+
+class StoredMap(PlaceMap):
+    """All features, as they are."""
+
+    kind = "stored"
+    values: Tensor
+
+    def __init__(self, values: Tensor | None = None, power: float = 1.0) -> None:
+        super().__init__(*((0, 0) if values is None else values.shape))
+        self.power = power
+        self.register_buffer("values", torch.zeros(0, 0) if values is None else values)
+
+    def scores(self, queries: Tensor) -> Tensor:
+        return torch.cdist(queries, self.values, p=self.power)
+
+    def settings(self) -> dict[str, Any]:
+        return {"power": self.power}
+
+    def summary(self) -> MapSummary:
+        return MapSummary(self.kind, self.places, self.places, 0, 0, (), {"values": self.values.nbytes}, {})
+
+    def disagreement(self) -> str:
+        fits = tuple(self.values.shape) == (self.places, self.dimension)
+        return (
+            "" if fits else f"values {tuple(self.values.shape)}; expected ({self.places}, {self.dimension})"
+        )
+
+
+class StoredMapper(Mapper):
+    """Keeps the features."""
+
+    kind = StoredMap.kind
+
+    def __init__(self, power: float = 1.0, every: int = 1) -> None:
+        super().__init__()
+        self.power, self.every = power, every
+
+    def forward(self, features: Tensor) -> StoredMap:
+        return StoredMap(features[:: self.every].clone(), self.power)
+
+    def empty(self) -> StoredMap:
+        return StoredMap(power=self.power)
+
+
+@pytest.fixture
+def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one line: the class in `CLASSES`, from which these two follow."""
+    monkeypatch.setattr(
+        model_module, "REGISTRY", {**model_module.REGISTRY, StoredMapper.__name__: StoredMapper}
+    )
+    monkeypatch.setattr(model_module, "KINDS", [*model_module.KINDS, StoredMapper.kind])
+
+
+def test_learn_localize_save_load(registered: None, tmp_path: Path) -> None:
+    values = torch.rand(40, 6)
+    model = DejaVu(mapper=StoredMapper()).learn(values)
+    assert model.localize(values + 0.01).index.tolist() == list(range(40))
+    model.save(tmp_path / "m.safetensors")
+    again = DejaVu.load(tmp_path / "m.safetensors")
+    assert isinstance(again.mapper, StoredMapper)
+    assert torch.equal(again(values), model(values))
+    assert again.summary().map_bytes == (tmp_path / "m.safetensors").stat().st_size
+    assert read_place_map(tmp_path / "m.safetensors").places == 40
+
+
+def test_a_kind_that_is_not_registered_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(model_module, "REGISTRY", {"StoredMapper": StoredMapper} | dict(model_module.REGISTRY))
+        patch.setattr(model_module, "KINDS", ["stored"])
+        DejaVu(mapper=StoredMapper()).learn(torch.rand(9, 2)).save(tmp_path / "m.safetensors")
+    with refused("'stored'", "templates"):
+        DejaVu.load(tmp_path / "m.safetensors")
+
+
+def test_compare_reports_any_kind() -> None:
+    reference, query = (torch.rand(30, 4, generator=torch.Generator().manual_seed(0)) for _ in range(2))
+    result = compare(
+        ArrayTraverse(reference, "a"), ArrayTraverse(query + 0.01, "b"), "0", DejaVu(mapper=StoredMapper())
+    )
+    report = result.report.as_json()
+    assert (report["kind"], report["recall_at_1"], report["templates"]) == ("stored", 1.0, 0)
+    assert report["map_bytes"] == result.model.summary().map_bytes > report["route_bytes"] == 30 * 4 * 4
+    assert {"uncompressed", "stride", "null"} <= report.keys()
+    assert "null_same_plan" not in report
+    assert {"pr", "coverage"} <= result.pictures.keys()
+
+
+def test_what_is_of_templates_alone_is_refused_in_one_line() -> None:
+    values = torch.rand(30, 4)
+    model = DejaVu(mapper=StoredMapper()).learn(values)
+    for use in (
+        lambda: leave_out_match(model, values, 1),
+        lambda: null_control(model, values, values, same_plan=True),
+    ):
+        with refused("template maps", "'stored'"):
+            use()
+
+
+def test_a_state_of_another_kind_or_of_other_settings_is_refused() -> None:
+    state = DejaVu(mapper=StoredMapper()).learn(torch.rand(9, 2)).state_dict()
+    with refused("kind is 'stored'", "'templates'"):
+        DejaVu().load_state_dict(state)
+    other = DejaVu(mapper=StoredMapper(power=2.0))
+    with refused("power is 1.0", "2.0"):
+        other.load_state_dict(state)
+    assert other.map.places == 0
+
+
+@pytest.mark.parametrize("settings", [("l2", "mean"), ("l1", "sum")])
+def test_an_l1_mean_state_goes_into_no_other(settings: tuple[Any, Any]) -> None:
+    layer = FrequencyLayer(4, 4, 0, 9, (0,))
+    route = TemplateMap((layer,), [torch.rand(4, 1)], 9, 2)
+    other = TemplateMap((), (), 0, 0, *settings)
+    with refused("expected"):
+        other.load_state_dict(route.state_dict())
+    assert (other.places, other.plan) == (0, ())
+
+
+def test_a_template_map_is_not_extended() -> None:
+    with refused("'templates'", "cannot be extended"):
+        TemplateMap((), (), 5, 2).extend(torch.rand(3, 2))
+
+
+def test_frames_and_places_are_one_another_where_nothing_is_resampled() -> None:
+    route = TemplateMap((), (), 5, 2)
+    some = torch.tensor([[0, 4], [-1, 2]])
+    assert torch.equal(route.frame_of(some), some)
+    assert torch.equal(route.place_of(some), some)
+    with refused("frame 5", "0 to 4"):
+        route.place_of(torch.tensor([5]))
+
+
+def test_the_one_table_between_frames_and_places() -> None:
+    """A camera that stands over frames 2 to 4: all of them are place 2."""
+    route = TemplateMap((), (), 4, 2)
+    route.positions = torch.tensor([0.0, 1.0, 2.0, 2.0, 2.0, 3.0])
+    route.check()
+    assert route.frame_of(torch.arange(-1, 4)).tolist() == [-1, 0, 1, 2, 5]
+    assert route.place_of(torch.tensor([-1, 0, 2, 3, 4, 5])).tolist() == [-1, 0, 2, 2, 2, 3]
+    route.positions = torch.tensor([0.0, 1.0])
+    with refused("positions of 2 places", "expected 4"):
+        route.check()
+
+
+def test_a_mapper_that_does_not_fit_is_refused() -> None:
+    with refused("StoredMapper made a map of 5 places", "(9, 2)"):
+        DejaVu(mapper=StoredMapper(every=2)).learn(torch.rand(9, 2))
+    with refused("Linear", "Mapper"):
+        DejaVu(mapper=nn.Linear(2, 2))  # type: ignore[arg-type]
+    with refused("Linear", "PeriodFinder"):
+        TemplateMapper(nn.Linear(2, 2))  # type: ignore[arg-type]
+
+
+def test_templates_become_parameters_by_an_argument() -> None:
+    wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])
+    model = DejaVu(mapper=TemplateMapper(trainable=True)).learn(wave)
+    assert [name for name, _ in model.map.named_parameters()] == ["templates"]
+    model(wave[:3] + 0.1).logsumexp(1).sum().backward()
+    gradient = dict(model.named_parameters())["map.templates"].grad
+    assert gradient is not None
+    assert gradient.abs().max() > 0
+    plain = DejaVu().learn(wave)
+    assert torch.equal(model(wave), plain(wave))
