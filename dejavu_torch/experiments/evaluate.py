@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.truth import Shown, unit_of
+from dejavu_torch.data.ground_truth import Shown, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
 from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import read_compressed

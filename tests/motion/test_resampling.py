@@ -17,7 +17,7 @@ from torch.nn.functional import interpolate
 from dejavu_torch import DejaVu, FrequencyLayer, GroundOdometry, ImageFolder
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truth import Shown, as_truth, places_of_frames, truth_of_places
+from dejavu_torch.data.ground_truth import Shown, as_ground_truth, places_of_frames, truth_of_places
 from dejavu_torch.data.truthfile import describe_truth, find_truth
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.experiments.compare import compare
@@ -152,7 +152,7 @@ def test_all_places_that_show_the_right_frame_are_right() -> None:
     """16 pixels a frame at a pixel a step: each frame is shown at 16 places."""
     even = ResampledTraverse(ArrayTraverse(footage(positions((16, 12)))), camera(step=1.0))
     where = Shown(None, even.frame, even.place_of)
-    right = truth_of_places(as_truth(torch.tensor([[5], [0]])), where).positives
+    right = truth_of_places(as_ground_truth(torch.tensor([[5], [0]])), where).positives
     for row, frame in zip(right, (5, 0), strict=True):
         assert row[row >= 0].tolist() == (even.frame == frame).nonzero()[:, 0].tolist()
     assert 14 <= int((right[0] >= 0).sum()) <= 18
