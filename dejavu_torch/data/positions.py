@@ -49,6 +49,11 @@ def nearest_places(positions: Tensor) -> Tensor:
     return positions.double().round().long().clamp(-1, last)
 
 
+def unit_of(positions: Tensor) -> str:
+    """What a tolerance counts: frames, or the places of a map that has such a table; (0,) is none."""
+    return "places at even steps" if len(positions) else "frames"
+
+
 def look_up(table: Tensor, index: Tensor) -> Tensor:
     """Entries of a table by their index, int64 of any shape; -1 stays -1."""
     return torch.where(index >= 0, table[index.clamp(min=0)], -1)

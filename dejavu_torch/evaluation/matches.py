@@ -40,7 +40,8 @@ def write_matches(
     """Write matches that come in parts as a csv; returns how many (queries, accepted).
 
     Args:
-        query_frames: (Q,) int64, the frame of its source that each query shows; None where query i is frame i.
+        query_frames: (Q,) int64, the frame of its source that each query shows; None where query i is
+            frame i.
         frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None where place i is
             frame i.
         query_name, place_name: the name of a frame of the query's and of the reference's source, as

@@ -134,7 +134,7 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
 # frames of the sources, and their names
 
 MATCH = Match(torch.tensor([2, -1, 0]), torch.tensor([0.5, INF, 0.25]), torch.tensor([True, False, True]))
-EVEN = "query,place,score,accepted,query_name,place_name\n"
+HEADER = "query,place,score,accepted,query_name,place_name"
 
 
 def lines(path: Path) -> list[str]:
@@ -146,7 +146,7 @@ def lines(path: Path) -> list[str]:
 def test_without_frames_and_names_places_are_frames(tmp_path: Path) -> None:
     path = tmp_path / "m.csv"
     assert write_matches(path, [MATCH]) == (3, 2)
-    assert lines(path) == [EVEN.strip(), "0,2,0.5,1,,", "1,-1,inf,0,,", "2,0,0.25,1,,"]
+    assert lines(path) == [HEADER, "0,2,0.5,1,,", "1,-1,inf,0,,", "2,0,0.25,1,,"]
 
 
 def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> None:
