@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.folder import check_size, fitted_size
+from dejavu_torch.data.names import clock_time
 from dejavu_torch.types import InputError, Traverse
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ class Video(Traverse):
         if not self._complete and i >= len(self._seconds):
             self._read_times()
         seconds = self._seconds[i]
-        return clock_time(seconds) if math.isfinite(seconds) else ""
+        return clock_time(math.floor(1000 * seconds + 0.5)) if math.isfinite(seconds) else ""
 
     @property
     def times(self) -> Tensor:
@@ -223,19 +224,6 @@ class Video(Traverse):
 
     def _broken(self, frame: int, why: str) -> InputError:
         return InputError(f"{self.name} is broken near frame {frame}: {why}; expected a whole video file")
-
-
-def clock_time(seconds: float) -> str:
-    """Hours, minutes, seconds and milliseconds.
-
-    Example:
-        >>> clock_time(3723.4804)
-        '1:02:03.480'
-    """
-    milliseconds = round(1000 * abs(seconds))
-    minutes, rest = divmod(milliseconds, 60_000)
-    sign = "-" if seconds < 0 and milliseconds else ""
-    return f"{sign}{minutes // 60}:{minutes % 60:02}:{rest / 1000:06.3f}"
 
 
 def _seconds(stamp: int | None, base: Fraction | float) -> float:
