@@ -68,7 +68,7 @@ class FrameRange(Traverse):
         if length is not None:
             self.length = len(self.frames)
         if traverse.place is not None:
-            self.place = traverse.place[start : stop or None : step]
+            self.place = traverse.place[start : stop or None : step].contiguous()
         self._least = len(self.frames) if stop else 1
 
     def batches(self, size: int) -> Iterator[Tensor]:
@@ -80,7 +80,9 @@ class FrameRange(Traverse):
             raise InputError(f"{self.name} holds {count} frames; expected {self._least} or more")
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        yield from self.traverse.select(self.frames[start:stop], 64)
+        part = self.frames[start:stop]
+        if part:
+            yield from self.traverse.select(part, 64)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
