@@ -236,9 +236,7 @@ def test_convention_11_the_map_turns_frames_into_places(resampled: Resampled) ->
     assert by_frames.match.index.max() == len(REFERENCE) - 1
 
 
-def test_convention_11_all_frames_of_a_standing_camera_are_right(
-    resampled: Resampled, tmp_path: Path
-) -> None:
+def test_convention_11_all_frames_of_one_place_are_right(resampled: Resampled, tmp_path: Path) -> None:
     """It stands from frame 60 to 85: in places any of these is right, in frames only those near by."""
     path = written(tmp_path, HEADER + "0,85,0.1,1\n")
     truth = str(written(tmp_path, "0,60\n", "truth.csv"))

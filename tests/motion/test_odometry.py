@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from functools import cache
+from inspect import signature
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,6 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.mapfile import build, recipe_of
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, ground_patch, region_length
 from dejavu_torch.motion.odometry import GroundOdometry, interpolated
 from dejavu_torch.motion.phase_correlation import shift_between
@@ -571,9 +571,10 @@ def test_settings_out_of_range_are_refused(choice: dict, words: tuple[str, ...])
         GroundOdometry(**choice)
 
 
-def test_a_recipe_builds_the_same_module() -> None:
+def test_its_attributes_build_the_same_module() -> None:
     module = GroundOdometry(size=(64, 48), step=3.0, blend=True, flow="phase")
-    assert repr(build(recipe_of(module), GroundOdometry)) == repr(module)
+    arguments = {name: getattr(module, name) for name in signature(GroundOdometry).parameters}
+    assert repr(GroundOdometry(**arguments)) == repr(module)
 
 
 # --- real footage
