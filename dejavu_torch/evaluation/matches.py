@@ -72,15 +72,15 @@ def _name(name_of: Callable[[int], str] | None, frame: int) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)
 
 
-def read_matches(path: Path, repeated: bool = False) -> Matches:
+def read_matches(path: Path) -> Matches:
     """The matches of a csv, which may come from any method.
 
     Args:
-        path: a csv with a header. query: number of the query frame, in any order. place: number of the
+        path: a csv with a header. query: number of the query frame, in any order, each once or in lines that
+            follow one another, as where resampled footage shows a frame several times. place: number of the
             reported frame of the reference, -1 for none. score: lower is better, inf for none. accepted: 1 or
             0; where the column is missing, every match with a finite score is accepted. Other columns are
             ignored.
-        repeated: whether several queries may show the same frame, as where footage is resampled.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
         accepted.
@@ -95,10 +95,8 @@ def read_matches(path: Path, repeated: bool = False) -> Matches:
         query, place = (
             _whole(cells[name], name, least, where) for name, least in (("query", 0), ("place", -1))
         )
-        if query in seen and not repeated:
-            raise InputError(
-                f"{where}: query {query} is there twice; expected each once, or the map of resampled places"
-            )
+        if query in seen and query != queries[-1]:
+            raise InputError(f"{where}: query {query} is there twice; expected each once")
         score = _score(cells["score"], where)
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:

@@ -76,7 +76,7 @@ def evaluate_file(
     if place_map is not None:
         places = place_map.places
         frames = len(positions) if resampled else places
-    queries, match = read_matches(matches, repeated=resampled)
+    queries, match = read_matches(matches)
     if frames is not None and int(match.index.max()) >= frames:
         raise InputError(f"{matches} reports place {int(match.index.max())}; expected one below {frames}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)

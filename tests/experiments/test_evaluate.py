@@ -225,7 +225,7 @@ def test_convention_11_the_map_turns_frames_into_places(resampled: Resampled) ->
     by_places = evaluate_file(resampled.matches, truth, tolerance=1, map=resampled.map)
     facts = by_places.report.facts
     assert (facts["unit"], facts["places"], facts["judged"]) == ("places at even steps", 101, 101)
-    assert torch.equal(by_places.match.index, resampled.match.index)
+    assert (by_places.match.index - resampled.match.index).abs().max() <= 1  # places that show one frame
     assert torch.equal(by_places.queries, resampled.query.frame)
     found = by_places.truth.positives[:, 0] - torch.arange(101)
     assert found.abs().max() <= 1
@@ -255,13 +255,11 @@ def test_every_frame_as_a_query_of_a_resampled_map(resampled: Resampled, tmp_pat
     assert scores_of(result)["recall_at_1"] == 1
 
 
-def test_a_frame_may_be_several_queries_only_where_places_are_resampled(
-    resampled: Resampled, tmp_path: Path
-) -> None:
-    path = written(tmp_path, HEADER + "0,0,0.1,1\n0,0,0.2,1\n1,1,0.3,1\n")
-    assert evaluate_file(path, "0", map=resampled.map).report.facts["queries"] == 3
-    with refused("line 3", "query 0", "twice"):
-        evaluate_file(path, "0")
+def test_a_frame_may_be_several_queries(resampled: Resampled, tmp_path: Path) -> None:
+    path = written(tmp_path, HEADER + "0,0,0.1,1\n0,90,0.2,1\n1,1,0.3,1\n")
+    for map_ in (resampled.map, None):
+        facts = evaluate_file(path, "0", map=map_).report.facts
+        assert (facts["queries"], facts["accepted_right"]) == (3, 2)
 
 
 def test_frames_that_the_reference_does_not_have_are_refused(resampled: Resampled, tmp_path: Path) -> None:
