@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.ground_truth import Shown, as_ground_truth, counted, unit_of
+from dejavu_torch.data.truth import Shown, as_truth, counted, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.evaluation.controls import leave_out_match
@@ -138,7 +138,7 @@ def compare(
         others["leave_out"] = Other(f"reference on itself, +-{leave_out} left out", itself)
     contenders = {}
     for key, (name, other, bytes, k) in others.items():
-        own = as_ground_truth(torch.arange(len(stored))[:, None]) if key == "leave_out" else known
+        own = as_truth(torch.arange(len(stored))[:, None]) if key == "leave_out" else known
         contenders[key] = _judged(name, other, own, tolerance, bytes, k)
 
     size = model.map_bytes

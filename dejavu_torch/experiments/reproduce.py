@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.ground_truth import places_of_frames
+from dejavu_torch.data.truth import places_of_frames
 from dejavu_torch.database.scores import Matcher
 from dejavu_torch.evaluation.controls import leave_out_match, same_settings
 from dejavu_torch.evaluation.curves import evaluate

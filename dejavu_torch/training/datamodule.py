@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.ground_truth import Shown, as_ground_truth
+from dejavu_torch.data.truth import Shown, as_truth
 from dejavu_torch.data.truthfile import find_truth
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.model import DejaVu
@@ -95,7 +95,7 @@ class RouteData(LightningDataModule):
             self.reference = self._evenly(self.raw)
             values = store(self.reference, self.resize)
             self._check_length(self.reference.name, len(values))
-            self.sets["reference"] = StoredFrames(values, as_ground_truth(torch.arange(len(values))[:, None]))
+            self.sets["reference"] = StoredFrames(values, as_truth(torch.arange(len(values))[:, None]))
         needed = {"fit": ("second", "validation"), "validate": ("validation",), "test": ("query",)}
         for name in needed.get(stage, ()):
             if self.others[name][0] is not None and name not in self.sets:
@@ -149,7 +149,7 @@ class RouteData(LightningDataModule):
         width = max(right.shape[1] for right in rights)
         pad = torch.nn.functional.pad
         right = torch.cat([pad(right, (0, width - right.shape[1]), value=-1) for right in rights])
-        frames = StoredFrames(parts[0].values, as_ground_truth(right), *(part.values for part in parts[1:]))
+        frames = StoredFrames(parts[0].values, as_truth(right), *(part.values for part in parts[1:]))
         return _loader(frames, Clips(lengths, self.batch_size, self.clip))
 
     def val_dataloader(self) -> DataLoader[Batch]:

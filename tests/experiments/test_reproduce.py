@@ -14,7 +14,7 @@ from helpers import refused
 from dejavu_torch.cli import commands, main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.ground_truth import places_of_frames
+from dejavu_torch.data.truth import places_of_frames
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.boundaries import BoundaryEffect
