@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,9 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+BATCH_NUMBERS = 2**26  # in the frames of a batch: 256 MB
+
 
 class InputError(ValueError):
-    """Bad input, told in one line: what was seen and what was expected."""
+    """Bad input. Its message is one line: what was seen and what was expected."""
 
 
 class Traverse(ABC):
@@ -55,6 +58,34 @@ class Traverse(ABC):
             if len(part):
                 yield part
             seen += len(batch)
+
+    def select(self, frames: range, size: int) -> Iterator[Tensor]:
+        """The frames of an increasing range, at most `size` at a time; a traverse may end before it does."""
+        ahead = 0  # of the next frame that is wanted
+        for part in self.between(frames.start, frames.stop):
+            kept = part[ahead :: frames.step]
+            ahead = (ahead - len(part)) % frames.step
+            if len(kept):
+                yield from kept.split(size)
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """Shape of one frame: (C,H,W), or (D,) where the traverse holds ready-made features.
+
+        Raises:
+            InputError: there are no frames.
+        """
+        for batch in self.batches(1):
+            return tuple(batch.shape[1:])
+        raise InputError(f"{self.name} holds no frames; expected at least one")
+
+    def frame_name(self, i: int) -> str:
+        """What frame i is called where it comes from: a file name, the time in a video; "" for no name."""
+        return ""
+
+    def batch_size(self, most: int) -> int:
+        """How many frames to read at a time: `most`, or fewer where frames are large."""
+        return max(1, min(most, BATCH_NUMBERS // max(1, math.prod(self.frame_shape))))
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,14 @@
-"""Traverses that lie in arrays: frames or ready-made features."""
+"""Arrays of frames, or of ready-made features, as traverses."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.types import InputError, Traverse
 
 EXPECTED = (
@@ -16,8 +16,8 @@ EXPECTED = (
 )
 
 
-class ArrayTraverse(Traverse):
-    """Frames or features that lie in an array or tensor; a memory-mapped array is read as it goes.
+class ArrayTraverse(IndexedTraverse):
+    """The frames or features of an array or tensor; of a memory-mapped file only what is used is read.
 
     Args:
         values: uint8 frames (N,H,W) or (N,H,W,3), float frames (N,C,H,W) in [0, 1], or float
@@ -40,16 +40,13 @@ class ArrayTraverse(Traverse):
         self.length = shape[0]
         self.values = values
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        for start in range(0, len(self.values), size):
-            part = self.values[start : start + size]
-            batch = part if isinstance(part, Tensor) else torch.from_numpy(np.array(part))
-            if batch.dtype == torch.uint8:
-                batch = batch[..., None] if batch.ndim == 3 else batch
-                batch = batch.permute(0, 3, 1, 2).float() / 255
-            elif batch.dtype != torch.float64:
-                batch = batch.float()
-            yield batch
+    def read(self, frames: range) -> Tensor:
+        part = self.values[frames.start : frames.stop : frames.step]
+        batch = part if isinstance(part, Tensor) else torch.from_numpy(np.array(part))
+        if batch.dtype == torch.uint8:
+            batch = batch[..., None] if batch.ndim == 3 else batch
+            return batch.permute(0, 3, 1, 2).float() / 255
+        return batch if batch.dtype == torch.float64 else batch.float()
 
 
 def read_array(path: Path) -> ArrayTraverse:

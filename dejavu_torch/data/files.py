@@ -1,4 +1,4 @@
-"""Writing files whole or not at all."""
+"""Text files read, and files written whole or not at all."""
 
 from __future__ import annotations
 
@@ -8,6 +8,37 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dejavu_torch.types import InputError
+
+LARGEST = 2**53  # beyond it a float does not hold every whole number
+
+
+def read_text(path: Path, expected: str) -> str:
+    """A whole text file, without a byte order mark, its lines ended by "\\n".
+
+    Args:
+        expected: what the file should hold, for messages.
+
+    Raises:
+        InputError: it cannot be read, or is no text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; expected {expected}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is no UTF-8 text; expected {expected}") from error
+    if "\0" in text:
+        raise InputError(f"{path} is no text; expected {expected}")
+    return text
+
+
+def as_number(text: str) -> float | None:
+    """A number that a frame or a coordinate can have, else None."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if abs(value) < LARGEST else None
 
 
 def check_output_file(path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,37 +11,30 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.types import InputError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 
-class ImageFolder(Traverse):
+class ImageFolder(IndexedTraverse):
     """The images of a folder, sorted by name; numbers in names count as numbers (9 before 10).
 
-    Grey images give one channel, all others three; a camera held upright is turned as its image says.
+    Grey images give one channel, all others three; an image that says how the camera was turned is upright.
 
     Args:
         path: the folder.
         width, height: pixels to resize each image to as it is read, antialiased; 0 keeps the image's
             own, or its aspect ratio where only the other is given.
-        step: every step-th image, from the first.
-        start, stop: the images [start, stop) only, counted from 0; a stop of 0 is the end.
 
     Raises:
-        InputError: width, height, step, start or stop out of range; no such folder, or no images in it; while
-            reading, an image that cannot be read or that has another size than the first.
+        InputError: width or height out of range; no such folder, or no images in it; while reading, an image
+            that cannot be read or that has another size than the first.
     """
 
-    def __init__(
-        self, path: str | Path, width: int = 0, height: int = 0, step: int = 1, start: int = 0, stop: int = 0
-    ) -> None:
+    def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
         folder = Path(path)
-        if width < 0 or height < 0 or step < 1:
-            raise InputError(
-                f"{path}: width={width}, height={height}, step={step}; "
-                "expected width and height of at least 0, and step of at least 1"
-            )
+        check_size(folder, width, height)
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
         files = [
@@ -55,38 +47,47 @@ class ImageFolder(Traverse):
                 (f"; it has folders such as {file.name}" for file in folder.iterdir() if file.is_dir()), ""
             )
             raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
-        stop = stop or len(files)
-        if not 0 <= start < stop <= len(files):
-            raise InputError(
-                f"{path}: start={start}, stop={stop}; expected start < stop within its {len(files)} images"
-            )
-        self.files = sorted(files, key=lambda file: _natural(file.name))[start:stop:step]
+        self.files = sorted(files, key=lambda file: _natural(file.name))
         self.width, self.height = width, height
-        self.name = str(folder) if stop - start == len(files) else f"{folder}?start={start}&stop={stop}"
+        self.name = str(folder)
         self.length = len(self.files)
+        self._first: tuple[str, str] | None = None  # name and shape of the first image that was read
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        first: Tensor | None = None
-        for start in range(0, len(self.files), size):
-            frames = []
-            for file in self.files[start : start + size]:
-                frame = self._resized(read_image(file))
-                first = frame if first is None else first
-                if frame.shape != first.shape:
-                    raise InputError(
-                        f"{file} is {_shape(frame)}; expected {_shape(first)} as {self.files[0].name}"
-                    )
-                frames.append(frame)
-            yield torch.stack(frames)
+    def read(self, frames: range) -> Tensor:
+        return torch.stack([self._image(self.files[i]) for i in frames])
 
-    def _resized(self, frame: Tensor) -> Tensor:
-        h, w = frame.shape[1:]
-        width = self.width or (max(1, round(w * self.height / h)) if self.height else w)
-        height = self.height or (max(1, round(h * self.width / w)) if self.width else h)
-        if (height, width) == (h, w):
-            return frame
-        small = interpolate(frame[None], (height, width), mode="bilinear", antialias=True)[0]
-        return small.clamp(0, 1)
+    def frame_name(self, i: int) -> str:
+        return self.files[i].name
+
+    def _image(self, file: Path) -> Tensor:
+        image = read_image(file)
+        size = fitted_size(image.shape[1], image.shape[2], self.width, self.height)
+        if size != image.shape[1:]:
+            image = interpolate(image[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+        channels, height, width = image.shape
+        shape = f"{height} x {width} pixels of {channels} channel{'s' * (channels > 1)}"
+        self._first = self._first or (file.name, shape)
+        if shape != self._first[1]:
+            raise InputError(f"{file} is {shape}; expected {self._first[1]} as {self._first[0]}")
+        return image
+
+
+def check_size(path: Path, width: int, height: int) -> None:
+    """Refuse a size in pixels below 0, which stands for the frames' own."""
+    if width < 0 or height < 0:
+        raise InputError(f"{path}: width={width}, height={height}; expected width and height of at least 0")
+
+
+def fitted_size(rows: int, columns: int, width: int, height: int) -> tuple[int, int]:
+    """(rows, columns) of frames resized to width and height; 0 is their own, or what keeps their aspect.
+
+    Example:
+        >>> fitted_size(40, 60, width=30, height=0)
+        (20, 30)
+    """
+    wide = width or (max(1, round(columns * height / rows)) if height else columns)
+    high = height or (max(1, round(rows * width / columns)) if width else rows)
+    return high, wide
 
 
 def read_image(path: Path) -> Tensor:
@@ -113,8 +114,3 @@ def _natural(name: str) -> tuple[list[str | int], str]:
     # odd positions are the digit runs, so that numbers only ever meet numbers
     parts = re.split(r"(\d+)", name)
     return [int(part) if j % 2 else part for j, part in enumerate(parts)], name
-
-
-def _shape(frame: Tensor) -> str:
-    channels, height, width = frame.shape
-    return f"{height} x {width} pixels of {channels} channel{'s' * (channels > 1)}"

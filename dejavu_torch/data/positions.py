@@ -1,40 +1,59 @@
-"""The table between reference frames and places at even steps (section IV-B)."""
+"""Frames and places of footage resampled by distance: one table, the position of each frame (section IV-B).
+
+Convention 11: the position of a frame is how many even steps it lies from the first place, place p lies at
+position p. Files count frames; phases, tolerances and scores count places.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-NEAR = 1e-4  # steps: what is so near to a place has reached it
+NEAR = 1e-4  # steps: a frame so near to a place has reached it
 
 
 def first_reached(positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where each whole number of steps is first reached: between two frames, and at what share of the way.
+    """Where each place is first reached: between which two frames, and at what share of the way.
 
     Args:
-        positions: (F,) float64, steps from the first place of each frame.
+        positions: (F,) float, of each frame.
 
-    Shape: -> low, high (M,) int64 frames, share (M,) in [0, 1]; M places.
+    Shape: -> low, high (M,) int64 frames, share (M,) float64 in [0, 1]; M places.
+
+    Convention: standing, and going back and forth, add no places.
+
+    Example:
+        >>> low, high, share = first_reached(torch.tensor([0.0, 0.5, 0.5, 2.0]))
+        >>> low.tolist(), high.tolist(), [round(part, 3) for part in share.tolist()]
+        ([0, 2, 2], [0, 3, 3], [0.0, 0.333, 1.0])
     """
+    positions = positions.double()
     furthest = positions.cummax(0).values + NEAR
-    goal = torch.arange(int(furthest[-1]) + 1, dtype=torch.float64, device=positions.device)
-    high = torch.searchsorted(furthest, goal).clamp(max=len(positions) - 1)
+    places = torch.arange(int(furthest[-1]) + 1, dtype=torch.float64, device=positions.device)
+    high = torch.searchsorted(furthest, places).clamp(max=len(positions) - 1)
     low = (high - 1).clamp(min=0)
-    # also after a reversal the frame before the first to reach a distance lies short of it
-    return (
-        low,
-        high,
-        ((goal - positions[low]) / (positions[high] - positions[low]).clamp(min=1e-12)).clamp(0, 1),
-    )
+    # also after a reversal the frame before the first to reach a place lies short of it
+    step = (positions[high] - positions[low]).clamp(min=1e-12)
+    return low, high, ((places - positions[low]) / step).clamp(0, 1)
 
 
 def shown_frames(positions: Tensor) -> Tensor:
-    """The frame nearest to each place, where it is first reached: (F,) steps -> (M,) int64."""
-    low, high, share = first_reached(positions.double())
+    """The frame nearest to each place where it is first reached: (F,) -> (M,) int64."""
+    low, high, share = first_reached(positions)
     return torch.where(share < 0.5, low, high)
 
 
 def nearest_places(positions: Tensor) -> Tensor:
-    """The place nearest to each frame, -1 behind the first: (F,) steps -> (F,) int64."""
+    """The place nearest to each frame, -1 for one behind the first: (F,) -> (F,) int64."""
     last = int(float(positions.max()) + NEAR)
     return positions.double().round().long().clamp(-1, last)
+
+
+def unit_of(positions: Tensor) -> str:
+    """What a tolerance counts: frames, or the places of a map that has such a table; (0,) is none."""
+    return "places at even steps" if len(positions) else "frames"
+
+
+def look_up(table: Tensor, index: Tensor) -> Tensor:
+    """Entries of a table by their index, int64 of any shape; -1 stays -1."""
+    return torch.where(index >= 0, table[index.clamp(min=0)], -1)

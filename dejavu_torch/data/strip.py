@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.folder import read_image
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.types import InputError
 
 
-class SlidingWindow(Traverse):
+class SlidingWindow(IndexedTraverse):
     """Frame i is the window [i * step, i * step + width) of a strip.
 
     Args:
@@ -42,14 +42,11 @@ class SlidingWindow(Traverse):
         self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
         self.length = len(self.windows)
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        for part in self.windows.split(size):
-            yield part.contiguous()
+    def read(self, frames: range) -> Tensor:
+        return self.windows[frames.start : frames.stop : frames.step].contiguous()
 
 
-def read_strip(
-    path: Path, width: int, rows: str = "", halve: int = 0, grey: bool = False, step: int = 1
-) -> SlidingWindow:
+def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: bool = False) -> SlidingWindow:
     """A window slid along a long image file.
 
     Args:
@@ -76,4 +73,4 @@ def read_strip(
         if not (first.isdigit() and stop.isdigit() and int(first) < int(stop) <= strip.shape[1]):
             raise InputError(f"{path}: rows {rows}; expected first:stop inside 0:{strip.shape[1]}")
         strip = strip[:, int(first) : int(stop)]
-    return SlidingWindow(strip, width, step, str(path))
+    return SlidingWindow(strip, width, name=str(path))

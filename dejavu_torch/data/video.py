@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -12,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.folder import check_size, fitted_size
+from dejavu_torch.data.names import clock_time
 from dejavu_torch.types import InputError, Traverse
 
 if TYPE_CHECKING:
@@ -37,46 +41,45 @@ class Video(Traverse):
         path: a video file of any container and codec that FFmpeg reads.
         width, height: pixels of the frames, averaged over areas; 0 keeps the video's own, or its
             aspect ratio where only the other is given.
-        step: every step-th frame, from frame 0.
 
     Shape: frames (B,3,H,W), RGB also where the video is grey, upright where the file says how the
         camera was turned.
 
-    Convention: where the time from frame to frame varies (dropped frames, a variable frame rate), one line of
-        warning tells so when the file was first read to its end.
+    Convention: where the time from frame to frame varies (dropped frames, a variable frame rate), a line of
+        warning says so when the file was first read to its end.
 
     Raises:
-        InputError: width, height or step out of range; no video, or one that is cut off; while
-            reading, a damaged frame, frames that are missing, or frames of different size. Only
-            files that say how long they are (not .ts, .mpg, .flv, .mjpeg) can be found cut off
-            between two frames.
+        InputError: width or height out of range; no video, or one that is cut off; while reading, a damaged
+            frame, frames that are missing, or frames of different size. Only files that say how long they are
+            (not .ts, .mpg, .flv, .mjpeg) can be found cut off between two frames.
     """
 
-    def __init__(self, path: str | Path, width: int = 0, height: int = 0, step: int = 1) -> None:
-        if width < 0 or height < 0 or step < 1:
-            raise InputError(
-                f"{path}: width={width}, height={height}, step={step}; "
-                "expected width and height of at least 0, and step of at least 1"
-            )
+    def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
         self.path, self.name = Path(path), str(path)
-        self.width, self.height, self.step = width, height, step
+        check_size(self.path, width, height)
+        self.width, self.height = width, height
         if not self.path.is_file():
             raise InputError(f"{path} is not there; expected a video file")
-        self._times: Tensor | None = None
-        self._listed: int | None = None  # frames before the step, where the file tells
+        self._seconds: list[float] = []  # of the frames that were read so far
+        self._complete = False  # whether these are all frames
         if not _is_whole(self.path):
             raise InputError(f"{path} is cut off or damaged; expected a whole video file")
         with self._open() as (container, stream):
             # only this family lists every frame, and which of them an edit list hides
             if container.format.name.startswith("mov") and stream.frames:
-                self._listed = sum(not entry.is_discard for entry in stream.index_entries)
-                self.length = len(range(0, self._listed, step))
+                self.length = sum(not entry.is_discard for entry in stream.index_entries)
 
     def batches(self, size: int) -> Iterator[Tensor]:
+        yield from self.select(range(2**62), size)
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        yield from self.select(range(start, stop), 64)
+
+    def select(self, frames: range, size: int) -> Iterator[Tensor]:
         first: tuple[int, int] | None = None
         batch: list[np.ndarray] = []
-        with closing(self._frames()) as frames:
-            for i, frame in enumerate(frames):
+        with closing(self._frames()) as decoded:
+            for i, frame in enumerate(decoded):
                 shape = (frame.height, frame.width)
                 first = first or shape
                 if shape != first:
@@ -84,13 +87,22 @@ class Video(Traverse):
                         f"frame {i} of {self.name} is {shape[0]} x {shape[1]} pixels; "
                         f"expected {first[0]} x {first[1]} as frame 0"
                     )
-                if i % self.step == 0:
+                if i in frames:
                     batch.append(self._pixels(frame))
                 if len(batch) == size:
                     yield _as_tensor(batch)
                     batch = []
+                if i + 1 >= frames.stop:
+                    break
         if batch:
             yield _as_tensor(batch)
+
+    def frame_name(self, i: int) -> str:
+        """The time of frame i, such as 0:01:23.480; "" where the file has none."""
+        if not self._complete and i >= len(self._seconds):
+            self._read_times()
+        seconds = self._seconds[i]
+        return clock_time(math.floor(1000 * seconds + 0.5)) if math.isfinite(seconds) else ""
 
     @property
     def times(self) -> Tensor:
@@ -101,13 +113,16 @@ class Video(Traverse):
         Raises:
             InputError: the file has no timestamps, or they run backwards.
         """
-        if self._times is None:
-            for _ in self._frames(decode=self._listed is None):
-                pass
-        times = self._times
-        if times is None or times.isnan().any() or (times.diff() < 0).any():
+        if not self._complete:
+            self._read_times()
+        times = torch.tensor(self._seconds, dtype=torch.float64)
+        if times.isnan().any() or (times.diff() < 0).any():
             raise InputError(f"{self.name} has no increasing timestamps; expected one for each frame")
         return times
+
+    def _read_times(self) -> None:
+        for _ in self._frames(decode=self.length is None):
+            pass
 
     def _frames(self, decode: bool = True) -> Generator[VideoFrame, None, None]:
         """Every frame; at the end its time is known, and that none is missing.
@@ -117,47 +132,51 @@ class Video(Traverse):
         """
         import av
 
-        stamps: list[int | None] = []
+        seconds: list[float] = []
         packets = 0
         try:
             with self._open() as (container, stream):
+                base = float("nan") if stream.time_base is None else stream.time_base
+                avi = container.format.name == "avi"
+                # packets are in decoding order; .avi stores no other: its decoded frames carry a wrong one
+                in_order = decode and not avi
+                if in_order and not self._complete:
+                    self._seconds = seconds
                 for packet in container.demux(stream):
                     packets += packet.size > 0
                     if packet.is_corrupt:
-                        raise self._broken(len(stamps), "the data are incomplete")
+                        raise self._broken(len(seconds), "the data are incomplete")
                     if not decode:
-                        stamps += [packet.pts] if packet.size and not packet.is_discard else []
+                        seconds += (
+                            [_seconds(packet.pts, base)] if packet.size and not packet.is_discard else []
+                        )
                         continue
                     for frame in packet.decode():
                         if frame.is_corrupt:
-                            raise self._broken(len(stamps), "the picture is damaged")
-                        stamps.append(frame.pts)
+                            raise self._broken(len(seconds), "the picture is damaged")
+                        seconds.append(_seconds(frame.pts, base))
                         yield frame
-                avi = container.format.name == "avi"
-                if (avi and packets < len(stream.index_entries)) or len(stamps) < (self._listed or 0):
-                    raise self._broken(len(stamps), "frames are missing")
-                if not stamps:
+                if (avi and packets < len(stream.index_entries)) or len(seconds) < (self.length or 0):
+                    raise self._broken(len(seconds), "frames are missing")
+                if not seconds:
                     raise InputError(f"{self.name} holds no frames; expected a video")
-                base = float("nan") if stream.time_base is None else stream.time_base
         except av.FFmpegError as error:
-            raise self._broken(len(stamps), str(error.strerror)) from error
-        seconds = [float("nan" if stamp is None else stamp * base) for stamp in stamps]
-        times = torch.tensor(seconds, dtype=torch.float64)
-        # packets come in decoding order; .avi stores no other, so its decoded frames carry a wrong one
-        times = times.sort().values if avi or not decode else times
-        if self._times is None:
-            self._tell_uneven(times.diff())
-        self._times = times[:: self.step]
+            raise self._broken(len(seconds), str(error.strerror)) from error
+        if not self._complete:
+            self._seconds = seconds if in_order else sorted(seconds)
+            self._complete = True
+            self._warn_uneven()
 
-    def _tell_uneven(self, intervals: Tensor) -> None:
-        """Tell of intervals (N-1,) in seconds that vary by more than the rounding of timestamps."""
+    def _warn_uneven(self) -> None:
+        """Warn of times from frame to frame that vary by more than the rounding of timestamps."""
+        intervals = torch.tensor(self._seconds, dtype=torch.float64).diff()
         if not len(intervals) or not (intervals >= 0).all():
             return
         middle, longest = float(intervals.median()), float(intervals.max())
         if longest > UNEVEN * middle + 1e-6:
             log.warning(
                 "%s: the frame rate varies, %.0f to %.0f ms from frame to frame (median %.0f): periods in "
-                "frames then mean nothing; frames at even steps along the ground mend it",
+                "frames mean nothing here unless the footage is resampled by distance",
                 *(self.name, 1e3 * float(intervals.min()), 1e3 * longest, 1e3 * middle),
             )
 
@@ -170,8 +189,7 @@ class Video(Traverse):
         how = int(How.AREA | How.FULL_CHR_H_INT | How.FULL_CHR_H_INP)
         turns = round(frame.rotation / 90) % 4  # quarters, counterclockwise
         w, h = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
-        width = self.width or (max(1, round(w * self.height / h)) if self.height else w)
-        height = self.height or (max(1, round(h * self.width / w)) if self.width else h)
+        height, width = fitted_size(h, w, self.width, self.height)
         if turns % 2:
             width, height = height, width
         try:
@@ -206,6 +224,10 @@ class Video(Traverse):
 
     def _broken(self, frame: int, why: str) -> InputError:
         return InputError(f"{self.name} is broken near frame {frame}: {why}; expected a whole video file")
+
+
+def _seconds(stamp: int | None, base: Fraction | float) -> float:
+    return float("nan" if stamp is None else stamp * base)
 
 
 def _as_tensor(frames: list[np.ndarray]) -> Tensor:

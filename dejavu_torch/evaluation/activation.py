@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.truth import counted, is_right
+from dejavu_torch.data.ground_truth import counted, is_right
 from dejavu_torch.types import FrequencyLayer, GroundTruth
 
 

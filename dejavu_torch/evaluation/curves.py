@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.truth import as_truth, counted, is_right
+from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
 from dejavu_torch.types import GroundTruth, InputError, Match, PRCurve
 
 RECALL_DEFINITION = (
@@ -161,7 +161,7 @@ def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> 
     """
     kept, right = _judged(match, truth, tolerance)
     good = is_right(kept.index, right.positives, tolerance)
-    queries, judged, unknown = len(match.index), len(kept.index), int((~as_truth(truth).judged).sum())
+    queries, judged, unknown = len(match.index), len(kept.index), int((~as_ground_truth(truth).judged).sum())
     return {
         "queries": queries,
         "judged": judged,
@@ -189,7 +189,7 @@ def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> No
 def _judged(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> tuple[Match, GroundTruth]:
     """Matches and truth of the queries that the scores count."""
     check_truth(match, truth, tolerance)
-    truth = as_truth(truth)
+    truth = as_ground_truth(truth)
     kept = counted(match.index, truth, tolerance)
     if not kept.any():
         raise InputError(

@@ -1,73 +1,86 @@
-"""Matches as a csv of query,place,score,accepted, and the frames of evenly spaced ones."""
+"""Matches as a csv of query,place,score,accepted,query_name,place_name."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import whole_file
-from dejavu_torch.data.truth import Shown
-from dejavu_torch.data.truthformats import as_number, read_text
+from dejavu_torch.data.files import as_number, read_text, whole_file
 from dejavu_torch.types import InputError, Match
 
+COLUMNS = ("query", "place", "score", "accepted", "query_name", "place_name")
 EXPECTED = "columns query,place,score and, if wanted, accepted"
-FRAMES = ("query_frame", "place_frame")
 _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 
 
 class Matches(NamedTuple):
     """Matches read from a file, in its order.
 
-    query: (Q,) int64, the number of each query. match: Match of (Q,). query_frame, place_frame: (Q,) int64,
-    the frames that evenly spaced queries and their reported places show, -1 for no place; None where the
-    file has no such column.
+    query: (Q,) int64, the frame number of each query. match: Match of (Q,), its index a frame number as well.
     """
 
     query: Tensor
     match: Match
-    query_frame: Tensor | None
-    place_frame: Tensor | None
 
 
-def write_matches(path: Path, matches: Iterable[Match], shown: Shown | None = None) -> tuple[int, int]:
-    """Write query,place,score,accepted for matches that come in parts; (queries, accepted) written.
+def write_matches(
+    path: Path,
+    matches: Iterable[Match],
+    query_frames: Tensor | None = None,
+    frame_of: Callable[[Tensor], Tensor] | None = None,
+    query_name: Callable[[int], str] | None = None,
+    place_name: Callable[[int], str] | None = None,
+) -> tuple[int, int]:
+    """Write matches that come in parts as a csv; returns how many (queries, accepted).
 
     Args:
-        shown: the frames that evenly spaced queries and places show: adds query_frame,place_frame, which is
-            -1 where no place is reported.
+        query_frames: (Q,) int64, the frame of its source that each query shows; None where query i is
+            frame i.
+        frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None where place i is
+            frame i.
+        query_name, place_name: the name of a frame of the query's and of the reference's source, as
+            `Traverse.frame_name`; None leaves the column empty. A character that is not printable, such as a
+            line break, is escaped.
+
+    Convention 11: query and place count frames of the sources, -1 where no place is reported.
     """
     total = accepted = 0
-    places = None if shown is None or shown.place is None else shown.place.tolist()
-    queries = None if shown is None or shown.query is None else shown.query.tolist()
-    with whole_file(path) as temporary, temporary.open("w", newline="") as file:
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["query", "place", "score", "accepted", *(FRAMES if places else ())])
+        writer.writerow(COLUMNS)
         for match in matches:
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
-            rows = zip(match.index.tolist(), match.score.tolist(), match.accepted.tolist(), strict=True)
-            for place, score, good in rows:
-                also = [queries[total] if queries else total] if places else []
-                also += [places[place] if place >= 0 else -1] if places else []
-                writer.writerow([total, place, f"{score:.{digits}g}", int(good), *also])
-                total += 1
+            first, total = total, total + len(match.index)
+            queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
+            places = match.index if frame_of is None else frame_of(match.index)
+            columns = (queries, places, match.score, match.accepted)
+            for query, place, score, good in zip(*(column.tolist() for column in columns), strict=True):
+                names = _name(query_name, query), _name(place_name, place)
+                writer.writerow([query, place, f"{score:.{digits}g}", int(good), *names])
                 accepted += good
     return total, accepted
+
+
+def _name(name_of: Callable[[int], str] | None, frame: int) -> str:
+    name = "" if name_of is None or frame < 0 else name_of(frame)
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)
 
 
 def read_matches(path: Path) -> Matches:
     """The matches of a csv, which may come from any method.
 
     Args:
-        path: a csv with a header. query: number of the query frame, each once, in any order. place: the
-            reported place, -1 for none. score: lower is better, inf for none. accepted: 1 or 0; where the
-            column is missing, every match with a finite score is accepted. query_frame, place_frame: the
-            frames that an evenly spaced query and place show, -1 for no place. Other columns are ignored.
+        path: a csv with a header. query: number of the query frame, in any order, each once or in lines that
+            follow one another, as where resampled footage shows a frame several times. place: number of the
+            reported frame of the reference, -1 for none. score: lower is better, inf for none. accepted: 1 or
+            0; where the column is missing, every match with a finite score is accepted. Other columns are
+            ignored.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
         accepted.
@@ -75,29 +88,28 @@ def read_matches(path: Path) -> Matches:
     Raises:
         InputError: what cannot be read, with the number of the line.
     """
-    rows: dict[int, tuple[int, float, bool]] = {}
-    frames: dict[str, list[int]] = {name: [] for name in FRAMES}
+    queries: list[int] = []
+    seen: set[int] = set()
+    reports: list[tuple[int, float, bool]] = []
     for where, cells in _rows(path):
         query, place = (
             _whole(cells[name], name, least, where) for name, least in (("query", 0), ("place", -1))
         )
-        if query in rows:
+        if query in seen and query != queries[-1]:
             raise InputError(f"{where}: query {query} is there twice; expected each once")
         score = _score(cells["score"], where)
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:
             raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
-        for name, least in zip(FRAMES, (0, -1), strict=True):
-            if name in cells:
-                frames[name].append(_whole(cells[name], name, least, where))
         nothing = place < 0 or math.isinf(score)
-        rows[query] = (-1, math.inf, False) if nothing else (place, score, accepted)
-    if not rows:
+        queries.append(query)
+        seen.add(query)
+        reports.append((-1, math.inf, False) if nothing else (place, score, accepted))
+    if not queries:
         raise InputError(f"{path} holds no matches; expected a line for each query")
-    index, scores, accepted_ = zip(*rows.values(), strict=True)
+    index, scores, accepted_ = zip(*reports, strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
-    of_query, of_place = (torch.tensor(frames[name]) if frames[name] else None for name in FRAMES)
-    return Matches(torch.tensor(list(rows)), match, of_query, of_place)
+    return Matches(torch.tensor(queries), match)
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

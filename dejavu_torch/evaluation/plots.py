@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dejavu_torch.data.truth import as_truth, counted, is_right
+from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
 from dejavu_torch.evaluation.activation import ActivationRates
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, PRCurve
 
@@ -111,7 +111,7 @@ def plot_coverage(
     if truth is None:
         dots(reported, BLUE, f"{reported.sum()} reported")
     else:
-        truth = as_truth(truth)
+        truth = as_ground_truth(truth)
         judged = counted(match.index, truth, tolerance)
         right = judged & is_right(match.index, truth.positives, tolerance)
         wrong = judged & reported & ~right

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.truth import counted, is_right
-from dejavu_torch.database.template_map import Matcher
+from dejavu_torch.data.ground_truth import counted, is_right
+from dejavu_torch.database.scores import Matcher
 from dejavu_torch.evaluation.controls import same_settings
 from dejavu_torch.evaluation.report import Contender, contend
 from dejavu_torch.experiments.compare import Comparison

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.truth import counted
+from dejavu_torch.data.ground_truth import counted
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.evaluation.activation import activation_rates
 from dejavu_torch.evaluation.curves import area, curve_of

@@ -91,9 +91,7 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
 
 def frame_shape(traverse: Traverse) -> tuple[int, ...]:
     """Shape of one frame of a traverse: (C,H,W), or (D,) where it gives ready features."""
-    for batch in traverse.batches(1):
-        return tuple(batch.shape[1:])
-    raise InputError(f"{traverse.name} holds no frames; expected at least one")
+    return traverse.frame_shape
 
 
 def check_queries(

@@ -1,1 +1,1 @@
-"""Frames -> frames at even steps along the ground (section IV-B)."""
+"""Frames -> frames resampled by distance, to even steps along the ground (section IV-B)."""

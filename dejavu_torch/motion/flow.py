@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.motion.ground_plane import FLOOR, check_size
+from dejavu_torch.motion.ground_plane import FLOOR, check_pairs
 from dejavu_torch.types import InputError
 
 Array = np.ndarray[Any, Any]
@@ -79,11 +79,7 @@ def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tens
         >>> round(shift.item(), 1), confidence.item() > 0.9
         (7.0, True)
     """
-    if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 1:
-        raise InputError(
-            f"patches {tuple(first.shape)} and {tuple(second.shape)}; expected two of the same (B,1,h,w)"
-        )
-    check_size((first.shape[2], first.shape[3]), 32)
+    check_pairs(first, second)
     check_method(method)
     if not len(first):
         return first.new_zeros(0), first.new_zeros(0)

@@ -10,27 +10,25 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from dejavu_torch.features.extract import BATCH_NUMBERS, frame_shape
 from dejavu_torch.motion.flow import TRACKS, check_method, flow_shift
 from dejavu_torch.motion.ground_plane import (
-    SURE,
     TRAPEZIUM,
     Corners,
     check_corners,
     check_size,
     ground_patch,
-    length_seen,
-    shift_peaks,
-    steady,
+    region_length,
 )
-from dejavu_torch.motion.mend import mended
+from dejavu_torch.motion.phase_correlation import SURE, shift_peaks, steady
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
+NAMED = 6  # stretches without common ground that a warning names
+
 
 class Odometry(NamedTuple):
-    """How far a traverse has come at each frame.
+    """Where a camera is at each frame of a traverse.
 
     distance: (N,) float64, pixels of ground (rows of the patch) from frame 0, negative behind it.
     confidence: (N-1,) of each step in [0, 1], as measured.
@@ -46,11 +44,11 @@ class GroundOdometry(nn.Module):
     Args:
         corners: (x, y) of a region of ground in fractions of the frame: far left, far right, near right,
             near left; its sides parallel on the ground, such as the rails. See `ground_patch`.
-        size: (rows, columns) of the patch it becomes, pixels, at least 32 x 32. The fastest step that can be
-            seen is about 0.42 of its rows.
+        size: (rows, columns) of the patch it becomes, pixels, at least 32 x 32. The longest step that can be
+            measured is about 0.42 of its rows.
         step: pixels of ground from one resampled frame to the next; None is the median step of the
             frames that move.
-        least: confidence below which a step is not believed, in [0, 1]. The default tells a cut in patches of
+        least: confidence below which a step is interpolated, in [0, 1]. The default finds a cut in patches of
             96 x 96; in those of 32 x 32 unrelated ground can agree by 0.8.
         still: pixels of ground; a shorter step of either sign counts as 0, as of a camera that stands. Noise
             of a few grey levels moves ground of clear texture by less; ground that hardly stands out from
@@ -122,26 +120,25 @@ class GroundOdometry(nn.Module):
         return shifts.gather(1, path)[:, 0], sure.gather(1, path)[:, 0]
 
     def distances(self, traverse: Traverse, batch_size: int = 64, progress: bool = False) -> Odometry:
-        """How far the camera has come at each frame of a traverse, which is read once, batch by batch.
+        """Where the camera is at each frame of a traverse, which is read once, batch by batch.
 
         Args:
             traverse: frames, in order.
             batch_size: frames in memory at a time; fewer where they are large.
             progress: show a progress bar on a terminal.
 
-        Convention: a step that is not believed (a cut, a drop-out) gets the velocity interpolated between the
-            believed ones before and after it; one line of warning tells which. Shorter than `still` is 0.
-            Another line tells of frames too small for the patch.
+        Convention: a step of a confidence below `least` (a cut, a drop-out) is interpolated between those
+            before and after it; a line of warning names the frames. A step shorter than `still` is 0. Another
+            warning is given of frames too small for the patch.
 
         Raises:
-            InputError: ready features, fewer than two frames, or no step that is believed.
+            InputError: ready features, fewer than two frames, or no step of enough confidence.
         """
         patches: Tensor | None = None
         parts: list[tuple[Tensor, Tensor]] = []
-        room = BATCH_NUMBERS // max(1, math.prod(frame_shape(traverse)))
         text, hidden = "measuring the ground", None if progress else True
         with tqdm(total=traverse.length, desc=text, unit="frame", disable=hidden, leave=False) as bar:
-            for batch in traverse.batches(max(1, min(batch_size, room))):
+            for batch in traverse.batches(traverse.batch_size(batch_size)):
                 if batch.ndim != 4:
                     raise InputError(
                         f"{traverse.name} gives batches {tuple(batch.shape)}; expected frames (B,C,H,W): "
@@ -150,7 +147,7 @@ class GroundOdometry(nn.Module):
                 with torch.no_grad():
                     new = ground_patch(batch, self.corners, self.size)
                     if patches is None:
-                        self._tell_coarse(batch, traverse.name)
+                        self._warn_coarse(batch, traverse.name)
                     patches = new if patches is None else torch.cat([patches[-1:], new])
                     parts.append(self._shifts(patches[:-1], patches[1:]))
                 bar.update(len(batch))
@@ -158,20 +155,20 @@ class GroundOdometry(nn.Module):
         if not len(shifts):
             raise InputError(f"{traverse.name} has 1 frame; expected at least 2 to see motion")
         shift, confidence = self._steady(shifts, sure)
-        shift = mended(shift.double(), confidence >= self.least, traverse.name)
+        shift = interpolated(shift.double(), confidence >= self.least, traverse.name)
         shift = torch.where(shift.abs() < self.still, 0.0, shift)
         return Odometry(torch.cat([shift.new_zeros(1), shift.cumsum(0)]), confidence)
 
-    def _tell_coarse(self, batch: Tensor, name: str) -> None:
-        """Tell of a patch finer than what the frames show: what is interpolated hardly moves."""
-        seen, (rows, columns) = length_seen(self.corners, *batch.shape[2:]), self.size
-        if rows <= 2 * seen:
+    def _warn_coarse(self, batch: Tensor, name: str) -> None:
+        """Warn of a patch finer than what the frames show: what is interpolated hardly moves."""
+        shown, (rows, columns) = region_length(self.corners, *batch.shape[2:]), self.size
+        if rows <= 2 * shown:
             return
-        fits = f"size ({int(2 * seen)}, {columns})" if seen >= 16 else "larger frames, or a larger region,"
+        fits = f"size ({int(2 * shown)}, {columns})" if shown >= 16 else "larger frames, or a larger region,"
         log.warning(
             "%s: the patch has %d rows, its region only %.0f in frames of %d x %d pixels: slow motion is "
             "underestimated, %s would do",
-            *(name, rows, seen, *batch.shape[2:], fits),
+            *(name, rows, shown, *batch.shape[2:], fits),
         )
 
     def extra_repr(self) -> str:
@@ -179,3 +176,33 @@ class GroundOdometry(nn.Module):
             f"corners={self.corners}, size={self.size}, step={self.step}, least={self.least}, "
             f"still={self.still}, blend={self.blend}, flow={self.flow}"
         )
+
+
+def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
+    """Steps with the others interpolated between those that are valid; a warning names their frames.
+
+    Shape: (n,), (n,) bool -> (n,).
+
+    Raises:
+        InputError: none is valid.
+    """
+    bad, good = (~valid).nonzero()[:, 0], valid.nonzero()[:, 0]
+    if not len(bad):
+        return shift
+    if not len(good):
+        raise InputError(
+            f"{name}: none of {len(shift)} steps shows the same ground twice; "
+            "expected corners on the ground in front of the camera"
+        )
+    starts, stops = bad[bad.diff(prepend=bad[:1] - 2) > 1], bad[bad.diff(append=bad[-1:] + 2) > 1] + 1
+    stretches = [f"{start} to {stop}" for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
+    more = f" and {len(stretches) - NAMED} more" if len(stretches) > NAMED else ""
+    log.warning(
+        "%s: no common ground in frames %s%s (%d of %d steps): the velocity there is interpolated",
+        *(name, ", ".join(stretches[:NAMED]), more, len(bad), len(shift)),
+    )
+    after = torch.searchsorted(good, bad)
+    left, right = good[(after - 1).clamp(min=0)], good[after.clamp(max=len(good) - 1)]
+    share = (bad - left).double() / (right - left).clamp(min=1)
+    share = share.clamp(0, 1)  # ahead of the first and behind the last: that one's
+    return shift.index_copy(0, bad, shift[left].lerp(shift[right], share))

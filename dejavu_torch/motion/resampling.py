@@ -1,4 +1,4 @@
-"""Footage resampled to even steps along the ground (section IV-B)."""
+"""Footage resampled by distance, to even steps along the ground (section IV-B)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.positions import NEAR, first_reached, nearest_places
+from dejavu_torch.data.positions import NEAR, first_reached, look_up, nearest_places, shown_frames
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError, Traverse
 
@@ -19,24 +19,25 @@ DOUBTFUL = 0.2  # steps backwards for each one forward
 
 
 class ResampledTraverse(Traverse):
-    """The frames of another traverse at even steps along the ground.
+    """The frames of another traverse, resampled by distance: at even steps along the ground.
 
-    It is read through once to measure the distances, and again each time the frames are asked for.
+    The other traverse is read through once to measure the distances, and again each time the frames are asked
+    for.
 
     Args:
         traverse: frames, in order.
-        normalizer: measures the ground, and says the step and whether to blend.
+        odometry: measures the ground, and says the step and whether to blend.
         batch_size: frames in memory at a time while measuring.
-        step: pixels of ground, in place of the normalizer's; as for the query of a map.
+        step: pixels of ground, in place of the odometry's; as for the queries of a map.
         progress: show a progress bar on a terminal.
 
-    Shape: frames (M,C,H,W). frame: (M,) int64, the nearest frame of the inner traverse. way: (N,) float64,
-        how many steps each frame of the inner traverse is from the first. place_of: (N,) int64, the place
-        nearest to each, -1 behind the first. place: (M,) float64, the inner traverse's place of what is shown
-        (interpolated where frames are blended), None where it has none. step: pixels of ground.
+    Shape: frames (M,C,H,W). positions: (F,) float32, how many steps each frame of the other traverse lies
+        from the first. frame: (M,) int64, the frame of the other traverse nearest to each step. place: (M,)
+        float64, the other traverse's place of what is shown (interpolated where frames are blended), None
+        where it has none. step: pixels of ground.
 
     Convention: distances count from frame 0, in the direction in which the camera gets further from it. Each
-        distance is taken where it is first reached: standing, and going back and forth, add no frames.
+        step is taken where it is first reached: standing, and going back and forth, add no frames.
 
     Raises:
         InputError: as `GroundOdometry.distances`, and footage that does not move, or less than a step, or
@@ -48,39 +49,48 @@ class ResampledTraverse(Traverse):
     def __init__(
         self,
         traverse: Traverse,
-        normalizer: GroundOdometry,
+        odometry: GroundOdometry,
         batch_size: int = 64,
         step: float | None = None,
         progress: bool = False,
     ) -> None:
-        self.traverse, self.normalizer, self.name = traverse, normalizer, traverse.name
-        way = normalizer.distances(traverse, batch_size, progress).distance
-        if -way.min() > way.max():  # a camera that looks back
-            way = -way
-        moved = way.diff()
+        self.traverse, self.odometry, self.name = traverse, odometry, traverse.name
+        distance = odometry.distances(traverse, batch_size, progress).distance
+        if -distance.min() > distance.max():  # a camera that looks back
+            distance = -distance
+        moved, frames = distance.diff(), len(distance)
         if not moved.any():
-            wanted = "motion to space evenly" + ("" if step is None else ", or --as_is")
-            raise InputError(f"{self.name} stands still in all of its {len(way)} frames; expected {wanted}")
-        step = normalizer.step if step is None else step
+            raise InputError(f"{self.name} stands still in all of its {frames} frames; expected motion")
+        step = odometry.step if step is None else step
         self.step = float(moved.abs()[moved != 0].median()) if step is None else float(step)
-        _tell_doubtful(moved, self.name)
-        self.positions = (way / self.step).float().double()  # as a map keeps it
+        _warn_doubtful(moved, self.name)
+        self.positions = (distance / self.step).float()
         most = float(self.positions.max())
-        if not 1 <= most + NEAR < MOST * len(way):
+        if not 1 <= most + NEAR < MOST * frames:
             raise InputError(
-                f"{self.name} moves by {float(way.max()):.3g} pixels of ground in {len(way)} frames; "
+                f"{self.name} moves by {float(distance.max()):.3g} pixels of ground in {frames} frames; "
                 f"expected at least one step, {self.step:g}, and at most {MOST} a frame"
             )
-        low, high, share = first_reached(self.positions)
-        self.length = len(low)
-        self.frame = torch.where(share < 0.5, low, high)
-        self.place_of = nearest_places(self.positions)
-        self._low, self._high, self._share = low, high, share
-        if not normalizer.blend:
-            self._low, self._high, self._share = self.frame, self.frame, torch.zeros_like(share)
+        self.frame = shown_frames(self.positions)
+        self.length = len(self.frame)
+        if odometry.blend:
+            self._low, self._high, self._share = first_reached(self.positions)
+        else:
+            self._low, self._high, self._share = self.frame, self.frame, torch.zeros(self.length).double()
         if traverse.place is not None:
             place = traverse.place.double()
             self.place = place[self._low].lerp(place[self._high], self._share)
+
+    def place_of(self, frames: Tensor) -> Tensor:
+        """The step nearest to each frame of the other traverse; -1 behind the first, and for -1."""
+        return look_up(nearest_places(self.positions), frames)
+
+    def frame_name(self, i: int) -> str:
+        return self.traverse.frame_name(int(self.frame[i]))
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.traverse.frame_shape
 
     def batches(self, size: int) -> Iterator[Tensor]:
         yield from self._shown(self.traverse.batches(size), 0, 0, self.length, size)
@@ -94,13 +104,13 @@ class ResampledTraverse(Traverse):
     def _shown(
         self, batches: Iterator[Tensor], seen: int, done: int, stop: int, size: int
     ) -> Iterator[Tensor]:
-        """The places [done, stop) of batches that begin with frame `seen` of the inner traverse."""
+        """The steps [done, stop) of batches that begin with frame `seen` of the other traverse."""
         last: Tensor | None = None
         for batch in batches:
             frames = batch if last is None else torch.cat([last, batch])
             seen += len(batch)
             ready = min(stop, int(torch.searchsorted(self._high, seen)))
-            for part in torch.arange(done, ready).split(size):
+            for part in torch.arange(done, ready).split(size) if done < ready else ():
                 low, high = (index[part] - (seen - len(frames)) for index in (self._low, self._high))
                 share = self._share[part].to(frames)[:, None, None, None]
                 yield frames[low].lerp(frames[high], share)
@@ -109,8 +119,8 @@ class ResampledTraverse(Traverse):
                 return
 
 
-def _tell_doubtful(moved: Tensor, name: str) -> None:
-    """Tell of footage in which hardly any step goes forward, as where the corners show no ground."""
+def _warn_doubtful(moved: Tensor, name: str) -> None:
+    """Warn of footage in which hardly any step goes forward, as where the corners show no ground."""
     forward, back = int((moved > 0).sum()), int((moved < 0).sum())
     if back > DOUBTFUL * forward:
         log.warning(

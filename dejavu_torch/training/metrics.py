@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
-from dejavu_torch.data.truth import as_truth, counted, is_right
+from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
 from dejavu_torch.evaluation.curves import Scores, check_truth, evaluate
 from dejavu_torch.types import GroundTruth, InputError, Match
 
@@ -70,7 +70,7 @@ class PlaceRecognition(Metric):
         _check_match(match)
         check_truth(match, truth, self.tolerance)
         index, score = match.index.cpu(), match.score.detach().cpu()
-        truth = as_truth(
+        truth = as_ground_truth(
             truth.cpu() if isinstance(truth, Tensor) else GroundTruth(*(part.cpu() for part in truth))
         )
         good, answerable = is_right(index, truth.positives, self.tolerance), (truth.positives >= 0).any(1)

@@ -197,7 +197,6 @@ def test_images_are_resized_as_they_are_read(tmp_path: Path) -> None:
         frames = all_of(ImageFolder(tmp_path, *size))
         assert tuple(frames.shape) == (3, 3, *shape)
         assert frames.mean((1, 2, 3)).mul(255).tolist() == pytest.approx([20, 60, 100], abs=1e-3)
-    assert all_of(ImageFolder(tmp_path, step=2)).mean((1, 2, 3)).mul(255).tolist() == pytest.approx([20, 100])
     with refused("width=-1", "expected width and height of at least 0"):
         ImageFolder(tmp_path, width=-1)
 
@@ -217,18 +216,15 @@ def test_a_folder_of_folders_is_told(tmp_path: Path) -> None:
         ImageFolder(tmp_path)
 
 
-def test_a_part_of_a_folder_is_a_traverse(tmp_path: Path) -> None:
-    for i in range(10):
-        Image.new("L", (4, 4), i * 10).save(tmp_path / f"{i}.png")
-    whole, part = all_of(ImageFolder(tmp_path)), ImageFolder(tmp_path, start=3, stop=8, step=2)
-    assert (part.length, part.name) == (3, f"{tmp_path}?start=3&stop=8")
-    assert torch.equal(all_of(part), whole[3:8:2])
-    assert torch.equal(all_of(ImageFolder(tmp_path, start=7)), whole[7:])
+def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
+    write(tmp_path, *(f"{j}.png" for j in range(10)))
+    for broken in (0, 4, 9):
+        (tmp_path / f"{broken}.png").write_bytes(b"")
+    folder = ImageFolder(tmp_path)
+    assert torch.cat(list(folder.select(range(1, 9, 2), 3)))[:, 0, 0, 0].mul(255).tolist() == [1, 3, 5, 7]
+    assert torch.cat(list(folder.between(5, 8)))[:, 0, 0, 0].mul(255).tolist() == [5, 6, 7]
 
 
-@pytest.mark.parametrize(("start", "stop"), [(-1, 0), (0, 11), (5, 5), (6, 5), (10, 0), (0, -1)])
-def test_a_part_that_is_not_there_is_refused(tmp_path: Path, start: int, stop: int) -> None:
-    for i in range(10):
-        Image.new("L", (4, 4)).save(tmp_path / f"{i}.png")
-    with refused(f"start={start}", "10 images"):
-        ImageFolder(tmp_path, start=start, stop=stop)
+def test_frames_are_called_by_their_files(tmp_path: Path) -> None:
+    write(tmp_path, "b10.png", "b9.png")
+    assert [ImageFolder(tmp_path).frame_name(i) for i in range(2)] == ["b9.png", "b10.png"]

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dejavu_torch.data.ground_truth import position_truth
 from dejavu_torch.data.simulate.draw import Painter
 from dejavu_torch.data.simulate.motion import FPS, reference_place, ride
 from dejavu_torch.data.simulate.railway import Outdoor, Underground
@@ -23,7 +24,6 @@ from dejavu_torch.data.simulate.scenery import STATION, Structure
 from dejavu_torch.data.simulate.sheets import Thing, View
 from dejavu_torch.data.simulate.train import Railway
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.truth import position_truth
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError
 

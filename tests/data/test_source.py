@@ -8,11 +8,12 @@ import av
 import numpy as np
 import pytest
 import torch
-from helpers import refused
+from helpers import all_of, refused
 from PIL import Image
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
+from dejavu_torch.data.ground_truth import position_truth
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.video import Video
@@ -35,13 +36,14 @@ def test_an_array(tmp_path: Path, name: str) -> None:
     assert (source.length, source.name) == (3, str(tmp_path / name))
 
 
-def write_clip(path: Path) -> Path:
-    """Five grey frames of 32 x 48 pixels."""
+def write_clip(path: Path, frames: int = 5) -> Path:
+    """Frames of 32 x 48 pixels, each of its own grey."""
     with av.open(str(path), "w", format="matroska") as container:
         stream = container.add_stream("ffv1", rate=25)
         stream.height, stream.width, stream.pix_fmt = 32, 48, "bgr0"
-        for _ in range(5):
-            container.mux(stream.encode(av.VideoFrame(48, 32, "bgr0")))
+        for i in range(frames):
+            pixels = np.full((32, 48, 3), 20 * i, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "bgr24").reformat(format="bgr0")))
         container.mux(stream.encode())
     return path
 
@@ -51,9 +53,8 @@ def write_clip(path: Path) -> Path:
     ("options", "shape"),
     [
         ("", (5, 3, 32, 48)),
-        ("?width=16&height=8&step=2", (3, 3, 8, 16)),
+        ("?width=16&height=8", (5, 3, 8, 16)),
         ("?width=24", (5, 3, 16, 24)),
-        ("?step=5", (1, 3, 32, 48)),
     ],
 )
 @pytest.mark.parametrize("kind", [str, Path])
@@ -70,9 +71,8 @@ def test_a_video(tmp_path: Path, name: str, options: str, shape: tuple[int, ...]
     [
         ("?width=wide", ["width is 'wide'", "expected int"]),
         ("?width=", ["width is ''", "expected int"]),
-        ("?path=3", ["unknown 'path'", "expected width, height, step"]),
-        ("?rows=3", ["unknown 'rows'", "expected width, height, step"]),
-        ("?step=0", ["a.mkv", "step=0", "step of at least 1"]),
+        ("?path=3", ["unknown 'path'", "expected width, height, start"]),
+        ("?rows=3", ["unknown 'rows'", "expected width, height, start"]),
     ],
 )
 def test_options_that_no_video_has_are_refused(tmp_path: Path, options: str, words: list[str]) -> None:
@@ -151,12 +151,101 @@ def test_a_folder_takes_the_options_of_a_video(tmp_path: Path) -> None:
         Image.new("RGB", (60, 40), (i, i, i)).save(tmp_path / f"{i}.png")
     source = open_source(f"{tmp_path}?width=30&step=2")
     assert source.length == 2
-    assert tuple(torch.cat(list(source.batches(8))).shape) == (2, 3, 20, 30)
-    with refused("unknown 'wide'", "expected width, height, step"):
+    assert source.frame_shape == (3, 20, 30)
+    with refused("unknown 'wide'", "expected width, height, start"):
         open_source(f"{tmp_path}?wide=30")
 
 
-def test_an_array_takes_no_options(tmp_path: Path) -> None:
+def test_an_array_takes_no_size(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((4, 8, 8), np.uint8))
-    with refused("unknown 'width'", "expected no options"):
+    with refused("unknown 'width'", "expected start, stop, step"):
         open_source(f"{tmp_path / 'a.npy'}?width=4")
+
+
+# part of a source
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """One of every kind, of 12 frames."""
+    folder = tmp_path_factory.mktemp("sources")
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 16, 3), np.uint8)
+    (folder / "images").mkdir()
+    for i, frame in enumerate(pixels):
+        Image.fromarray(frame).save(folder / "images" / f"{i:02}.png")
+    np.save(folder / "frames.npy", pixels)
+    np.save(folder / "features.npy", pixels.reshape(12, -1).astype(np.float32))
+    Image.fromarray(pixels[:2].reshape(-1, 16, 3).swapaxes(0, 1)[:, :27]).save(folder / "long.png")
+    write_clip(folder / "clip.mkv", 12)
+    with av.open(str(folder / "clip.mkv")) as source, av.open(str(folder / "clip.mp4"), "w") as target:
+        stream = target.add_stream("libx264", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, "yuv420p"
+        for frame in source.decode(video=0):
+            target.mux(stream.encode(frame.reformat(format="yuv420p")))
+        target.mux(stream.encode())
+    found = {
+        name: str(folder / name) for name in ("images", "frames.npy", "features.npy", "clip.mkv", "clip.mp4")
+    }
+    strip = f"strip:{folder / 'long.png'}?width=16"
+    return found | {"strip": strip, "aerial": "sim:aerial?frames=12", "outdoor": "sim:outdoor?frames=12"}
+
+
+KINDS = ["images", "frames.npy", "features.npy", "clip.mkv", "clip.mp4", "strip", "aerial"]
+PARTS = [
+    ("start=5", slice(5, None)),
+    ("stop=4", slice(4)),
+    ("stop=0&step=5", slice(None, None, 5)),
+    ("start=11", slice(11, 12)),
+    ("start=1&stop=12&step=100", slice(1, 2)),
+]
+EVERY_SECOND = ("start=3&stop=9&step=2", slice(3, 9, 2))
+
+
+@pytest.mark.parametrize(
+    ("kind", "part", "chosen"),
+    [(kind, *part) for kind in KINDS for part in [EVERY_SECOND, *PARTS]] + [("outdoor", *EVERY_SECOND)],
+)
+def test_a_part_of_every_source_means_the_same(
+    sources: dict[str, str], kind: str, part: str, chosen: slice
+) -> None:
+    address = sources[kind]
+    whole = open_source(address)
+    some = open_source(f"{address}{'&' if '?' in address else '?'}{part}")
+    frames = all_of(whole)
+    assert len(frames) == 12
+    for size in (1, 2, 64):
+        batches = list(some.batches(size))
+        assert max(len(batch) for batch in batches) <= size
+        torch.testing.assert_close(torch.cat(batches), frames[chosen], atol=1e-6, rtol=0)
+    count = len(frames[chosen])
+    assert some.length == (None if whole.length is None else count)
+    assert some.frame_shape == whole.frame_shape
+    torch.testing.assert_close(
+        torch.cat([frames[:0], *some.between(1, 3)]), frames[chosen][1:3], atol=1e-6, rtol=0
+    )
+    assert [some.frame_name(i) for i in range(count)] == [whole.frame_name(i) for i in range(12)][chosen]
+    assert (some.place is None) == (whole.place is None)
+    if some.place is not None and whole.place is not None:
+        assert torch.equal(some.place, whole.place[chosen])
+    assert some.name != whole.name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "part", ["start=12", "start=5&stop=5", "start=-1", "stop=13", "stop=-1", "step=0", "step=-2"]
+)
+def test_a_part_that_is_not_there_is_refused(sources: dict[str, str], kind: str, part: str) -> None:
+    address = sources[kind]
+    with refused(*part.split("&")[:1], "step of at least 1") if kind != "clip.mkv" else refused():
+        all_of(open_source(f"{address}{'&' if '?' in address else '?'}{part}"))
+
+
+def test_a_part_of_a_reference_keeps_its_positions() -> None:
+    reference = open_source("sim:outdoor?frames=60&start=20&stop=50")
+    query = open_source("sim:outdoor?frames=60&traverse=1&start=30&step=3")
+    assert reference.place is not None
+    assert query.place is not None
+    found = position_truth(reference.place, query.place)[:, 0]
+    known = found >= 0
+    assert known.any()
+    assert ((reference.place[found] - query.place).abs()[known] <= 1).all()

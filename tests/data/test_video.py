@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from helpers import all_of, refused
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from dejavu_torch.data.names import clock_time
 from dejavu_torch.data.video import Video
 
 H264 = {"codec": "libx264", "pixels": "yuv420p"}
@@ -100,28 +102,57 @@ def test_frames_and_their_times_are_in_order(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in KINDS if name.endswith((".mp4", ".mov"))])
 def test_the_length_is_known_where_the_file_lists_its_frames(tmp_path: Path, name: str) -> None:
     path = clip(tmp_path / name, pictures(11), **KINDS[name])
-    assert [Video(path, step=step).length for step in (1, 2, 5, 100)] == [11, 6, 3, 1]
+    assert Video(path).length == 11
 
 
 @pytest.mark.parametrize("name", ["h264.mp4", "h264.mkv", "mjpeg.avi"])
 @pytest.mark.parametrize("batch", [1, 2, 5, 100])
 def test_the_batch_size_changes_nothing(tmp_path: Path, name: str, batch: int) -> None:
-    video = Video(clip(tmp_path / name, pictures(11), **KINDS[name]), width=20, step=2)
+    video = Video(clip(tmp_path / name, pictures(11), **KINDS[name]), width=20)
     assert {len(part) for part in list(video.batches(batch))[:-1]} <= {batch}
     assert torch.equal(all_of(video, batch), all_of(video))
-    assert numbers(all_of(Video(video.path, step=2), batch)) == [0, 2, 4, 6, 8, 10]
+    chosen = list(Video(video.path).select(range(1, 9, 2), batch))
+    assert max(len(part) for part in chosen) <= batch
+    assert numbers(torch.cat(chosen)) == [1, 3, 5, 7]
+    assert numbers(torch.cat(list(Video(video.path).between(9, 20)))) == [9, 10]
 
 
 @pytest.mark.parametrize("name", ["h264.mp4", "h264.mkv", "mjpeg.avi"])
-@pytest.mark.parametrize("step", [1, 3])
-def test_times_of_a_variable_frame_rate(tmp_path: Path, name: str, step: int) -> None:
+def test_times_of_a_variable_frame_rate(tmp_path: Path, name: str) -> None:
     ticks = [0, 1, 2, 6, 7, 8, 15, 16, 40, 41, 43]
     path = clip(tmp_path / name, pictures(11), ticks=ticks, **KINDS[name])
-    expected = torch.tensor(ticks[::step], dtype=torch.float64) / 25
-    torch.testing.assert_close(Video(path, step=step).times, expected, atol=0, rtol=0)
-    video = Video(path, step=step)
-    assert numbers(all_of(video)) == list(range(0, 11, step))
+    expected = torch.tensor(ticks, dtype=torch.float64) / 25
+    torch.testing.assert_close(Video(path).times, expected, atol=0, rtol=0)
+    video = Video(path)
+    assert numbers(all_of(video)) == list(range(11))
     assert torch.equal(video.times, expected)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_frames_are_called_by_their_times(tmp_path: Path, name: str) -> None:
+    path = clip(tmp_path / name, pictures(30), **KINDS[name])
+    times = Video(path).times
+    fresh, reading = Video(path), Video(path)
+    named = [fresh.frame_name(i) for i in range(30)]
+    assert named[0] == clock_time(math.floor(1000 * float(times[0]) + 0.5))
+    for seconds, text in zip(times.tolist(), named, strict=True):
+        hours, minutes, rest = text.split(":")
+        assert (hours, minutes, len(rest)) == ("0", "00", 6)
+        assert float(rest) == pytest.approx(seconds, abs=6e-4)
+    batches = reading.batches(4)
+    for start in range(0, 30, 4):  # the same while the video is being read
+        next(batches)
+        assert [reading.frame_name(i) for i in range(start, min(start + 4, 30))] == named[start : start + 4]
+
+
+def test_a_name_costs_no_second_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    video = Video(clip(tmp_path / "a.mkv", pictures(30)))
+    batches = video.batches(4)
+    next(batches)
+    monkeypatch.setattr(video, "_open", lambda: pytest.fail("it is read again"))
+    assert video.frame_name(3) == "0:00:00.120"
+    assert sum(len(part) for part in batches) == 26
+    assert video.frame_name(29) == "0:00:01.160"
 
 
 @pytest.mark.parametrize("kind", ["h264.mp4", "h264.mkv", "ffv1.mkv", "mpeg4.mp4", "h264.ts"])
@@ -131,11 +162,11 @@ def test_a_frame_rate_that_varies_is_told_once(
 ) -> None:
     path = clip(tmp_path / kind, pictures(12), ticks=[0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 13, 14], **KINDS[kind])
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
-        video = Video(path, step=2)
+        video = Video(path)
         for _ in (1, 2):
             if first == "frames":
                 all_of(video)
-            assert len(video.times) == 6
+            assert len(video.times) == 12
     (message,) = caplog.messages
     assert message.startswith(f"{path}: the frame rate varies, 40 to 120 ms from frame to frame (median 40)")
     assert "\n" not in message
@@ -253,10 +284,10 @@ def test_the_file_is_closed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("given", "seen"),
-    [({"width": -1}, "width=-1"), ({"height": -2}, "height=-2"), ({"step": 0}, "step=0")],
+    [({"width": -1}, "width=-1"), ({"height": -2}, "height=-2")],
 )
 def test_wrong_options_are_refused(tmp_path: Path, given: dict, seen: str) -> None:
-    with refused("a.mkv", seen, "expected width and height of at least 0", "step of at least 1"):
+    with refused("a.mkv", seen, "expected width and height of at least 0"):
         Video(clip(tmp_path / "a.mkv", pictures(2)), **given)
 
 

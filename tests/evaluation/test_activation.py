@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.data.truth import as_truth
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.activation import Rate, activation_rates, in_phase
 from dejavu_torch.types import FrequencyLayer, GroundTruth
 
@@ -18,7 +18,7 @@ def layer(period: Fraction | int, phases: int, start: int = 0, stop: int = 40) -
 
 def test_rates_in_closed_form() -> None:
     # chunk [0, 40), period 10: of the places 3, 13, 27 inside and 41, 52 outside
-    truth = as_truth(torch.tensor([[3], [13], [27], [41], [52]]))
+    truth = as_ground_truth(torch.tensor([[3], [13], [27], [41], [52]]))
     best = torch.tensor([3, 4, 0, 0, 7])  # 0, 1 and 3 phases off inside; 1 and 5 off outside
     index = torch.tensor([3, 20, 26, 42, -1])  # right, wrong, right; right, nothing reported
     rates = activation_rates([layer(10, 10)], [best], index, truth, tolerance=1, places=60)
@@ -33,13 +33,13 @@ def test_rates_in_closed_form() -> None:
 
 
 def test_the_chunk_ends_before_its_stop() -> None:
-    truth = as_truth(torch.tensor([[39], [40]]))
+    truth = as_ground_truth(torch.tensor([[39], [40]]))
     rates = activation_rates([layer(10, 10)], [torch.tensor([9, 5])], torch.tensor([39, 0]), truth, 0, 80)
     assert rates.layers[0][:2] == (1.0, 0.0)
 
 
 def test_a_layer_that_covers_the_route_has_no_outside() -> None:
-    truth = as_truth(torch.tensor([[3], [13]]))
+    truth = as_ground_truth(torch.tensor([[3], [13]]))
     rates = activation_rates([layer(10, 10)], [torch.tensor([3, 3])], torch.tensor([3, 3]), truth, 0, 40)
     assert rates.layers[0] == Rate(1.0, None, 0.1)
     assert rates.fused.outside is None
@@ -61,13 +61,13 @@ def test_a_query_that_reports_a_soft_place_does_not_count_in_the_fusion() -> Non
 
 
 def test_a_right_place_outside_does_not_help_a_query_inside() -> None:
-    truth = as_truth(torch.tensor([[3, 48]]))
+    truth = as_ground_truth(torch.tensor([[3, 48]]))
     rates = activation_rates([layer(10, 10)], [torch.tensor([8])], torch.tensor([48]), truth, 0, 60)
     assert rates.layers[0].inside == 0.0
 
 
 def test_chance_is_at_most_one() -> None:
-    truth = as_truth(torch.tensor([[3]]))
+    truth = as_ground_truth(torch.tensor([[3]]))
     rates = activation_rates([layer(4, 4)], [torch.tensor([1])], torch.tensor([3]), truth, 50, 60)
     assert rates.layers[0].chance == rates.fused.chance == 1.0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import pytest
@@ -37,7 +38,7 @@ def written(folder: Path, text: str | bytes) -> Path:
 
 def told(path: Path) -> list[tuple[int, int, float, bool]]:
     """The rows that were read, by query."""
-    queries, match, *_ = read_matches(path)
+    queries, match = read_matches(path)
     assert [queries.dtype, match.index.dtype, match.score.dtype] == [torch.int64, torch.int64, torch.float64]
     assert match.accepted.dtype == torch.bool
     columns = (queries, *match)
@@ -55,7 +56,7 @@ def test_what_is_written_in_parts_is_read(
     parts = zip(*(column.split(size) for column in match), strict=True)
     path = scratch / "m.csv"
     assert write_matches(path, (Match(*part) for part in parts)) == (len(rows), int(match.accepted.sum()))
-    queries, read, *_ = read_matches(path)
+    queries, read = read_matches(path)
     assert queries.tolist() == list(range(len(rows)))
     assert torch.equal(read.index, match.index)
     assert torch.equal(read.accepted, match.accepted)
@@ -128,3 +129,61 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
         read_matches(tmp_path / "none.csv")
     with refused("directory"):
         read_matches(tmp_path)
+
+
+# frames of the sources, and their names
+
+MATCH = Match(torch.tensor([2, -1, 0]), torch.tensor([0.5, INF, 0.25]), torch.tensor([True, False, True]))
+HEADER = "query,place,score,accepted,query_name,place_name"
+
+
+def lines(path: Path) -> list[str]:
+    text = path.read_bytes().decode()
+    assert text.count("\n") == text.count("\r\n")
+    return text.splitlines()
+
+
+def test_without_frames_and_names_places_are_frames(tmp_path: Path) -> None:
+    path = tmp_path / "m.csv"
+    assert write_matches(path, [MATCH]) == (3, 2)
+    assert lines(path) == [HEADER, "0,2,0.5,1,,", "1,-1,inf,0,,", "2,0,0.25,1,,"]
+
+
+def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> None:
+    path, frames = tmp_path / "m.csv", torch.tensor([10, 14, 19])
+
+    def frame_of(places: torch.Tensor) -> torch.Tensor:
+        return torch.where(places >= 0, frames[places.clamp(min=0)], -1)
+
+    parts = [Match(*(column[:2] for column in MATCH)), Match(*(column[2:] for column in MATCH))]
+    write_matches(path, parts, torch.tensor([4, 4, 7]), frame_of, "q{}.png".format, "0:00:{:02}.000".format)
+    assert lines(path)[1:] == [
+        "4,19,0.5,1,q4.png,0:00:19.000",
+        "4,-1,inf,0,q4.png,",
+        "7,10,0.25,1,q7.png,0:00:10.000",
+    ]
+    queries, match = read_matches(path)
+    assert (queries.tolist(), match.index.tolist()) == ([4, 4, 7], [19, -1, 10])
+
+
+@given(st.lists(st.text(st.characters(blacklist_characters="\0"), max_size=9), min_size=3, max_size=3))
+def test_any_name_leaves_the_file_readable(scratch: Path, names: list[str]) -> None:
+    path = scratch / "names.csv"
+    write_matches(path, [MATCH], query_name=names.__getitem__, place_name=names.__getitem__)
+    queries, match = read_matches(path)
+    assert queries.tolist() == [0, 1, 2]
+    for one, other in zip(match, MATCH, strict=True):
+        assert torch.equal(one, other.to(one.dtype))
+    rows = list(csv.DictReader(path.open(newline="")))
+    for row, name in zip(rows, names, strict=True):
+        assert row["query_name"].isprintable()
+        if name.isprintable():
+            assert row["query_name"] == name
+
+
+def test_names_with_commas_quotes_and_line_breaks(tmp_path: Path) -> None:
+    path = tmp_path / "m.csv"
+    write_matches(path, [MATCH], query_name=['a, "b".png', "ä\n.png", "c\u2028d\udcff.png"].__getitem__)
+    rows = list(csv.DictReader(path.open(newline="", encoding="utf-8")))
+    assert [row["query_name"] for row in rows] == ['a, "b".png', "ä\\n.png", "c\\u2028d\\udcff.png"]
+    assert len(lines(path)) == 4

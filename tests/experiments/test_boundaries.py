@@ -7,7 +7,7 @@ import torch
 from helpers import refused
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truth import as_truth
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.boundaries import GivenChunks, boundary_effect, known_boundaries
 from dejavu_torch.experiments.compare import compare
@@ -25,7 +25,7 @@ def test_chunks_end_at_the_cuts() -> None:
 
 
 def test_recall_near_and_far_by_hand() -> None:
-    truth = as_truth(torch.tensor([[0], [90], [100], [110], [111], [-1]]))
+    truth = as_ground_truth(torch.tensor([[0], [90], [100], [110], [111], [-1]]))
     index = torch.tensor([0, 90, 5, 110, 6, 7])  # right, right, wrong, right, wrong, no answer
     match = Match(index, torch.ones(6), torch.ones(6, dtype=torch.bool))
     effect = boundary_effect(match, truth, cuts=[100], tolerance=0, near=10)
@@ -61,7 +61,7 @@ def test_a_map_with_known_boundaries_is_learnt_and_judged_as_any_other(tmp_path:
     period = torch.where(truth < 90, 10, 14)
     assert ((match.index - truth) % period == 0).double().mean() > 0.9  # known up to the period that is there
     assert known.judged.scores == evaluate(match, truth[:, None], 0)
-    assert known.known_effect == boundary_effect(match, as_truth(truth[:, None]), [90], 0)
+    assert known.known_effect == boundary_effect(match, as_ground_truth(truth[:, None]), [90], 0)
     fixed = evaluate(result.match, truth[:, None], 0)  # the default's scores are comparable already
     assert known.fixed.scores == fixed
     assert known.judged.scores.recall_at_1 > fixed.recall_at_1

@@ -1,23 +1,26 @@
-"""Matches in a file, judged: the same figures as in memory, for every kind of truth."""
+"""Matches in a file, evaluated: the same figures as in memory, for every kind of ground truth."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from helpers import Fixed, refused
+from footage import QUERY, REFERENCE, camera, everything, footage
+from helpers import Fixed, refused, template_model
 from PIL import Image
 
-from dejavu_torch import DejaVu, FrequencyLayer, ImageFolder, Match
+from dejavu_torch import FrequencyLayer, ImageFolder
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.evaluation.report import score_table, text_table, write_report
 from dejavu_torch.experiments.evaluate import Evaluation, evaluate_file
-from dejavu_torch.types import GroundTruth
+from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.types import GroundTruth, Match
 
 HEADER = "query,place,score,accepted\n"
 # right, right but far, wrong, silent, accepted though wrong
@@ -37,7 +40,7 @@ def scores_of(result: Evaluation) -> dict[str, float]:
 def found(path: Path) -> Match:
     """What a small map makes of noisy queries, some of which nothing covers."""
     features = torch.rand(96, 8)
-    model = DejaVu(periods=Fixed(FrequencyLayer(24, 24, 0, 60, (0, 1, 2, 3))))
+    model = template_model(periods=Fixed(FrequencyLayer(24, 24, 0, 60, (0, 1, 2, 3))))
     match = model.learn(ArrayTraverse(features)).localize(ArrayTraverse(features + 0.1 * torch.rand(96, 8)))
     silent = torch.arange(96) % 7 == 0
     match = Match(
@@ -129,7 +132,7 @@ def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
     with refused("utm", "both traverses"):
         evaluate_file(path, "utm:5")
     stored, seen = ArrayTraverse(torch.rand(60, 2)), ArrayTraverse(torch.rand(5, 2))
-    with refused("no truth"):
+    with refused("no ground truth"):
         evaluate_file(path, None, reference=stored, query=seen)
     stored.place, seen.place = torch.arange(60.0), torch.tensor([0.0, 4.2, 2.0, 3.0, 30.0])
     assert evaluate_file(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
@@ -141,12 +144,12 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         evaluate_file(path, "0", tolerance=-1)
     with refused("'maybe'"):
         evaluate_file(tmp_path / "none.csv", "maybe")  # the text first: it costs nothing
-    with refused("no truth"):
+    with refused("no ground truth"):
         evaluate_file(path, None)
     with refused("place 50", "below 20"):
         evaluate_file(path, "0", reference=ArrayTraverse(torch.rand(20, 2)))
     np.savez(tmp_path / "gt.npz", GThard=np.eye(60, 4, dtype=bool))
-    with refused("GThard is (60, 4)", "(places, 5)"):
+    with refused("GThard is (60, 4)", "(reference frames, 5)"):
         evaluate_file(path, str(tmp_path / "gt.npz"))
     only = written(tmp_path, HEADER + "0,7,0.5,1\n", "one.csv")
     soft = np.ones((9, 1), dtype=bool)
@@ -189,6 +192,92 @@ def test_a_silent_method_has_a_report_too(tmp_path: Path) -> None:
     assert set(scores_of(result).values()) == {0.0}
     assert result.report.facts["accepted_precision"] is None
     write_report(tmp_path, result.report, result.pictures, "silent", "")
+
+
+# a map of resampled places
+
+
+class Resampled(NamedTuple):
+    """A map, its matches in a file, and the queries and matches themselves."""
+
+    map: Path
+    matches: Path
+    query: ResampledTraverse
+    match: Match
+
+
+@pytest.fixture(scope="module")
+def resampled(tmp_path_factory: pytest.TempPathFactory) -> Resampled:
+    folder = tmp_path_factory.mktemp("resampled")
+    model = template_model(periods=everything(101), velocity=camera()).learn(footage(REFERENCE))
+    model.save(folder / "m.safetensors")
+    query = model.resample(ArrayTraverse(footage(QUERY, noise=0.02)), model.step)
+    assert isinstance(query, ResampledTraverse)
+    match = model.localize(query)
+    write_matches(folder / "matches.csv", [match], query.frame, model.map.frame_of)
+    nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
+    (folder / "truth.csv").write_text("".join(f"{q},{p}\n" for q, p in enumerate(nearest)))
+    return Resampled(folder / "m.safetensors", folder / "matches.csv", query, match)
+
+
+def test_convention_11_the_map_turns_frames_into_places(resampled: Resampled) -> None:
+    truth = str(resampled.map.parent / "truth.csv")
+    by_places = evaluate_file(resampled.matches, truth, tolerance=1, map=resampled.map)
+    facts = by_places.report.facts
+    assert (facts["unit"], facts["places"], facts["judged"]) == ("places at even steps", 101, 101)
+    assert (by_places.match.index - resampled.match.index).abs().max() <= 1  # places that show one frame
+    assert torch.equal(by_places.queries, resampled.query.frame)
+    found = by_places.truth.positives[:, 0] - torch.arange(101)
+    assert found.abs().max() <= 1
+    assert scores_of(by_places)["recall_at_1"] > 0.9
+    by_frames = evaluate_file(resampled.matches, truth, tolerance=1)
+    facts = by_frames.report.facts
+    assert (facts["unit"], facts["places"]) == ("frames", None)
+    assert by_frames.match.index.max() > 110
+
+
+def test_convention_11_all_frames_of_one_place_are_right(resampled: Resampled, tmp_path: Path) -> None:
+    """It stands from frame 60 to 85: in places any of these is right, in frames only those near by."""
+    path = written(tmp_path, HEADER + "0,85,0.1,1\n")
+    truth = str(written(tmp_path, "0,60\n", "truth.csv"))
+    assert scores_of(evaluate_file(path, truth, 0, map=resampled.map))["recall_at_1"] == 1
+    assert scores_of(evaluate_file(path, truth, 24))["recall_at_1"] == 0
+
+
+def test_every_frame_as_a_query_of_a_resampled_map(resampled: Resampled, tmp_path: Path) -> None:
+    rows = "".join(
+        f"{q},{p},0.5,1\n" for q, p in enumerate((REFERENCE - QUERY[:, None]).abs().argmin(1).tolist())
+    )
+    result = evaluate_file(
+        written(tmp_path, HEADER + rows), str(resampled.map.parent / "truth.csv"), 0, map=resampled.map
+    )
+    assert result.report.facts["judged"] == len(QUERY)
+    assert scores_of(result)["recall_at_1"] == 1
+
+
+def test_a_frame_may_be_several_queries(resampled: Resampled, tmp_path: Path) -> None:
+    path = written(tmp_path, HEADER + "0,0,0.1,1\n0,90,0.2,1\n1,1,0.3,1\n")
+    for map_ in (resampled.map, None):
+        facts = evaluate_file(path, "0", map=map_).report.facts
+        assert (facts["queries"], facts["accepted_right"]) == (3, 2)
+
+
+def test_frames_that_the_reference_does_not_have_are_refused(resampled: Resampled, tmp_path: Path) -> None:
+    path = written(tmp_path, HEADER + f"0,{len(REFERENCE)},0.1,1\n")
+    with refused(f"place {len(REFERENCE)}", f"below {len(REFERENCE)}"):
+        evaluate_file(path, "0", map=resampled.map)
+    truth = written(tmp_path, "query,place\n0,99999\n", "truth.csv")
+    with refused("place 99999", f"0 to {len(REFERENCE) - 1}"):
+        evaluate_file(resampled.matches, str(truth), map=resampled.map)
+
+
+def test_a_map_of_frames_says_how_many_there_are(tmp_path: Path) -> None:
+    model = template_model(periods=Fixed(FrequencyLayer(24, 24, 0, 60, (0, 1)))).learn(torch.rand(60, 4))
+    model.save(tmp_path / "m.safetensors")
+    facts = evaluate_file(written(tmp_path, MATCHES), "0", map=tmp_path / "m.safetensors").report.facts
+    assert (facts["unit"], facts["places"]) == ("frames", 60)
+    with refused("place 70", "below 60"):
+        evaluate_file(written(tmp_path, HEADER + "0,70,1,1\n"), "0", map=tmp_path / "m.safetensors")
 
 
 def test_corridor(tmp_path: Path, data_dir: Path) -> None:

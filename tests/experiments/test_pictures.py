@@ -10,7 +10,7 @@ from helpers import Fixed
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, SlidingWindow, SpectrogramAnalysis
-from dejavu_torch.data.truth import as_truth, offset_truth
+from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.experiments.pictures import (
     best_explained,
@@ -60,7 +60,7 @@ def short(**options: object) -> DejaVu:
 
 
 def same_places(length: int = 120) -> GroundTruth:
-    return as_truth(offset_truth(length, length))
+    return as_ground_truth(offset_truth(length, length))
 
 
 def test_every_picture_of_frames_that_repeat() -> None:
@@ -88,7 +88,9 @@ def test_the_rates_are_those_of_the_layers_they_stand_beside() -> None:
     """Two layers that each answer for their own period only: swapped, neither would be in phase."""
     values = (torch.arange(90)[:, None] % torch.tensor([9.0, 9.0, 10.0])) + torch.tensor([0.0, 1.0, 2.0])
     model = DejaVu(periods=Fixed(layer(9, 0, 90, 0, 1), layer(10, 0, 90, 2)))
-    rates = drawn(model, values, values, as_truth(offset_truth(90, 90)))["activations"].numbers["layers"]
+    rates = drawn(model, values, values, as_ground_truth(offset_truth(90, 90)))["activations"].numbers[
+        "layers"
+    ]
     assert [rate["inside"] for rate in rates] == [1.0, 1.0]
     assert [rate["chance"] for rate in rates] == [pytest.approx(5 / 9), 0.5]
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from dejavu_torch.motion.flow import flow_shift
-from dejavu_torch.motion.ground_plane import shift_between
 from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.motion.phase_correlation import shift_between
 
 pytest.importorskip("cv2")
 

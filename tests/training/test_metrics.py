@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from torchmetrics import MetricCollection
 
-from dejavu_torch.data.truth import as_truth
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.curves import Scores, evaluate
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.types import GroundTruth, Match
@@ -245,5 +245,5 @@ def test_errors() -> None:
     with refused("the truth is (3,)"):
         metric.update(match, truth[:, 0])
     with refused("(2,) and (3, 0)", "expected (3,)"):
-        metric.update(match, as_truth(truth)._replace(judged=torch.ones(2, dtype=torch.bool)))
+        metric.update(match, as_ground_truth(truth)._replace(judged=torch.ones(2, dtype=torch.bool)))
     assert not metric.score  # nothing of a refused batch is kept

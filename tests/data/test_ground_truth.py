@@ -1,4 +1,4 @@
-"""TRUTH as text: offset, csv, npz, and coordinates in image names."""
+"""The ground truth: offset, positions, csv, npz, coordinates in image names; and what counts as right."""
 
 from __future__ import annotations
 
@@ -17,15 +17,146 @@ from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.truth import is_right
-from dejavu_torch.data.truthfile import check_truth_text, find_truth, read_truth
+from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.ground_truth import (
+    as_ground_truth,
+    check_ground_truth,
+    counted,
+    describe_ground_truth,
+    find_ground_truth,
+    ground_truth_in_places,
+    is_right,
+    near_truth,
+    offset_truth,
+    padded,
+    position_truth,
+)
+from dejavu_torch.data.positions import look_up
 from dejavu_torch.types import GroundTruth, InputError, Traverse
+
+POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
+
+
+def column(truth: Tensor) -> list[int]:
+    assert (truth.ndim, truth.shape[1], truth.dtype) == (2, 1, torch.int64)
+    return truth[:, 0].tolist()
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(-12, 12))
+def test_offset(queries: int, places: int, offset: int) -> None:
+    expected = [i + offset if 0 <= i + offset < places else -1 for i in range(queries)]
+    assert column(offset_truth(queries, places, offset)) == expected
+
+
+@given(st.lists(st.integers(0, 30), min_size=1, max_size=9), st.integers(-40, 40))
+def test_offset_of_numbered_queries_on_a_map_of_unknown_length(numbers: list[int], offset: int) -> None:
+    expected = [i + offset if i + offset >= 0 else -1 for i in numbers]
+    assert column(offset_truth(torch.tensor(numbers), None, offset)) == expected
+
+
+@given(POSITIONS, POSITIONS)
+def test_position_is_the_nearest_reference_frame(reference: list[int], query: list[int]) -> None:
+    found = column(position_truth(torch.tensor(reference).double(), torch.tensor(query).double()))
+    ordered = sorted(reference)
+    widest = max((b - a for a, b in pairwise(ordered)), default=0)
+    for place, position in zip(found, query, strict=True):
+        nearest = min(abs(position - r) for r in reference)
+        if nearest > widest:
+            assert place == -1
+        else:
+            assert abs(reference[place] - position) == nearest
+
+
+def test_position_beyond_the_route_has_no_right_place() -> None:
+    reference, query = torch.arange(5.0), torch.tensor([-3.0, -0.4, 2.4, 4.9, 9.0])
+    assert column(position_truth(reference, query)) == [-1, 0, 2, 4, -1]
+
+
+def test_convention_5_tolerance_is_inclusive() -> None:
+    index = torch.tensor([4, 5, 10, 15, 16])
+    assert is_right(index, torch.full((5, 1), 10), 5).tolist() == [False, True, True, True, False]
+    assert is_right(index, torch.full((5, 1), 10), 0).tolist() == [False, False, True, False, False]
+
+
+ANSWERS = st.lists(
+    st.tuples(st.integers(-1, 9), st.lists(st.integers(-1, 9), min_size=3, max_size=3)), min_size=1
+)
+
+
+@given(ANSWERS, st.integers(0, 4))
+def test_any_right_place_will_do_and_minus_one_is_none(
+    rows: list[tuple[int, list[int]]], tolerance: int
+) -> None:
+    expected = [i >= 0 and any(t >= 0 and abs(i - t) <= tolerance for t in truth) for i, truth in rows]
+    index, truth = torch.tensor([i for i, _ in rows]), torch.tensor([t for _, t in rows])
+    assert is_right(index, truth, tolerance).tolist() == expected
+
+
+@given(st.lists(st.lists(st.integers(0, 9), max_size=4), min_size=1, max_size=8))
+def test_padded_holds_each_row_in_order(rows: list[list[int]]) -> None:
+    row = torch.tensor([i for i, places in enumerate(rows) for _ in places], dtype=torch.int64)
+    place = torch.tensor([p for places in rows for p in places], dtype=torch.int64)
+    table = padded(row, place, len(rows))
+    assert table.dtype == torch.int64
+    assert table.shape == (len(rows), max(map(len, rows)))
+    assert [[p for p in line if p >= 0] for line in table.tolist()] == rows
+    # the padding stands behind the places
+    assert [line[: len(places)] for line, places in zip(table.tolist(), rows, strict=True)] == rows
+
+
+POINTS = st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=12)
+
+
+@given(POINTS, POINTS, st.integers(0, 6))
+def test_near_is_every_frame_within_the_radius_inclusive(
+    reference: list[tuple[int, int]], query: list[tuple[int, int]], radius: int
+) -> None:
+    # UTM coordinates are large: float32 would not hold their metres
+    far = torch.tensor([500_000, 5_000_000], dtype=torch.float64)
+    found = near_truth(torch.tensor(reference) + far, torch.tensor(query) + far, radius)
+    expected = [
+        [i for i, (a, b) in enumerate(reference) if (a - x) ** 2 + (b - y) ** 2 <= radius**2]
+        for x, y in query
+    ]
+    assert [[place for place in row if place >= 0] for row in found.tolist()] == expected
+
+
+def test_near_needs_no_table_of_all_pairs(largest_tensor: type) -> None:
+    line = torch.stack([torch.arange(2500.0), torch.zeros(2500)], 1)
+    with largest_tensor() as seen:
+        found = near_truth(line, line, 0.0)
+    assert found.flatten().tolist() == list(range(2500))
+    assert seen.numel < 2500 * 2500 / 3
+
+
+def test_a_tensor_of_places_is_a_truth_in_which_all_is_known() -> None:
+    right = torch.tensor([[0, 1], [-1, -1]])
+    truth = as_ground_truth(right)
+    assert torch.equal(truth.positives, right)
+    assert truth.judged.tolist() == [True, True]
+    assert truth.ignored.shape == (2, 0)
+    assert as_ground_truth(truth) is truth
+
+
+def test_a_soft_place_counts_neither_way_and_an_unknown_query_never() -> None:
+    """Right, wrong, soft, silent, soft but right by the tolerance, not known, not known though right."""
+    index = torch.tensor([10, 30, 20, -1, 11, 30, 10])
+    known = torch.tensor([True] * 5 + [False] * 2)
+    truth = GroundTruth(torch.full((7, 1), 10), known, torch.tensor([[20, 11]] * 7))
+    assert counted(index, truth, 1).tolist() == [True, True, False, True, True, False, False]
+    assert counted(index, truth, 0).tolist() == [True, True, False, True, False, False, False]
 
 
 def route(length: int, place: list[float] | None = None) -> Traverse:
     traverse = ArrayTraverse(torch.rand(length, 2))
     traverse.place = None if place is None else torch.tensor(place, dtype=torch.float64)
     return traverse
+
+
+def read(truth: str, frames: int | None, queries: int | Tensor, **options: bool) -> GroundTruth:
+    found = find_ground_truth(truth, None, None, frames, queries, **options)
+    assert found is not None
+    return found
 
 
 def sets(table: Tensor) -> list[set[int]]:
@@ -57,7 +188,7 @@ def written(folder: Path, text: str | bytes) -> str:
 def test_what_a_command_was_given_or_can_know(
     truth: str | None, reference: Traverse, query: Traverse, expected: list[int]
 ) -> None:
-    found = find_truth(truth, reference, query, reference.length, query.length or 0)
+    found = find_ground_truth(truth, reference, query, reference.length, query.length or 0)
     assert found is not None
     assert found.positives[:, 0].tolist() == expected
     assert found.judged.all()
@@ -65,29 +196,29 @@ def test_what_a_command_was_given_or_can_know(
 
 
 def test_without_a_truth_other_lengths_or_missing_traverses_give_none() -> None:
-    assert find_truth(None, route(3), route(4), 3, 4) is None
-    assert find_truth(None, None, route(3), 3, 3) is None
-    assert find_truth(None, route(3), None, None, torch.tensor([0])) is None
+    assert find_ground_truth(None, route(3), route(4), 3, 4) is None
+    assert find_ground_truth(None, None, route(3), 3, 3) is None
+    assert find_ground_truth(None, route(3), None, None, torch.tensor([0])) is None
 
 
 def test_numbered_queries_get_their_own_rows() -> None:
     numbers = torch.tensor([3, 0])
-    by_offset = find_truth("2", None, None, None, numbers)
-    by_position = find_truth(None, route(3, [0, 1, 2]), route(4, [2, 9, 9, 1]), 3, numbers)
-    by_length = find_truth(None, route(4), route(4), 4, numbers)
+    by_offset = find_ground_truth("2", None, None, None, numbers)
+    by_position = find_ground_truth(None, route(3, [0, 1, 2]), route(4, [2, 9, 9, 1]), 3, numbers)
+    by_length = find_ground_truth(None, route(4), route(4), 4, numbers)
     for found, expected in ((by_offset, [5, 2]), (by_position, [1, 2]), (by_length, [3, 0])):
         assert found is not None
         assert found.positives[:, 0].tolist() == expected
     with refused("query 3", "below 3"):
-        find_truth(None, route(3, [0, 1, 2]), route(3, [0, 1, 2]), 3, numbers)
+        find_ground_truth(None, route(3, [0, 1, 2]), route(3, [0, 1, 2]), 3, numbers)
 
 
 def test_an_offset_without_any_right_answer_is_refused() -> None:
     with refused("truth 9", "from -3 to 4"):
-        read_truth("9", 5, 4)
+        read("9", 5, 4)
     with refused("truth -9", "from -8"):
-        read_truth("-9", None, torch.tensor([2, 8]))
-    assert read_truth("-8", None, torch.tensor([2, 8])).positives.tolist() == [[-1], [0]]
+        read("-9", None, torch.tensor([2, 8]))
+    assert read("-8", None, torch.tensor([2, 8])).positives.tolist() == [[-1], [0]]
 
 
 # any text
@@ -98,27 +229,27 @@ def test_an_offset_without_any_right_answer_is_refused() -> None:
 )
 def test_text_that_is_no_truth_is_refused(truth: str) -> None:
     with refused(f"truth {truth!r}", "expected an integer offset", ".csv", ".npz", "utm:25"):
-        check_truth_text(truth)
+        check_ground_truth(truth)
     with refused(repr(truth)):
-        find_truth(truth, route(3), route(3), 3, 3)
+        find_ground_truth(truth, route(3), route(3), 3, 3)
     with refused(repr(truth)):
-        read_truth(truth, 3, 3)
+        read(truth, 3, 3)
 
 
 @pytest.mark.parametrize("name", ["none.csv", "none.npz", "none.CSV"])
 def test_a_file_that_is_not_there_is_refused_early(tmp_path: Path, name: str) -> None:
     with refused(name, "No such file", "expected"):
-        check_truth_text(str(tmp_path / name))
+        check_ground_truth(str(tmp_path / name))
     (tmp_path / name).mkdir()
     with refused(name, "directory"):
-        check_truth_text(str(tmp_path / name))
+        check_ground_truth(str(tmp_path / name))
 
 
 @pytest.mark.parametrize("truth", ["3", "utm", "utm:7.5"])
 def test_only_a_csv_can_be_interpolated(truth: str) -> None:
-    check_truth_text(truth)
+    check_ground_truth(truth)
     with refused(truth, "interpolated", ".csv"):
-        check_truth_text(truth, interpolate=True)
+        check_ground_truth(truth, interpolate=True)
 
 
 # csv
@@ -133,7 +264,7 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_csv_by_hand(tmp_path: Path) -> None:
-    truth = read_truth(written(tmp_path, TABLE), 8, 7)
+    truth = read(written(tmp_path, TABLE), 8, 7)
     assert sets(truth.positives) == [{4}, set(), {1, 7}, set(), set(), set(), set()]
     assert truth.judged.tolist() == [True, False, True, True, False, True, False]
     assert truth.ignored.shape == (7, 0)
@@ -148,9 +279,9 @@ def test_csv_holds_what_was_written(
     wanted = [set(listed.get(query, [])) for query in numbers]
     if not any(query in listed for query in numbers) or not any(wanted):
         with refused("expected some" if not any(query in listed for query in numbers) else "no query"):
-            read_truth(path, 10, torch.tensor(numbers))
+            read(path, 10, torch.tensor(numbers))
         return
-    truth = read_truth(path, 10, torch.tensor(numbers))
+    truth = read(path, 10, torch.tensor(numbers))
     assert sets(truth.positives) == wanted
     assert truth.judged.tolist() == [query in listed for query in numbers]
     assert truth.positives.shape[1] == max(len(listed.get(query, [])) for query in numbers)
@@ -175,8 +306,8 @@ def test_csv_holds_what_was_written(
     ],
 )
 def test_csv_is_read_leniently(tmp_path: Path, text: str | bytes) -> None:
-    expected = read_truth(written(tmp_path, TABLE), 8, 7)
-    truth = read_truth(written(tmp_path, text), 8, 7)
+    expected = read(written(tmp_path, TABLE), 8, 7)
+    truth = read(written(tmp_path, text), 8, 7)
     assert sets(truth.positives) == sets(expected.positives)
     assert truth.judged.tolist() == expected.judged.tolist()
 
@@ -212,13 +343,13 @@ def test_csv_is_read_leniently(tmp_path: Path, text: str | bytes) -> None:
 )
 def test_a_csv_that_is_none_is_refused(tmp_path: Path, text: str | bytes, words: tuple[str, ...]) -> None:
     with refused("truth.csv", *words):
-        read_truth(written(tmp_path, text), 8, 7)
+        read(written(tmp_path, text), 8, 7)
 
 
 def test_places_are_not_bounded_where_the_map_is_not_known(tmp_path: Path) -> None:
-    assert read_truth(written(tmp_path, "0,100000"), None, 1).positives.tolist() == [[100000]]
+    assert read(written(tmp_path, "0,100000"), None, 1).positives.tolist() == [[100000]]
     with refused("place -3", "from 0,"):
-        read_truth(written(tmp_path, "0,-3"), None, 1)
+        read(written(tmp_path, "0,-3"), None, 1)
 
 
 @given(st.dictionaries(st.integers(0, 30), st.integers(0, 60), min_size=1, max_size=6))
@@ -226,7 +357,7 @@ def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
     scratch: Path, listed: dict[int, int]
 ) -> None:
     path = written(scratch, "".join(f"{query},{place}\n" for query, place in listed.items()))
-    truth = read_truth(path, 61, 34, interpolate=True)
+    truth = read(path, 61, 34, interpolate=True)
     expected: dict[int, float] = dict(listed)
     for a, b in pairwise(sorted(listed)):
         expected |= {q: listed[a] + (listed[b] - listed[a]) * (q - a) / (b - a) for q in range(a, b)}
@@ -239,9 +370,9 @@ def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
 
 def test_interpolation_by_hand(tmp_path: Path) -> None:
     path = written(tmp_path, "1,10\n5,12.4\n6,0\n")
-    truth = read_truth(path, 20, 8, interpolate=True)
+    truth = read(path, 20, 8, interpolate=True)
     assert truth.positives[:, 0].tolist() == [-1, 10, 11, 11, 12, 12, 0, -1]
-    some = read_truth(path, 20, torch.tensor([5, 2]), interpolate=True)
+    some = read(path, 20, torch.tensor([5, 2]), interpolate=True)
     assert some.positives[:, 0].tolist() == [12, 11]
 
 
@@ -259,11 +390,11 @@ def test_a_csv_that_cannot_be_interpolated_is_refused(
     tmp_path: Path, text: str, words: tuple[str, ...]
 ) -> None:
     with refused("truth.csv", *words):
-        read_truth(written(tmp_path, text), 8, 7, interpolate=True)
+        read(written(tmp_path, text), 8, 7, interpolate=True)
 
 
 def test_convention_5_the_tolerance_applies_on_top_of_listed_places(tmp_path: Path) -> None:
-    right = read_truth(written(tmp_path, "0,3,4\n1,3,4\n2,3,4\n3,3,4"), None, 4).positives
+    right = read(written(tmp_path, "0,3,4\n1,3,4\n2,3,4\n3,3,4"), None, 4).positives
     index = torch.tensor([1, 2, 4, 5])
     assert is_right(index, right, 0).tolist() == [False, False, True, False]
     assert is_right(index, right, 1).tolist() == [False, True, True, True]
@@ -296,16 +427,16 @@ def test_npz_rows_are_places_and_columns_queries(scratch: Path, cells: list[list
     path = saved(scratch, GThard=hard.astype(dtype), GTsoft=soft.astype(dtype), other=np.zeros(3))
     if not hard.any():
         with refused("no query has a right answer"):
-            read_truth(path, places, queries)
+            read(path, places, queries)
         return
-    truth = read_truth(path, places, queries)
+    truth = read(path, places, queries)
     assert sets(truth.positives) == [{i for i in range(places) if hard[i, q]} for q in range(queries)]
     # what is right is not soft
     assert sets(truth.ignored) == [
         {i for i in range(places) if cells[i][q] == "soft"} for q in range(queries)
     ]
     assert truth.judged.all()
-    turned = read_truth(path, places, torch.arange(queries).flip(0))
+    turned = read(path, places, torch.arange(queries).flip(0))
     assert sets(turned.positives) == sets(truth.positives)[::-1]
     assert sets(turned.ignored) == sets(truth.ignored)[::-1]
 
@@ -313,7 +444,7 @@ def test_npz_rows_are_places_and_columns_queries(scratch: Path, cells: list[list
 def test_npz_with_one_matrix_only(tmp_path: Path) -> None:
     matrix = np.array([[True, False], [True, False], [False, True]])
     for name in ("GThard", "GTsoft"):
-        truth = read_truth(saved(tmp_path, **{name: matrix}), 3, 2)
+        truth = read(saved(tmp_path, **{name: matrix}), 3, 2)
         assert sets(truth.positives) == [{0, 1}, {2}]
         assert truth.ignored.shape == (2, 0)
 
@@ -322,8 +453,8 @@ def test_npz_with_one_matrix_only(tmp_path: Path) -> None:
     ("shape", "places", "queries", "words"),
     [
         ((3, 2), 2, 3, ("(3, 2)", "(2, 3)", "transposed it fits")),
-        ((3, 2), None, 3, ("(3, 2)", "(places, 3)", "transposed it fits")),
-        ((3, 5), None, torch.tensor([0, 2]), ("(3, 5)", "(places, 3)")),
+        ((3, 2), None, 3, ("(3, 2)", "(reference frames, 3)", "transposed it fits")),
+        ((3, 5), None, torch.tensor([0, 2]), ("(3, 5)", "(reference frames, 3)")),
         ((3, 2), None, torch.tensor([0, 2]), ("transposed it fits",)),
         ((4, 4), 3, 4, ("(4, 4)", "(3, 4)")),
         ((3, 4), 3, 5, ("(3, 4)", "(3, 5)")),
@@ -335,41 +466,41 @@ def test_a_matrix_that_does_not_fit_is_refused(
     tmp_path: Path, shape: tuple[int, ...], places: int | None, queries: int | Tensor, words: tuple[str, ...]
 ) -> None:
     with refused("truth.npz: GThard", *words):
-        read_truth(saved(tmp_path, GThard=np.ones(shape, dtype=bool)), places, queries)
+        read(saved(tmp_path, GThard=np.ones(shape, dtype=bool)), places, queries)
 
 
 def test_only_what_fits_transposed_is_called_so(tmp_path: Path) -> None:
     path = saved(tmp_path, GThard=np.ones((3, 4), dtype=bool))
     with pytest.raises(InputError) as caught:
-        read_truth(path, 5, 6)
+        read(path, 5, 6)
     assert "transposed it fits" not in str(caught.value)
 
 
 def test_some_queries_of_a_larger_matrix(tmp_path: Path) -> None:
     path = saved(tmp_path, GThard=np.eye(4, 9, dtype=bool))
-    assert sets(read_truth(path, None, torch.tensor([6, 1, 2])).positives) == [set(), {1}, {2}]
+    assert sets(read(path, None, torch.tensor([6, 1, 2])).positives) == [set(), {1}, {2}]
 
 
 def test_other_npz_files_are_refused(tmp_path: Path) -> None:
     square = np.eye(3, dtype=bool)
     with refused("truth.npz", "holds gt, S", "GThard"):
-        read_truth(saved(tmp_path, gt=square, S=square), 3, 3)
+        read(saved(tmp_path, gt=square, S=square), 3, 3)
     with refused("differ in shape"):
-        read_truth(saved(tmp_path, GThard=square, GTsoft=np.ones((2, 3))), None, 3)
+        read(saved(tmp_path, GThard=square, GTsoft=np.ones((2, 3))), None, 3)
     with refused("no whole .npz"):
-        read_truth(saved(tmp_path, GThard=np.array([[{}]], dtype=object)), 1, 1)
+        read(saved(tmp_path, GThard=np.array([[{}]], dtype=object)), 1, 1)
     with refused("GThard", "<U1"):
-        read_truth(saved(tmp_path, GThard=np.array([["1"]])), 1, 1)
+        read(saved(tmp_path, GThard=np.array([["1"]])), 1, 1)
     path = Path(saved(tmp_path, GThard=square))
     whole = path.read_bytes()
     for data in (whole[: len(whole) // 2], b"", b"query,place\n"):
         path.write_bytes(data)
         with refused("truth.npz", "no whole .npz", "GThard"):
-            read_truth(str(path), 3, 3)
+            read(str(path), 3, 3)
     with path.open("wb") as file:
         np.save(file, square)
     with refused("no whole .npz"):
-        read_truth(str(path), 3, 3)
+        read(str(path), 3, 3)
 
 
 # coordinates in image names
@@ -387,15 +518,15 @@ def test_utm_makes_every_reference_frame_near_by_right(tmp_path: Path) -> None:
     query = images(tmp_path / "b", [(500_030, 4_000_000), (500_000, 4_000_025), (500_000, 4_000_026)])
     expected = [{1, 2, 3, 4, 5}, {0}, set()]
     for text in ("utm", "utm:25"):
-        truth = find_truth(text, reference, query, 8, 3)
+        truth = find_ground_truth(text, reference, query, 8, 3)
         assert truth is not None
         assert sets(truth.positives) == expected
         assert truth.judged.all()
-    near = find_truth("utm:10", reference, query, 8, torch.tensor([2, 0]))
+    near = find_ground_truth("utm:10", reference, query, 8, torch.tensor([2, 0]))
     assert near is not None
     assert sets(near.positives) == [set(), {2, 3, 4}]
     with refused("no query has a right answer", "within 1 m"):
-        find_truth("utm:1", reference, query, 8, torch.tensor([2, 1]))
+        find_ground_truth("utm:1", reference, query, 8, torch.tensor([2, 1]))
 
 
 def test_utm_needs_two_folders_of_images_with_coordinates(tmp_path: Path) -> None:
@@ -404,22 +535,22 @@ def test_utm_needs_two_folders_of_images_with_coordinates(tmp_path: Path) -> Non
     for name in ("1.png", "@1@.png", "@x@3@.png"):
         Image.new("L", (2, 2)).save(tmp_path / "b" / name)
         with refused(name, "@easting@northing@"):
-            find_truth("utm", good, ImageFolder(tmp_path / "b"), 1, 1)
+            find_ground_truth("utm", good, ImageFolder(tmp_path / "b"), 1, 1)
         (tmp_path / "b" / name).unlink()
     with refused("no image names", "folders of images"):
-        find_truth("utm", route(1), good, 1, 1)
-    for lacking in (lambda: find_truth("utm", good, None, 1, 1), lambda: read_truth("utm", 1, 1)):
+        find_ground_truth("utm", route(1), good, 1, 1)
+    for lacking in (lambda: find_ground_truth("utm", good, None, 1, 1), lambda: read("utm", 1, 1)):
         with refused("truth utm", "both traverses"):
             lacking()
     with refused("query 1", "below 1"):
-        find_truth("utm", good, good, 1, torch.tensor([1]))
+        find_ground_truth("utm", good, good, 1, torch.tensor([1]))
 
 
 # real data
 
 
 def test_the_corridor_truth(data_dir: Path) -> None:
-    truth = read_truth(str(data_dir / "corridor" / "truth.csv"), 111, 111)
+    truth = read(str(data_dir / "corridor" / "truth.csv"), 111, 111)
     assert isinstance(truth, GroundTruth)
     assert truth.judged.all()
     found = sets(truth.positives)
@@ -429,3 +560,108 @@ def test_the_corridor_truth(data_dir: Path) -> None:
     # a slow camera: right places follow each other without gaps, and never go far back
     assert all(max(places) - min(places) == len(places) - 1 for places in found)
     assert math.isclose(sum(min(places) for places in found) / 111, 53, abs_tol=3)
+
+
+# resampled by distance: two queries show frames 3 and 9 of 11; three places show frames 0, 4 and 9 of 12
+
+SHOWN = torch.tensor([3, 9])
+PLACE_OF = torch.tensor([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, -1])
+
+
+def resampled(truth: str, **options: bool) -> GroundTruth:
+    reference, query = route(12), route(11)
+    found = find_ground_truth(truth, reference, query, 12, SHOWN, resampled=True, **options)
+    assert found is not None
+    return found
+
+
+def test_convention_11_a_ground_truth_counts_frames(tmp_path: Path) -> None:
+    found = resampled(written(tmp_path, "query,place\n3,4\n4,0\n9,11,2\n"))
+    assert sets(found.positives) == [{4}, {2, 11}]
+    places = ground_truth_in_places(found, lambda frames: look_up(PLACE_OF, frames))
+    assert sets(places.positives) == [{1}, {0}]
+    assert torch.equal(places.judged, found.judged)
+    assert sets(resampled("-1").positives) == [{2}, {8}]
+
+
+def test_a_frame_that_no_query_shows_speaks_for_the_nearest_one_that_is_shown(tmp_path: Path) -> None:
+    found = resampled(written(tmp_path, "1,0\n2,1\n10,4\n"))
+    assert sets(found.positives) == [{0, 1}, {4}]
+    assert found.judged.all()
+    kept = resampled(written(tmp_path, "1,0\n3,1\n"))
+    assert sets(kept.positives) == [{1}, set()]
+    assert kept.judged.tolist() == [True, False]
+    # frames are not moved where queries are only some of the frames
+    with refused("lists queries from 1 to 10"):
+        read(written(tmp_path, "1,0\n10,4\n"), 12, SHOWN)
+
+
+def test_a_frame_may_be_shown_by_several_queries(tmp_path: Path) -> None:
+    path = written(tmp_path, "0,2\n1,5\n")
+    found = find_ground_truth(path, None, None, 12, torch.tensor([0, 0, 1, 1, 1]), resampled=True)
+    assert found is not None
+    assert sets(found.positives) == [{2}, {2}, {5}, {5}, {5}]
+
+
+def test_frames_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    with refused("place 99999", "0 to 11"):
+        resampled(written(tmp_path, "3,99999\n"))
+    with refused("query 11", "0 to 10"):
+        resampled(written(tmp_path, "11,1\n"))
+
+
+def test_a_table_is_interpolated_between_frames(tmp_path: Path) -> None:
+    found = resampled(written(tmp_path, "0,0\n10,11\n"), interpolate=True)
+    assert sets(found.positives) == [{3}, {10}]
+
+
+def test_matrices_are_of_frames(tmp_path: Path) -> None:
+    hard, soft = np.zeros((12, 11), bool), np.zeros((12, 11), bool)
+    hard[11, 3] = hard[0, 9] = hard[5, 0] = soft[4, 3] = True
+    found = resampled(saved(tmp_path, GThard=hard, GTsoft=soft))
+    assert (sets(found.positives), sets(found.ignored)) == ([{11}, {0}], [{4}, set()])
+    places = ground_truth_in_places(found, lambda frames: look_up(PLACE_OF, frames))
+    assert (sets(places.positives), sets(places.ignored)) == ([set(), {0}], [{1}, set()])
+    with refused("(3, 2)", "(12, 10)"):
+        resampled(saved(tmp_path, GThard=np.eye(3, 2, dtype=bool)))
+
+
+def test_positions_and_coordinates_are_of_frames(tmp_path: Path) -> None:
+    reference = images(tmp_path / "reference", [(10 * i, 0) for i in range(12)])
+    query = images(tmp_path / "query", [(10 * (i + 1), 0) for i in range(11)])
+    found = find_ground_truth("utm:1", reference, query, 12, SHOWN, resampled=True)
+    assert found is not None
+    assert sets(found.positives) == [{4}, {10}]
+    part = find_ground_truth("utm:1", FrameRange(reference, start=2), query, 10, SHOWN)
+    assert part is not None
+    assert sets(part.positives) == [{2}, {8}]
+    carried = route(12, list(range(12))), route(10, list(range(1, 11)))
+    found = find_ground_truth(None, *carried, 12, SHOWN, resampled=True)
+    assert found is not None
+    assert sets(found.positives) == [{4}, {10}]
+
+
+def test_as_many_resampled_frames_are_no_ground_truth() -> None:
+    pair = route(12), route(12)
+    assert find_ground_truth(None, *pair, 12, SHOWN, resampled=True) is None
+    assert find_ground_truth(None, *pair, 12, SHOWN) is not None
+
+
+@pytest.mark.parametrize(
+    ("truth", "options", "words"),
+    [
+        ("-3", {}, "place = query - 3"),
+        ("utm", {}, "within 25 m by the coordinates in image names"),
+        ("utm:7.5", {}, "within 7.5 m"),
+        (None, {}, "both have as many frames"),
+        (None, {"positions": True}, "positions that both traverses carry"),
+    ],
+)
+def test_a_ground_truth_in_words(truth: str | None, options: dict[str, bool], words: str) -> None:
+    assert words in describe_ground_truth(truth, **options)
+
+
+def test_a_file_is_described_by_its_name(tmp_path: Path) -> None:
+    path = written(tmp_path, "0,1")
+    assert describe_ground_truth(path) == path
+    assert describe_ground_truth(path, interpolate=True) == f"{path}, interpolated"

@@ -1,0 +1,92 @@
+"""Part of a traverse, and traverses whose frames can be read in any order."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+
+from torch import Tensor
+
+from dejavu_torch.types import InputError, Traverse
+
+
+class IndexedTraverse(Traverse):
+    """A traverse of known length that reads only the frames asked for; a subclass says how, in `read`."""
+
+    length: int
+
+    @abstractmethod
+    def read(self, frames: range) -> Tensor:
+        """The frames of a range, which is not empty, as one batch."""
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        yield from self.select(range(self.length), size)
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        yield from self.select(range(start, stop), 64)
+
+    def select(self, frames: range, size: int) -> Iterator[Tensor]:
+        there = range(frames.start, min(frames.stop, self.length), frames.step)
+        for first in range(0, len(there), size):
+            yield self.read(there[first : first + size])
+
+
+class FrameRange(Traverse):
+    """The frames [start, stop) of a traverse, every step-th of them; names and positions follow.
+
+    Args:
+        traverse: any traverse.
+        start: the first frame, from 0. stop: the end, which is left out; 0 is that of the traverse.
+        step: how many frames to go on from one to the next.
+
+    Convention: frames count from 0 again; `place` keeps its values.
+
+    Raises:
+        InputError: start, stop or step out of range; while reading, a traverse of unknown length that has
+            no such frames.
+
+    Example:
+        >>> import torch
+        >>> from dejavu_torch.data.arrays import ArrayTraverse
+        >>> part = FrameRange(ArrayTraverse(torch.arange(6.0)[:, None]), start=1, stop=6, step=2)
+        >>> part.length, next(part.batches(64)).flatten()
+        (3, tensor([1., 3., 5.]))
+    """
+
+    def __init__(self, traverse: Traverse, start: int = 0, stop: int = 0, step: int = 1) -> None:
+        length = traverse.length
+        stops = stop == 0 or start < stop
+        if start < 0 or step < 1 or not stops or (length is not None and max(start + 1, stop) > length):
+            frames = "frames" if length is None else f"{length} frames"
+            raise InputError(
+                f"{traverse.name}: start={start}, stop={stop}, step={step}; expected start < stop within its "
+                f"{frames}, and step of at least 1"
+            )
+        self.traverse = traverse
+        self.frames = range(start, stop or length or 2**62, step)
+        self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
+        if length is not None:
+            self.length = len(self.frames)
+        if traverse.place is not None:
+            self.place = traverse.place[start : stop or None : step].contiguous()
+        self._least = len(self.frames) if stop else 1
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        count = 0
+        for batch in self.traverse.select(self.frames, size):
+            count += len(batch)
+            yield batch
+        if count < self._least:
+            raise InputError(f"{self.name} holds {count} frames; expected {self._least} or more")
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        part = self.frames[start:stop]
+        if part:
+            yield from self.traverse.select(part, 64)
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.traverse.frame_shape
+
+    def frame_name(self, i: int) -> str:
+        return self.traverse.frame_name(self.frames[i])

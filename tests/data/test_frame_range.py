@@ -1,0 +1,80 @@
+"""What every traverse offers by itself: parts, the shape of a frame, batches that fit into memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from helpers import all_of, refused
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import types
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.types import Traverse
+
+
+class Stream(Traverse):
+    """Frames that can only be read from the beginning, of unknown length, in batches of odd sizes."""
+
+    def __init__(self, values: Tensor) -> None:
+        self.values = values
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        if len(self.values):
+            yield from self.values.split(min(size, 7))
+
+
+VALUES = torch.arange(40.0)[:, None]
+PARTS = st.tuples(st.integers(0, 39), st.integers(0, 40), st.integers(1, 45)).filter(
+    lambda part: part[1] == 0 or part[0] < part[1]
+)
+
+
+@given(PARTS, st.integers(1, 50))
+def test_a_part_is_a_slice_however_the_frames_are_read(part: tuple[int, int, int], size: int) -> None:
+    start, stop, step = part
+    expected = VALUES[start : stop or None : step]
+    for traverse in (Stream(VALUES), ArrayTraverse(VALUES), FrameRange(Stream(VALUES))):
+        some = FrameRange(traverse, start, stop, step)
+        assert torch.equal(all_of(some, size), expected)
+        assert max(len(batch) for batch in some.batches(size)) <= size
+        assert some.length in (None, len(expected))
+        inner = torch.cat([VALUES[:0], *some.between(1, 4)])
+        assert torch.equal(inner, expected[1:4])
+
+
+def test_parts_of_parts_name_both() -> None:
+    part = FrameRange(FrameRange(ArrayTraverse(VALUES, "walk"), start=10), stop=8, step=2)
+    assert part.name == "walk[10:][0:8:2]"
+    assert all_of(part).flatten().tolist() == [10, 12, 14, 16]
+
+
+@pytest.mark.parametrize(("start", "stop"), [(40, 0), (90, 0), (0, 41), (50, 60)])
+def test_a_stream_that_ends_too_soon_is_refused(start: int, stop: int) -> None:
+    with refused("traverse[", "frames; expected"):
+        all_of(FrameRange(Stream(VALUES), start, stop))
+
+
+def test_the_shape_of_a_frame() -> None:
+    assert ArrayTraverse(torch.rand(3, 2)).frame_shape == (2,)
+    assert ArrayTraverse(torch.rand(3, 1, 4, 5)).frame_shape == (1, 4, 5)
+    assert FrameRange(Stream(VALUES), start=3).frame_shape == (1,)
+    with refused("holds no frames"):
+        _ = Stream(VALUES[:0]).frame_shape
+
+
+def test_large_frames_are_read_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = ArrayTraverse(torch.rand(9, 1, 4, 5))
+    assert frames.batch_size(64) == 64
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 3 * 20 + 1)
+    assert frames.batch_size(64) == 3
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 1)
+    assert frames.batch_size(64) == 1
+
+
+def test_a_traverse_without_names_has_empty_ones() -> None:
+    assert Stream(VALUES).frame_name(3) == ""

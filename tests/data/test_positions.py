@@ -1,0 +1,51 @@
+"""Frames and places of resampled footage: one table, read both ways."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch.data.positions import NEAR, first_reached, look_up, nearest_places, shown_frames
+
+WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
+    lambda steps: torch.tensor([0.0, *steps]).cumsum(0)
+)
+
+
+@given(WAYS)
+def test_each_place_is_taken_where_it_is_first_reached(positions: torch.Tensor) -> None:
+    low, high, share = first_reached(positions)
+    exact = positions.double()
+    assert len(low) == int(exact.max() + NEAR) + 1
+    for place, (a, b, part) in enumerate(zip(low.tolist(), high.tolist(), share.tolist(), strict=True)):
+        assert (exact[:b] + NEAR < place + 1e-9).all()
+        assert exact[b] + NEAR >= place - 1e-9
+        assert b - a == min(b, 1)
+        assert abs(exact[a] + part * (exact[b] - exact[a]) - place) <= NEAR + 1e-9
+    assert (low.diff() >= 0).all()
+    shown = shown_frames(positions)
+    assert ((shown == low) | (shown == high)).all()
+
+
+@given(WAYS)
+def test_a_frame_belongs_to_the_place_nearest_to_it(positions: torch.Tensor) -> None:
+    places = len(shown_frames(positions))
+    nearest = nearest_places(positions)
+    for place, position in zip(nearest.tolist(), positions.tolist(), strict=True):
+        if place < 0:
+            assert position < 0
+        else:
+            assert abs(position - place) <= min(abs(position - other) for other in range(places)) + 1e-6
+
+
+def test_convention_11_standing_and_going_back_add_no_places() -> None:
+    positions = torch.tensor([0.0, 1, 2, 2, 2, 1, 0, 1, 2, 3])
+    assert shown_frames(positions).tolist() == [0, 1, 2, 9]
+    assert nearest_places(positions).tolist() == [0, 1, 2, 2, 2, 1, 0, 1, 2, 3]
+
+
+def test_minus_one_stays() -> None:
+    table = torch.tensor([5, 7, -1])
+    assert look_up(table, torch.tensor([[0, -1], [2, 1]])).tolist() == [[5, -1], [-1, 7]]
+    assert look_up(table, torch.zeros(2, 0, dtype=torch.int64)).shape == (2, 0)
