@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.database.mapfile import map_size, read_map, write_map
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
@@ -19,7 +20,7 @@ from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.extract import check_queries, feature_batches, features_of, frame_shape
+from dejavu_torch.features.extract import check_queries, feature_batches, features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
@@ -36,7 +37,7 @@ SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
 
 # the classes that a map file may name; any other has to be given by the caller
-CLASSES = (
+CLASSES: tuple[type[nn.Module], ...] = (
     Preprocess,
     HOG,
     SmallCNN,
@@ -108,9 +109,8 @@ class DejaVu(nn.Module):
         self.velocity = velocity
         self.map: PlaceMap = self.mapper.empty()
         self.step: float | None = None  # pixels of ground from one place of the map to the next
-        self.frame_shape: tuple[int, ...] | None = (
-            None  # of the reference, (C,H,W), or (D,) of ready features
-        )
+        self.frame_shape: tuple[int, ...] | None = None  # of the reference, or (D,) of ready features
+        self.frame_names: list[str] = []  # of the reference's frames; empty where they have none
         self.trained: Training | None = None
 
     def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
@@ -144,7 +144,7 @@ class DejaVu(nn.Module):
         """
         if self.velocity is None or isinstance(traverse, ResampledTraverse):
             return traverse
-        if step is not None and (traverse.length == 1 or len(frame_shape(traverse)) == 1):
+        if step is not None and (traverse.length == 1 or len(traverse.frame_shape) == 1):
             return traverse
         return ResampledTraverse(traverse, self.velocity, self.batch_size, step, progress)
 
@@ -156,7 +156,7 @@ class DejaVu(nn.Module):
             traverse: what they come from, where known: the map then knows what frames to expect, and,
                 where they were resampled, which frame each place shows.
         """
-        shape = () if traverse is None else frame_shape(traverse)
+        shape = () if traverse is None else traverse.frame_shape
         if len(shape) == 3 and features.shape[1] > MANY_FEATURES:
             log.warning(
                 "each frame gives %d features; smaller frames make a smaller and faster map",
@@ -171,12 +171,13 @@ class DejaVu(nn.Module):
                 f"{type(self.mapper).__name__} made a map of {route.places} places of {route.dimension} "
                 f"features from features {tuple(features.shape)}; expected as many"
             )
-        self.step = None
+        self.step, source, frames = None, traverse, len(features)
         if isinstance(traverse, ResampledTraverse):
-            self.step = traverse.step
-            route.positions = traverse.positions.float().to(features.device)
+            self.step, source, frames = traverse.step, traverse.traverse, len(traverse.positions)
+            route.positions = traverse.positions.to(features.device)
             route.check()
         self.map = route
+        self.frame_names = [] if source is None else names_of(source, frames)
         self.frame_shape, self.trained = shape or None, None
         return self
 
@@ -216,7 +217,7 @@ class DejaVu(nn.Module):
         queries = as_traverse(queries)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress is not None)
-        shape = frame_shape(queries)
+        shape = queries.frame_shape
         for i, features in enumerate(self.extract(queries, progress)):
             if i == 0:
                 self.check_queries(shape, features.shape[1], queries.name)
@@ -248,6 +249,10 @@ class DejaVu(nn.Module):
         resized = getattr(self.features, "resize", None) is not None
         check_queries(shape, dimension, self.frame_shape, self.map.dimension, resized, name)
 
+    def frame_name(self, frame: int) -> str:
+        """The name of a reference frame, such as its file's; empty where it has none."""
+        return self.frame_names[frame] if self.frame_names else ""
+
     def save(self, path: str | Path) -> None:
         """Write the map, with the feature module's weights, as one safetensors file.
 
@@ -275,6 +280,8 @@ class DejaVu(nn.Module):
             check_kind(header["map"])
             model = cls(**_build_parts(header, features), **{name: header[name] for name in SETTINGS})
             model.set_extra_state({name: header[name] for name in model.get_extra_state()})
+            names, frames = header["names"], len(tensors["map.positions"]) or header["map"]["places"]
+            model.frame_names = [] if names is None else decode_names(names, frames)
             state: dict[str, Any] = {**tensors, "map._extra_state": header["map"]}
             loaded = model.load_state_dict(state, strict=False)
             missing = [name for name in loaded.missing_keys if name.startswith(("map.", "features."))]
@@ -295,6 +302,7 @@ class DejaVu(nn.Module):
         header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
         header |= {name: getattr(self, name) for name in SETTINGS} | self.get_extra_state()
         header["map"] = self.map.get_extra_state()
+        header["names"] = encode_names(self.frame_names) if self.frame_names else None
         tensors = {f"map.{name}": t for name, t in self.map.state_dict().items() if isinstance(t, Tensor)}
         return tensors | self._weights(), header
 
@@ -305,9 +313,10 @@ class DejaVu(nn.Module):
     def summary(self) -> MapSummary:
         """What the map can tell apart, and the bytes of its file by part."""
         tensors, header = self._file()
-        summary, backbone = self.map.summary(), sum(tensor.nbytes for tensor in self._weights().values())
+        backbone = sum(tensor.nbytes for tensor in self._weights().values())
+        summary = self.map.summary().with_parts(route={"names": len(header["names"] or "")})
         rest = map_size(tensors, header) - summary.route_bytes - backbone
-        return summary.with_fixed(backbone=backbone, header=rest)
+        return summary.with_parts(fixed={"backbone": backbone, "header": rest})
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the state_dict holds beside the tensors and the map's own state."""

@@ -102,7 +102,7 @@ class Video(Traverse):
         if not self._complete and i >= len(self._seconds):
             self._read_times()
         seconds = self._seconds[i]
-        return clock_time(math.floor(1000 * seconds + 0.5)) if math.isfinite(seconds) else ""
+        return clock_time(seconds) if math.isfinite(seconds) else ""
 
     @property
     def times(self) -> Tensor:

@@ -73,9 +73,12 @@ class MapSummary:
         """`map_bytes` over the number of places."""
         return self.map_bytes / max(self.places, 1)
 
-    def with_fixed(self, **parts: int) -> MapSummary:
-        """The summary with further parts of a fixed size, those of 0 bytes left out."""
-        return replace(self, fixed={**self.fixed, **{name: size for name, size in parts.items() if size}})
+    def with_parts(
+        self, route: Mapping[str, int] | None = None, fixed: Mapping[str, int] | None = None
+    ) -> MapSummary:
+        """The summary with further parts, those of 0 bytes left out."""
+        more = [{name: size for name, size in (parts or {}).items() if size} for parts in (route, fixed)]
+        return replace(self, route={**self.route, **more[0]}, fixed={**self.fixed, **more[1]})
 
     def __repr__(self) -> str:
         return describe(self)

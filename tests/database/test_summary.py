@@ -21,7 +21,9 @@ PLAN: Plan = (
 
 
 def test_numbers_of_a_plan_made_by_hand() -> None:
-    summary = summarise(PLAN, places=2500, route={"templates": 9000}).with_fixed(header=1000, backbone=0)
+    summary = summarise(PLAN, places=2500, route={"templates": 9000}).with_parts(
+        fixed={"header": 1000, "backbone": 0}
+    )
     assert summary.places == 2500
     assert summary.covered == 1024 + 600  # the last two chunks overlap
     assert summary.templates == 93 + 171 + 98 + 4 + 6 + 15
@@ -61,7 +63,9 @@ def test_a_plan_without_layers() -> None:
 
 def test_description_tells_the_numbers() -> None:
     lines = describe(
-        summarise(PLAN, places=2500, route={"templates": 9000}).with_fixed(header=1000, backbone=0)
+        summarise(PLAN, places=2500, route={"templates": 9000}).with_parts(
+            fixed={"header": 1000, "backbone": 0}
+        )
     ).splitlines()
     assert len(lines) == 5
     for number in ("0-1023", "93", "171", "5301"):
