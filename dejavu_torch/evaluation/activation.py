@@ -1,4 +1,4 @@
-"""How often single layers, and their fusion, answer with the right phase (figure 17 of the paper)."""
+"""How single layers answer, and how often they, and their fusion, are right (figure 17 of the paper)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.truth import counted, is_right
+from dejavu_torch.database.distance import phase_distances
+from dejavu_torch.model import DejaVu
 from dejavu_torch.types import FrequencyLayer, GroundTruth
+
+DISTANCES_AT_ONCE = 2**22  # numbers of Q x P held at a time
 
 
 class Rate(NamedTuple):
@@ -52,6 +56,25 @@ class ActivationRates(NamedTuple):
         }
 
 
+def layer_distances(model: DejaVu, queries: Tensor, j: int) -> Tensor:
+    """Eq. 3 for one layer of the map: (Q,D) -> (Q,P)."""
+    block, features = model.map.blocks()[j], model.map.layer_features()[j]
+    chosen = queries.index_select(1, features.to(queries.device)).to(block.device)
+    if len(model.map.weights):
+        chosen = chosen * model.map.weights[features]
+    with torch.no_grad():
+        return phase_distances(chosen, block, model.matcher.metric).cpu()
+
+
+def best_phases(model: DejaVu, queries: Tensor, j: int) -> Tensor:
+    """The phase of one layer, among those its chunk has, nearest to each query: (Q,D) -> (Q,) int64."""
+    layer = model.map.plan[j]
+    present: Tensor = layer.place_phases.unique()
+    parts = queries.split(max(1, DISTANCES_AT_ONCE // max(layer.phases, len(layer.features))))
+    nearest = [layer_distances(model, part, j)[:, present].argmin(1) for part in parts]
+    return present[torch.cat(nearest)]
+
+
 def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int) -> Tensor:
     """Whether the best phase of each query is the phase of any of these places, within the tolerance.
 
@@ -87,7 +110,7 @@ def activation_rates(
 
     For a layer, the rate is the share of the queries whose best phase (argmin over k of eq. 3) is
     within the tolerance of the phase of a right place (`in_phase`): inside, a right place in the
-    chunk; outside, any, with the phase it would have if the layer went on. Outside the layer learnt
+    chunk; outside, any, with the phase it would have if the layer went on. Outside the layer holds
     nothing: a rate near chance says that its period ends with the chunk, or slips there; a rate as
     inside, that it goes on. Chance is the share of phases within the tolerance of any one phase,
     (2 * tolerance + 1) / period where phases = period, at most 1.

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
-from dejavu_torch.data.truth import Shown, as_truth, counted, unit_of
+from dejavu_torch.data.truth import Shown, as_truth, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
 from dejavu_torch.database.l1 import l1_backend
+from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.controls import leave_out_match
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
@@ -23,15 +24,13 @@ from dejavu_torch.evaluation.curves import (
     curve_of,
     threshold_of_full_precision,
 )
+from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.report import Contender, Report, contend
-from dejavu_torch.evaluation.route_plots import plot_ground, plot_velocity
+from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.others import Other, hog_others, others_of
-from dejavu_torch.experiments.pictures import draw_pictures
 from dejavu_torch.features.extract import feature_batches, frame_shape
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
@@ -139,7 +138,7 @@ def compare(
     contenders = {}
     for key, (name, other, bytes, k) in others.items():
         own = as_truth(torch.arange(len(stored))[:, None]) if key == "leave_out" else known
-        contenders[key] = _judged(name, other, own, tolerance, bytes, k)
+        contenders[key] = contend(name, other, own, tolerance, bytes, k)
 
     size = model.map_bytes
     plan = model.map.plan
@@ -189,11 +188,9 @@ def compare(
         facts |= count_queries(match, known, tolerance)
         facts["truth"] = describe_truth(truth, interpolate, positions, spaced=shown is not None)
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
-    ours = _judged("this map", match, known, tolerance, size)
-    pictures = draw_pictures(model, reference, stored, seen, match, known, tolerance, others)
-    if isinstance(reference, ResampledTraverse):
-        motion = {"ground": _ground(reference), "velocity": _velocity(reference, query)}
-        pictures = motion | pictures
+    ours = contend("this map", match, known, tolerance, size)
+    run = Localization(model, reference, query, stored, seen, match, known, tolerance)
+    pictures = draw_pictures(run, {"map": ours, **contenders})
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     report = Report(ours, contenders, facts)
     return Comparison(report, match, model, pictures, stored, seen, known, reference, query, shown)
@@ -210,46 +207,6 @@ class Clock:
         began = time.perf_counter()
         yield
         self.seconds[name] += time.perf_counter() - began
-
-
-def _judged(
-    name: str,
-    match: Match,
-    truth: GroundTruth | None,
-    tolerance: int,
-    bytes: int | None = None,
-    k: int | None = None,
-) -> Contender:
-    """Scores where there is a truth that counts any of the queries."""
-    if truth is None or not counted(match.index, truth, tolerance).any():
-        return Contender(name, None, bytes, k)
-    return contend(name, match, truth, tolerance, bytes, k)
-
-
-def _ground(reference: ResampledTraverse) -> Picture:
-    velocity, place = reference.normalizer, reference.length // 2
-    frame = next(reference.between(place, place + 1)).cpu()
-    corners = velocity.corners
-    return Picture(
-        plot_ground(frame[0], corners, ground_patch(frame, corners, velocity.size)[0]),
-        "the ground that is measured",
-        "Right if what lies straight ahead runs straight down the view from above, and what repeats along "
-        "the way repeats at even distances there.",
-    )
-
-
-def _velocity(reference: ResampledTraverse, query: Traverse) -> Picture:
-    pair = [("reference", reference), ("query", query)]
-    ways = {
-        f"{role}: {one.name}": one.way * one.step for role, one in pair if isinstance(one, ResampledTraverse)
-    }
-    return Picture(
-        plot_velocity(ways, reference.step),
-        "how fast the ground moves",
-        "The motion of the ground from frame to frame, forward above the grey line. Places are even steps "
-        "along it: a camera that stands, or goes back and forth, adds none. A vehicle's speed changes "
-        "smoothly: a curve that jumps, or falls below the line, tells of corners that show no clear ground.",
-    )
 
 
 def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:

@@ -14,15 +14,18 @@ from dejavu_torch.data.truth import Shown, unit_of
 from dejavu_torch.data.truthfile import check_truth_text, describe_truth, find_truth
 from dejavu_torch.database.compressed import CompressedMap
 from dejavu_torch.database.mapfile import read_compressed
+from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     count_queries,
     curve_of,
     threshold_of_full_precision,
 )
+from dejavu_torch.evaluation.match_plots import plot_coverage
 from dejavu_torch.evaluation.matches import read_matches
-from dejavu_torch.evaluation.plots import Picture, plot_coverage, plot_curves
-from dejavu_torch.evaluation.report import Report, contend
+from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.report import Report
+from dejavu_torch.evaluation.score_plots import plot_curves
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 
@@ -100,7 +103,7 @@ def evaluate_file(
     seen = 1 + max(int(table.max()) for table in (match.index, known.positives))
     pictures = {
         "pr": Picture(
-            plot_curves({matches.name: curve}, f"right within {tolerance} places"),
+            plot_curves({"map": ours}, f"right within {tolerance} places"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises.",
