@@ -238,7 +238,9 @@ def plot_features(
     if grey.min() < 0 or grey.max() > 1:
         grey = (grey - grey.min()) / (grey.max() - grey.min())
     for axis, layer, colour in zip(axes.flat, layers, LAYERS * len(layers), strict=False):
-        axis.imshow(0.35 + 0.65 * grey, cmap="gray", vmin=0, vmax=1)  # pale, so that lines stand out
+        axis.imshow(
+            (0.35 + 0.65 * grey).numpy(), cmap="gray", vmin=0, vmax=1
+        )  # pale, so that lines stand out
         edges, count = edges_seen(torch.tensor(layer.features), (height, width), orientations, cell, block)
         strength = count / count.max()
         axis.add_collection(

@@ -64,14 +64,15 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
     """The queries that `plot_pairs` shows: the surest right, the surest wrong, and one at the threshold.
 
     The last is the surest that the threshold rejects, or, where it rejects none, the least sure of all.
-    Without ground truth the surest of all stands for the first two. Each query is shown once.
+    Without ground truth the surest of all stands for the first two. A query that is several of these is one
+    example.
 
     Example:
         >>> match = Match(torch.tensor([0, 9]), torch.tensor([0.1, 0.2]), torch.tensor([True, False]))
         >>> for example in example_matches(match, as_truth(torch.tensor([[0], [1]])), tolerance=0):
         ...     print(example)
         Example(why='surest right answer, score 0.1', query=0, place=0, right=0)
-        Example(why='surest wrong answer, score 0.2', query=1, place=9, right=1)
+        Example(why='surest wrong answer, first above the threshold, score 0.2', query=1, place=9, right=1)
     """
     reported = match.index >= 0
     rejected = reported & ~match.accepted
@@ -85,19 +86,21 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
         groups["first above the threshold"] = rejected
     else:
         groups["least sure answer"] = reported
-    examples: dict[int, Example] = {}
+    reasons: dict[int, list[str]] = {}
     for why, group in groups.items():
-        if not group.any():
-            continue
-        sign = -1 if why.startswith("least") else 1
-        query = int(torch.where(group, sign * match.score, torch.inf).argmin())
+        if group.any():
+            sign = -1 if why.startswith("least") else 1
+            query = int(torch.where(group, sign * match.score, torch.inf).argmin())
+            reasons.setdefault(query, []).append(why)
+    examples = []
+    for query, whys in reasons.items():
         place, nearest = int(match.index[query]), -1
         if truth is not None and truth.judged[query] and (truth.positives[query] >= 0).any():
             positives = truth.positives[query][truth.positives[query] >= 0]
             nearest = int(positives[(positives - place).abs().argmin()])
-        text = f"{why}, score {float(match.score[query]):.3g}"
-        examples.setdefault(query, Example(text, query, place, nearest))
-    return list(examples.values())
+        text = f"{', '.join(whys)}, score {float(match.score[query]):.3g}"
+        examples.append(Example(text, query, place, nearest))
+    return examples
 
 
 def plot_pairs(examples: Sequence[Example], frames: Sequence[Sequence[Tensor]]) -> Plot:
@@ -148,10 +151,10 @@ def score_matrix(
         done += len(part)
         places = values.shape[1]
         block, at_once = -(-places // cells), max(1, SCORES_AT_ONCE // places)
-        least = values.amin(1, keepdim=True)
-        median = values.masked_fill(values.isinf(), torch.nan).nanmedian(1, keepdim=True).values
+        closed, least = values.isinf(), values.amin(1, keepdim=True)
+        median = values.masked_fill(closed, torch.nan).nanmedian(1, keepdim=True).values
         values = ((values - least) / (median - least).clamp(min=1e-12)).clamp(max=1)
-        values = values.masked_fill(values.isnan(), torch.inf)
+        values = values.masked_fill(closed, torch.inf)
         padded = torch.nn.functional.pad(values, (0, -places % block), value=torch.inf)
         rows.append(padded.unflatten(1, (-1, block)).amin(2))
     matrix = torch.cat(rows)
@@ -166,7 +169,7 @@ def plot_score_matrix(matrix: ScoreMatrix, match: Match, truth: GroundTruth | No
     extent = (-0.5, queries - 0.5, -0.5, matrix.values.shape[1] * matrix.block - 0.5)
     axis.set_facecolor(GREY)  # where nothing covers
     image = axis.imshow(
-        matrix.values.T, cmap="gray", vmin=0, vmax=1, origin="lower", aspect="auto", extent=extent
+        matrix.values.T.numpy(), cmap="gray", vmin=0, vmax=1, origin="lower", aspect="auto", extent=extent
     )
     found = match.index >= 0
     style = {"color": COLOURS["map"], "markersize": 2, "label": "reported place"}

@@ -88,7 +88,7 @@ def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dic
 
 def draw_pairs(run: Localization) -> dict[str, Picture]:
     """Some queries beside the frames found for them; nothing for ready features, or where none is found."""
-    if len(frame_shape(run.query)) == 1 or len(frame_shape(run.reference)) == 1:
+    if not has_frames(run):
         return {}
     examples = example_matches(run.match, run.truth, run.tolerance)
     frames = [
@@ -102,9 +102,9 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
         return {}
     known = "" if run.truth is None else ", and at the right what it should have been"
     last = (
-        "The last is the best match that the threshold rejects."
-        if "threshold" in examples[-1].why
-        else "No threshold rejects any, so the last is the match with the worst score."
+        "First above the threshold: the best match that the threshold rejects."
+        if any("threshold" in one.why for one in examples)
+        else "No threshold rejects any; the least sure answer has the worst score."
     )
     return {
         "pairs": Picture(
@@ -278,7 +278,7 @@ def draw_activations(run: Localization) -> dict[str, Picture]:
 def paper_pictures(run: Localization) -> dict[str, Picture]:
     """Frames, autocorrelogram and layers, which `reproduce` adds (figures 1, 2 and 5 to 7 of the paper)."""
     pictures, plan = {}, run.model.map.plan
-    if run.truth is not None:
+    if run.truth is not None and (run.truth.positives >= 0).any() and has_frames(run):
         middles = [len(run.reference_features) * (k + 0.5) / EXAMPLES for k in range(EXAMPLES)]
         queries = [nearest_query(run.truth, middle) for middle in middles]
         places = run.truth.positives[queries].amax(1).tolist()
@@ -354,6 +354,11 @@ def nearest_query(truth: GroundTruth, place: float) -> int:
     """The query one of whose right places is nearest to a place; the first where none has any."""
     right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.inf)
     return int((right - place).abs().amin(1).argmin())
+
+
+def has_frames(run: Localization) -> bool:
+    """Whether both traverses hold frames, not ready features."""
+    return len(frame_shape(run.reference)) == len(frame_shape(run.query)) == 3
 
 
 def frame_at(traverse: Traverse, number: int) -> Tensor:

@@ -43,8 +43,8 @@ _NULL = "control on shuffled frames, where nothing repeats: what it finds does n
 _NULLS = "The first looks for periods anew, and may find none; the second keeps the periods of the map."
 _TRAINED = "It keeps the trained backbone."
 _LATE = (
-    f"many queries share the best score, so that this curve starts at a recall above {LATE}; nothing to the "
-    "left of that counts as area."
+    f"*: this curve starts at a recall above {LATE}, since many queries share the best score; nothing to the "
+    "left of that counts as area"
 )
 
 
@@ -162,25 +162,27 @@ def summary(report: Report) -> str:
     if facts.get("threshold_of_full_precision") is not None:
         threshold = facts["threshold_of_full_precision"]
         lines.append(f"Here --threshold {threshold:.9g} would accept right places only")
+    if any(is_late(one) for one in report.shown().values()):
+        lines.append(_LATE)
     if "seconds_learn" in facts:
         seconds = f"{facts['seconds_learn']:.1f} s, localizing {facts['seconds_localize']:.1f} s"
         lines.append(f"Learning took {seconds}")
     return ". ".join(lines) + "."
 
 
+def words_of(headings: list[str]) -> dict[str, str]:
+    """What the words in the headings of a table mean."""
+    return {word: text for word, text in _KEY.items() if any(word in heading for heading in headings)}
+
+
 def table_key(report: Report) -> dict[str, str]:
     """What the words in the first table mean: those that it holds."""
-    rows, facts = report.shown(), report.facts
-    key = {heading: _KEY[heading] for heading in _MAIN.values()}
-    if "frames" in facts:
-        key["bytes per place"] = _KEY["bytes per place"]
+    rows, key = report.shown(), words_of(score_table(report)[0])
     if any(one.k is not None for one in rows.values()):
         key["all, every k-th frame"] = _BASELINES
     if "null" in rows:
-        more = _NULLS if "null_same_plan" in rows else _TRAINED if facts.get("trained") else ""
+        more = _NULLS if "null_same_plan" in rows else _TRAINED if report.facts.get("trained") else ""
         key["null"] = f"{_NULL} {more}".strip()
-    if any(is_late(one) for one in rows.values()):
-        key["*"] = _LATE
     return key
 
 
@@ -205,19 +207,19 @@ def write_report(
             temporary.write_bytes(data)
     for name in set(PICTURES) - set(pictures):
         (folder / f"{name}.png").unlink(missing_ok=True)
-    colours, facts = [colour_of(key) for key in report.shown()], report.facts
-    every = _KEY | {"recall": facts["recall_definition"]}
+    facts, key, every = report.facts, table_key(report), score_table(report, every=True)
+    more = {word: text for word, text in words_of(every[0]).items() if word not in key}
     _write_page(
         folder,
         title=title,
         lead=headline(report),
         notes=[summary(report)],
-        key=table_key(report),
+        key=key,
         rows=score_table(report),
-        colours=colours,
+        colours=[colour_of(one) for one in report.shown()],
         pictures=[(picture, _embedded(pngs[name])) for name, picture in pictures.items()],
-        every_score=score_table(report, every=True),
-        every_key={word: text for word, text in every.items() if word not in table_key(report)},
+        every_score=every,
+        every_key=more | {"recall": facts["recall_definition"]},
         plan=plan,
         made_by=f"{command}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
     )
@@ -245,7 +247,7 @@ def write_index(
         title=title,
         notes=notes,
         links=pages,
-        key={word: text for word, text in _KEY.items() if any(word in heading for heading in rows[0])},
+        key=words_of(rows[0]),
         rows=rows,
         pictures=[(picture, _embedded(as_png(picture)))],
         made_by=command,
