@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dejavu_torch.data.truth import as_truth, counted, is_right
 from dejavu_torch.evaluation.contenders import COLOURS
-from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, WIDTH, WRONG, Plot, canvas, show_frame
+from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, WIDTH, WRONG, Plot, canvas, pixels, show_frame
 from dejavu_torch.types import GroundTruth, Match
 
 CELLS = 400  # rows and columns of a score matrix, at most
@@ -118,9 +118,12 @@ def plot_pairs(examples: Sequence[Example], frames: Sequence[Sequence[Tensor]]) 
     for axis in axes.flat:
         axis.set_axis_off()
     for row, (one, shown) in enumerate(zip(examples, frames, strict=True)):
-        titles = (f"query {one.query}", f"reported: place {one.place}", f"right: place {one.right}")
-        for axis, frame, title in zip(axes[row], shown, titles, strict=False):
-            show_frame(axis, frame, f"\n{title}")  # the empty line is for what stands above the row
+        right = "none is known" if one.right < 0 else f"place {one.right}"
+        titles = (f"query {one.query}", f"reported: place {one.place}", f"right: {right}")
+        for axis, title in zip(axes[row], titles, strict=False):
+            axis.set_title(f"\n{title}", loc="left", fontsize=9, pad=3)  # the empty line is for the heading
+        for axis, frame in zip(axes[row], shown, strict=False):
+            axis.imshow(pixels(frame))
         heading = axes[row, 0].annotate(
             one.why, (0, 1), (0, 15), "axes fraction", "offset points", weight="bold"
         )
