@@ -27,21 +27,6 @@ _MORE = {
     "auc_reported": "AUC rep.",
     "recall_at_100_precision_reported": "R@100P rep.",
 }
-_KEY = {
-    "AUC": "area under the precision-recall curve; 1 is perfect.",
-    "recall@1": "share of the queries that were found in their right place.",
-    "R@100P": "recall at 100 % precision: share of the queries that can be accepted, in the order of their "
-    "scores, before the first wrong one.",
-    "bytes per place": "all that localizing needs, divided by the number of places.",
-    "P@100R": "precision at 100 % recall: share of the reported places that are right when every query "
-    "reports one.",
-    "rep.": "as above, with the recall that fits the figures of the paper, TP / (TP + FN), where a wrong "
-    "report is a false positive but not a miss as well.",
-}
-_BASELINES = "no map: the features of these frames are stored, and the most similar one is reported."
-_NULL = "control on shuffled frames, where nothing repeats: what it finds does not come from periods."
-_NULLS = "The first looks for periods anew, and may find none; the second keeps the periods of the map."
-_TRAINED = "It keeps the trained backbone."
 _LATE = (
     f"*: this curve starts at a recall above {LATE}, since many queries share the best score; nothing to the "
     "left of that counts as area"
@@ -170,22 +155,6 @@ def summary(report: Report) -> str:
     return ". ".join(lines) + "."
 
 
-def words_of(headings: list[str]) -> dict[str, str]:
-    """What the words in the headings of a table mean."""
-    return {word: text for word, text in _KEY.items() if any(word in heading for heading in headings)}
-
-
-def table_key(report: Report) -> dict[str, str]:
-    """What the words in the first table mean: those that it holds."""
-    rows, key = report.shown(), words_of(score_table(report)[0])
-    if any(one.k is not None for one in rows.values()):
-        key["all, every k-th frame"] = _BASELINES
-    if "null" in rows:
-        more = _NULLS if "null_same_plan" in rows else _TRAINED if report.facts.get("trained") else ""
-        key["null"] = f"{_NULL} {more}".strip()
-    return key
-
-
 def write_report(
     folder: Path,
     report: Report,
@@ -207,19 +176,18 @@ def write_report(
             temporary.write_bytes(data)
     for name in set(PICTURES) - set(pictures):
         (folder / f"{name}.png").unlink(missing_ok=True)
-    facts, key, every = report.facts, table_key(report), score_table(report, every=True)
-    more = {word: text for word, text in words_of(every[0]).items() if word not in key}
+    facts = report.facts
     _write_page(
         folder,
         title=title,
         lead=headline(report),
         notes=[summary(report)],
-        key=key,
         rows=score_table(report),
+        every_row=score_table(report, every=True),
+        contenders=report.contenders,
+        facts=facts,
         colours=[colour_of(one) for one in report.shown()],
         pictures=[(picture, _embedded(pngs[name])) for name, picture in pictures.items()],
-        every_score=every,
-        every_key=more | {"recall": facts["recall_definition"]},
         plan=plan,
         made_by=f"{command}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
     )
@@ -247,7 +215,6 @@ def write_index(
         title=title,
         notes=notes,
         links=pages,
-        key=words_of(rows[0]),
         rows=rows,
         pictures=[(picture, _embedded(as_png(picture)))],
         made_by=command,

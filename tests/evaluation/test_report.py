@@ -20,7 +20,6 @@ from dejavu_torch.evaluation.report import (
     headline,
     score_table,
     summary,
-    table_key,
     text_table,
     write_index,
     write_report,
@@ -155,15 +154,27 @@ def test_the_page_begins_with_plain_words() -> None:
     assert "None" not in headline(unscored) + summary(unscored)
 
 
-def test_the_key_explains_what_the_table_holds_and_no_more() -> None:
-    assert list(table_key(report())) == ["AUC", "recall@1", "R@100P"]
+def key(folder: Path, one: Report) -> dict[str, str]:
+    """What stands above the first table."""
+    above = written(folder, one).partition("<table")[0]
+    return dict(re.findall(r"<dt>([^<]+)</dt> <dd>([^<]+)</dd>", above))
+
+
+def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path: Path) -> None:
+    assert list(key(tmp_path, report())) == ["AUC", "recall@1", "R@100P"]
     null, frames = Contender("null", SCORES), Contender("all", SCORES, 100, 1)
-    one = report({"frames": 32}, uncompressed=frames, null=null, null_same_plan=null)
-    assert list(table_key(one))[3:] == ["bytes per place", "all, every k-th frame", "null"]
-    assert "second" in table_key(one)["null"]
-    trained = table_key(report({"trained": {"steps": 1}}, null=null))["null"]
+    found = key(tmp_path, report({"frames": 32}, uncompressed=frames, null=null, null_same_plan=null))
+    assert list(found)[3:] == ["bytes per place", "all, every k-th frame", "null"]
+    assert "second" in found["null"]
+    trained = key(tmp_path, report({"trained": {"steps": 1}}, null=null))["null"]
     assert "backbone" in trained
     assert "second" not in trained
+
+
+def test_the_words_of_the_last_table_are_explained_beside_it(tmp_path: Path) -> None:
+    below = written(tmp_path, report()).partition("all scores</h2>")[2]
+    assert re.findall(r"<dt>([^<]+)</dt>", below)[:3] == ["P@100R", "rep.", "recall"]
+    assert "TP / all</dd>" in below
 
 
 def test_report_json_has_the_facts_the_scores_and_an_entry_for_each_contender(tmp_path: Path) -> None:
