@@ -221,16 +221,16 @@ class TemplateMap(PlaceMap):
         """Features as the templates are made of and compared with: times `weights`. (n,D) -> (n,D)."""
         return features * self.weights if len(self.weights) else features
 
-    def distances(self, queries: Tensor) -> list[Tensor]:
-        """Eq. 3 for every layer: (Q,D) -> L tensors (Q,P)."""
+    def distances(self, queries: Tensor, layers: Sequence[int] | None = None) -> list[Tensor]:
+        """Eq. 3 for every layer, or for some by their positions in the plan: (Q,D) -> L tensors (Q,P)."""
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
             raise InputError(
                 f"the query features are {tuple(queries.shape)}; the map expects (Q, {self.dimension})"
             )
-        queries = self.weighted(queries)
+        queries, features, blocks = self.weighted(queries), self.layer_features(), self.blocks()
         return [
-            phase_distances(queries.index_select(1, index), block, self.metric)
-            for index, block in zip(self.layer_features(), self.blocks(), strict=True)
+            phase_distances(queries.index_select(1, features[j]), blocks[j], self.metric)
+            for j in (range(len(blocks)) if layers is None else layers)
         ]
 
     def combine(self, distances: Sequence[Tensor]) -> Tensor:

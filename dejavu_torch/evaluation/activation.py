@@ -1,4 +1,4 @@
-"""How often single layers, and their fusion, answer with the right phase (figure 17 of the paper)."""
+"""How single layers answer, and how often they, and their fusion, are right (figure 17 of the paper)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import counted, is_right
+from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.types import FrequencyLayer, GroundTruth
+
+DISTANCES_AT_ONCE = 2**22  # numbers of Q x P held at a time
 
 
 class Rate(NamedTuple):
@@ -52,6 +55,22 @@ class ActivationRates(NamedTuple):
         }
 
 
+def layer_distances(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
+    """Eq. 3 for one layer of the map, on the CPU: (Q,D) -> (Q,P)."""
+    with torch.no_grad():
+        (distances,) = route.distances(queries.to(route.templates.device), [j])
+    return distances.cpu()
+
+
+def best_phases(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
+    """The phase of one layer, among those its chunk has, nearest to each query: (Q,D) -> (Q,) int64."""
+    layer = route.plan[j]
+    present: Tensor = layer.place_phases.unique()
+    parts = queries.split(max(1, DISTANCES_AT_ONCE // max(layer.phases, queries.shape[1])))
+    nearest = [layer_distances(route, part, j)[:, present].argmin(1) for part in parts]
+    return present[torch.cat(nearest)]
+
+
 def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int) -> Tensor:
     """Whether the best phase of each query is the phase of any of these places, within the tolerance.
 
@@ -87,7 +106,7 @@ def activation_rates(
 
     For a layer, the rate is the share of the queries whose best phase (argmin over k of eq. 3) is
     within the tolerance of the phase of a right place (`in_phase`): inside, a right place in the
-    chunk; outside, any, with the phase it would have if the layer went on. Outside the layer learnt
+    chunk; outside, any, with the phase it would have if the layer went on. Outside the layer holds
     nothing: a rate near chance says that its period ends with the chunk, or slips there; a rate as
     inside, that it goes on. Chance is the share of phases within the tolerance of any one phase,
     (2 * tolerance + 1) / period where phases = period, at most 1.

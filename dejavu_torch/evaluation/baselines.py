@@ -13,7 +13,6 @@ from tqdm import tqdm
 from dejavu_torch.database.distance import Metric, phase_distances
 from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
-from dejavu_torch.features.extract import frame_shape
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.select import best_match
@@ -141,7 +140,7 @@ def hog_baselines(
 
     Nothing where the traverses hold ready features, or frames too small for HOG.
     """
-    if len(frame_shape(reference)) != 3:
+    if len(reference.frame_shape) != 3:
         return {}
     plain = DejaVu(batch_size=batch_size)
     try:

@@ -11,22 +11,12 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import PowerNorm
 from torch import Tensor
 
-from dejavu_torch.evaluation.plots import (
-    BLUE,
-    DARK,
-    GREY,
-    LABELLED,
-    LAYERS,
-    ORANGE,
-    WIDTH,
-    Plot,
-    canvas,
-    period_axis,
-)
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.plots import DARK, GREY, LABELLED, LAYERS, WIDTH, Plot, canvas, period_axis
 from dejavu_torch.periods.spectrogram import Spectrum
 from dejavu_torch.types import FrequencyLayer, InputError
 
-ROWS, CYCLES = 64, 100  # drawn at most
+ROWS, CYCLES, MARKED = 64, 100, 12  # templates, cycles and multiples of a period drawn at most
 _BESIDE = {  # a number next to a mark, readable on any colour
     "textcoords": "offset points",
     "va": "center",
@@ -140,7 +130,7 @@ def plot_spectrogram(
         for period in periods:
             middle = (start + right) / 2
             size = 11 if len(spectra) <= LABELLED else 3
-            below.plot(middle, period, "o", color=ORANGE, markersize=size, markerfacecolor="none")
+            below.plot(middle, period, "o", color=LAYERS[0], markersize=size, markerfacecolor="none")
             if len(spectra) <= LABELLED:
                 below.annotate(f"{period:.4g}", (middle, period), (10, 0), **_BESIDE)
     figure.colorbar(mesh, ax=below, label="% of its power", pad=0.01, aspect=30)
@@ -148,6 +138,29 @@ def plot_spectrogram(
     below.set(xlim=(0, len(values)), xlabel="place")
     below.set_title("power at each period, chunk by chunk; circles: kept", loc="left", fontsize=10)
     return figure, (above, below)
+
+
+def plot_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int = 0) -> Plot:
+    """How alike a feature is to itself some frames later (figure 1 (c) of the paper).
+
+    Args:
+        values: (n,) the feature along one chunk. periods: those the map keeps of it, frames.
+        feature: its number.
+
+    Convention: the biased autocorrelation of the feature minus its mean, 1 at lag 0.
+    """
+    figure, axis = canvas(3.4)
+    spectrum = torch.fft.rfft(values.double() - values.double().mean(), n=2 * len(values)).abs().square()
+    correlation = torch.fft.irfft(spectrum)[: len(values)]
+    axis.plot(correlation / correlation[0].clamp(min=1e-30), color=DARK, linewidth=1)
+    for period, colour in zip(periods, LAYERS, strict=False):
+        lags = [k * period for k in range(1, MARKED) if k * period < len(values)]
+        axis.vlines(lags, -1, 1, color=colour, linewidth=0.9, linestyle=":", label=f"multiples of {period:g}")
+    axis.set(xlim=(0, len(values)), ylim=(-1, 1.02), xlabel="lag (frames)", ylabel="autocorrelation")
+    axis.set_title(f"feature {feature} against itself", loc="left", fontsize=10)
+    if periods:
+        axis.legend(loc="upper right", ncols=2, frameon=False, fontsize=9)
+    return figure, axis
 
 
 def plot_templates(
@@ -177,7 +190,7 @@ def plot_templates(
         above.plot(x, y, color=GREY, linewidth=0.6, alpha=0.6)
     # phase k holds the frames that lie from k to k + 1 phases into their cycle
     phase = (torch.arange(layer.phases) + 0.5) * period / layer.phases - 0.5
-    above.plot(phase, templates[:, chosen], color=BLUE, linewidth=2.2)
+    above.plot(phase, templates[:, chosen], color=COLOURS["map"], linewidth=2.2)
     text = f"feature {number}, {len(cycles)} cycles of {period:.4g} frames; thick: {thick}"
     above.set_title(text, loc="left", fontsize=10)
     above.set(ylabel="value")
@@ -208,7 +221,8 @@ def plot_features(
     """HOG features that take part in a layer, on a frame of the route (figures 15 and 16 of the paper).
 
     Args:
-        frame: (C,H,W) in [0,1], of the size that HOG saw. layers: one picture each.
+        frame: (C,H,W) as HOG sees it, preprocessed and resized; shown from its darkest to its brightest
+            value where these lie outside [0,1]. layers: one picture each.
         orientations, cell, block: as HOG has them.
 
     Convention: each is drawn as the edge it responds to, across its gradient; the stronger the line, the
@@ -220,7 +234,9 @@ def plot_features(
     wide = 0.97 * WIDTH / columns
     figure, axes = canvas((min(2 * WIDTH, wide * height / width) + 0.36) * rows, rows, columns, squeeze=False)
     points = 72 * wide * cell / width  # a cell's side
-    grey = frame.mean(0).clamp(0, 1)
+    grey = frame.mean(0)
+    if grey.min() < 0 or grey.max() > 1:
+        grey = (grey - grey.min()) / (grey.max() - grey.min())
     for axis, layer, colour in zip(axes.flat, layers, LAYERS * len(layers), strict=False):
         axis.imshow(
             (0.35 + 0.65 * grey).numpy(), cmap="gray", vmin=0, vmax=1

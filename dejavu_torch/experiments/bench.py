@@ -17,7 +17,7 @@ import dejavu_torch
 from dejavu_torch.data.files import make_output_folder, whole_file
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
-from dejavu_torch.evaluation.bench_plot import plot_ratios
+from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.experiments.race import Row, Run, Runner, race
 from dejavu_torch.features.hog import hog
 from dejavu_torch.types import InputError

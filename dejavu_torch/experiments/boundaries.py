@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import counted, is_right
 from dejavu_torch.database.scores import Matcher
+from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import same_settings
-from dejavu_torch.evaluation.report import Contender, contend
 from dejavu_torch.experiments.compare import Comparison
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import GroundTruth, InputError, Match

@@ -17,15 +17,18 @@ from dejavu_torch.data.ground_truth import (
     ground_truth_in_places,
 )
 from dejavu_torch.data.positions import unit_of
+from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     count_queries,
     curve_of,
     threshold_of_full_precision,
 )
+from dejavu_torch.evaluation.match_plots import plot_coverage
 from dejavu_torch.evaluation.matches import read_matches
-from dejavu_torch.evaluation.plots import Picture, plot_coverage, plot_curves
-from dejavu_torch.evaluation.report import Report, contend
+from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.report import Report
+from dejavu_torch.evaluation.score_plots import plot_curves
 from dejavu_torch.model import read_place_map
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
@@ -98,13 +101,13 @@ def evaluate_file(
         "version": dejavu_torch.__version__,
         "torch": torch.__version__,
     }
-    pictures = _pictures(matches.name, queries, match, known, tolerance, places, unit)
     ours = contend(matches.name, match, known, tolerance)
+    pictures = _pictures(ours, queries, match, known, tolerance, places, unit)
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
 
 
 def _pictures(
-    name: str,
+    ours: Contender,
     queries: Tensor,
     match: Match,
     truth: GroundTruth,
@@ -114,10 +117,9 @@ def _pictures(
 ) -> dict[str, Picture]:
     if places is None:
         places = 1 + max(int(table.max()) for table in (match.index, truth.positives))
-    curves = {name: curve_of(match, truth, tolerance)}
     return {
         "pr": Picture(
-            plot_curves(curves, f"right within {tolerance} {unit}"),
+            plot_curves({"map": ours}, f"right within {tolerance} {unit}"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises.",
@@ -125,6 +127,6 @@ def _pictures(
         "coverage": Picture(
             plot_coverage(match, truth, tolerance, places, queries),
             "places reported",
-            "Where along the route each query was put. In its right place it is green, in a wrong one red.",
+            "Where along the route each query was found. In its right place it is green, in a wrong one red.",
         ),
     }

@@ -5,24 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import places_of_frames
-from dejavu_torch.database.template_map import Matcher
+from dejavu_torch.database.scores import Matcher
+from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.controls import leave_out_match, same_settings
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.report import Report, contend
-from dejavu_torch.evaluation.route_plots import (
-    Length,
-    plot_autocorrelogram,
-    plot_frames,
-    plot_layers,
-)
+from dejavu_torch.evaluation.pictures import Localization, paper_pictures
+from dejavu_torch.evaluation.report import Report
+from dejavu_torch.evaluation.score_plots import Length
 from dejavu_torch.experiments.boundaries import known_boundaries
 from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.pictures import best_explained, leading_layers
 from dejavu_torch.experiments.section_five import PUBLISHED
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
@@ -31,9 +25,6 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import InputError, Traverse
 
 LENGTHS = (256, 512, 1024, 2048)
-EXAMPLES = 4  # places of which frames are shown
-
-
 PATCH = (32, 32)  # pixels: as many rows as the region of ground has in a frame, and some more
 
 
@@ -121,11 +112,10 @@ def reproduce(
             "comparable": known.fixed_effect._asdict(),
             "known_boundaries": known.known_effect._asdict(),
         }
-    pictures = {
-        **_frames(result),
-        **result.pictures,
-        **_map_pictures(model, stored),
-    }
+    run = Localization(
+        *(model, result.reference, result.query, stored, result.seen, result.match, result.truth, tolerance)
+    )
+    pictures = paper_pictures(run) | dict(result.pictures)
     return result._replace(report=Report(result.report.ours, contenders, facts), pictures=pictures)
 
 
@@ -186,49 +176,3 @@ def structure_places(result: Comparison, cuts: Sequence[int]) -> list[int]:
         return list(cuts)
     places: list[int] = places_of_frames(torch.tensor(cuts), result.shown).unique().tolist()
     return places
-
-
-def _frames(result: Comparison) -> dict[str, Picture]:
-    """Frames of both traverses at the same places."""
-    if result.truth is None:
-        return {}
-    right, places, queries = result.truth.positives, [], []
-    for k in range(EXAMPLES):
-        apart = (right - len(result.stored) * (k + 0.5) / EXAMPLES).abs()
-        queries.append(int(torch.where(right >= 0, apart, torch.inf).amin(1).argmin()))
-        places.append(int(right[queries[-1]].max()))
-    first = torch.cat([next(result.reference.between(n, n + 1)) for n in places])
-    second = torch.cat([next(result.query.between(n, n + 1)) for n in queries])
-    return {
-        "frames": Picture(
-            plot_frames(first, second, places),
-            "the route",
-            "The same places on the reference and on the second traverse.",
-        )
-    }
-
-
-def _map_pictures(model: DejaVu, stored: Tensor) -> dict[str, Picture]:
-    """The autocorrelogram of one feature, and the phases of the layers of one chunk."""
-    leading = leading_layers(model.map.plan)
-    if not leading:
-        return {}
-    layer = model.map.plan[leading[0]]
-    chosen = best_explained(stored, layer, model.map.blocks()[leading[0]].detach().cpu())
-    feature = layer.features[chosen]
-    chunk = [p for p in model.map.plan if (p.start, p.stop) == (layer.start, layer.stop)]
-    kept = [float(p.period) for p in chunk if feature in p.features]
-    return {
-        "autocorrelogram": Picture(
-            plot_autocorrelogram(stored[layer.start : layer.stop, feature].cpu(), kept, feature),
-            "a feature against itself",
-            "How alike a feature is to itself so many frames later: where it repeats, it is high at every "
-            "multiple of its period.",
-        ),
-        "layers": Picture(
-            plot_layers(chunk),
-            "layers and their phases",
-            "One chunk of the map: a row a layer, the colour its phase. A column of phases names a place; "
-            "the next place where all are the same is the least common multiple of the periods away.",
-        ),
-    }

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
-from dejavu_torch.evaluation.route_plots import Length, plot_lengths
+from dejavu_torch.evaluation.score_plots import Length, plot_lengths
 
 
 class Published(NamedTuple):

@@ -39,7 +39,7 @@ def test_scores_of_a_route_that_repeats(model: DejaVu) -> None:
     # lcm(12, 20) = 60: of four places that look alike the first is reported
     assert report["recall_at_1"] == pytest.approx(60 / 240, abs=0.15)
     assert report["uncompressed"]["bytes"] == 240 * 60 * 4
-    pictures = {"pr", "auc", "coverage", "chunks", "spectrogram", "templates", "activations"}
+    pictures = {"coverage", "scores", "pr", "auc", "chunks", "spectrogram", "templates", "activations"}
     assert set(result.pictures) == pictures
     assert 0 <= report["activations"]["fused"]["inside"] <= 1
 

@@ -14,7 +14,10 @@ from dejavu_torch import DejaVu
 from dejavu_torch.cli import main
 
 README = Path(__file__).parents[2] / "README.md"
-PICTURES = ("pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations")
+PICTURES = (
+    *("pairs", "coverage", "scores", "pr", "auc", "chunks"),
+    *("spectrogram", "templates", "features", "activations"),
+)
 SCORES = {
     "auc",
     "auc_reported",
@@ -84,7 +87,7 @@ def test_pictures_show_something(demo: Path) -> None:
 
 def test_page_is_self_contained(demo: Path) -> None:
     page = (demo / "index.html").read_text()
-    assert page.count("data:image/png;base64,") == 8
+    assert page.count("data:image/png;base64,") == len(PICTURES)
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "right within 5 frames" in page
     assert "null: all learnt shuffled" in page

@@ -173,7 +173,7 @@ def test_report_of_an_evaluation(tmp_path: Path) -> None:
         "matches &lt;judged&gt;",
         "5 queries; right within 3 frames of the truth (",
         "truth.csv). 4 of the queries are in the truth. ",
-        "Of 4 judged 3 are accepted, 2 rightly.",
+        "Of 4 scored 3 are accepted, 2 correctly.",
         "<pre>dejavu evaluate matches.csv",
         "precision and recall</h2>",
         "In its right place it is green",

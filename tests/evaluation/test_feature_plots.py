@@ -1,146 +1,29 @@
-"""What is drawn, read back from the figures."""
+"""Pictures of single features, read back from the figures."""
 
 from __future__ import annotations
 
-import io
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
+from drawn import render, texts
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
-from PIL import Image
 from torch import Tensor
 
 from dejavu_torch import HOG, hog
 from dejavu_torch.evaluation.feature_plots import (
     edges_seen,
     hog_parts,
+    plot_autocorrelogram,
     plot_features,
     plot_spectrogram,
     plot_templates,
 )
-from dejavu_torch.evaluation.plots import (
-    WIDTH,
-    plot_activations,
-    plot_auc,
-    plot_chunks,
-    plot_coverage,
-    plot_curves,
-)
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, PRCurve
-
-
-def layer(period: Fraction | int, start: int, stop: int, features: int = 2) -> FrequencyLayer:
-    return FrequencyLayer(Fraction(period), int(period), start, stop, tuple(range(features)))
-
-
-def render(figure: Figure) -> Image.Image:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    assert figure.get_figwidth() == WIDTH
-    return Image.open(buffer).convert("RGB")
-
-
-def told(figure: Figure) -> list[str]:
-    """Every text of a figure that says something."""
-    render(figure)
-    return [text.get_text() for text in figure.findobj(match=lambda one: hasattr(one, "get_text"))]
-
-
-def matched(*index: int) -> Match:
-    place = torch.tensor(index)
-    return Match(place, torch.zeros(len(place)), place >= 0)
-
-
-def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
-    """The points of each group of a coverage plot by its label."""
-    return {
-        line.get_label(): list(zip(*(map(float, part) for part in line.get_data()), strict=True))
-        for line in axis.lines  # type: ignore[attr-defined]
-    }
-
-
-def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
-    figure, axis = plot_coverage(matched(0, 9, -1, 4), torch.arange(4)[:, None], tolerance=1, places=10)
-    assert dots(axis) == {
-        "1 wrong": [(1, 9)],
-        "2 right (within 1 places)": [(0, 0), (3, 4)],
-        "1 not reported": [(2, 0)],
-    }
-    render(figure)
-
-
-def test_coverage_leaves_grey_what_is_not_judged() -> None:
-    right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
-    truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
-    figure, axis = plot_coverage(
-        matched(0, 1, 7, -1, 9), truth, 0, 10, queries=torch.tensor([10, 20, 30, 40, 50])
-    )
-    assert dots(axis) == {
-        "3 not judged": [(20, 1), (30, 7)],
-        "1 wrong": [(50, 9)],
-        "1 right (within 0 places)": [(10, 0)],
-    }
-    assert axis.get_xlim() == (10, 50)
-    assert "3 not judged" in told(figure)
-
-
-def test_coverage_without_truth_or_of_one_query() -> None:
-    figure, axis = plot_coverage(matched(3), None, 5, 10)
-    assert dots(axis) == {"1 reported": [(0, 3)]}
-    render(figure)
-
-
-def test_auc_bars_are_as_long_as_the_areas_in_the_colours_of_the_curves() -> None:
-    areas = {"this map": 0.75, "null: shuffled": 0.0}
-    figure, axis = plot_auc(areas)
-    assert [bar.get_width() for bar in axis.patches] == [0.75, 0.0]
-    assert {"this map", "0.750", "null: shuffled", "0.000"} <= set(told(figure))
-    curve = PRCurve(*torch.rand(3, 4, dtype=torch.float64))
-    _, other = plot_curves(dict.fromkeys(areas, curve))
-    assert axis.patches[0].get_facecolor()[:3] == pytest.approx(_rgb(other.lines[0]))
-
-
-def _rgb(line: object) -> tuple[float, ...]:
-    colour = line.get_color().lstrip("#")  # type: ignore[attr-defined]
-    return tuple(int(colour[j : j + 2], 16) / 255 for j in (0, 2, 4))
-
-
-def test_a_curve_that_reports_nothing_says_so() -> None:
-    figure, _ = plot_curves({"null: x": PRCurve(*[torch.zeros(0)] * 3)})
-    assert "null: x (reports nothing)" in told(figure)
-
-
-def test_chunks_are_drawn_at_their_periods() -> None:
-    plan = (layer(93, 0, 512, 4), layer(171, 0, 512), layer(Fraction(195, 2), 512, 1024))
-    figure, axis = plot_chunks(plan, 1024)
-    drawn = {tuple(map(tuple, part.get_segments()[0].tolist())) for part in axis.collections}
-    assert drawn == {
-        ((0, 93), (512, 93)),
-        ((0, 171), (512, 171)),
-        ((512, 97.5), (1024, 97.5)),
-    }
-    assert {"93", "171", "97.5", "widest bar: 4 features"} <= set(told(figure))
-
-
-def test_chunks_of_a_route_without_layers() -> None:
-    assert "this route does not repeat: no layers" in told(plot_chunks((), 100)[0])
-
-
-def test_activations_show_the_scores_and_mark_the_best() -> None:
-    layers, scores = (layer(4, 8, 16), layer(2, 8, 16)), torch.rand(2, 8)
-    figure, rows = plot_activations(layers, scores, scores.sum(0), 5, [11], torch.rand(3, 6, 8))
-    for axis, values in zip(rows[1:], (*scores, scores.sum(0)), strict=True):
-        curve, best = axis.lines[:2]
-        assert curve.get_xdata().tolist() == list(range(8, 16))
-        assert curve.get_ydata().tolist() == values.tolist()
-        assert float(best.get_xdata()[0]) == 8 + int(values.argmin())
-    assert {"period 4, 2 features", "all layers fused", "true place"} <= set(told(figure))
+from dejavu_torch.types import FrequencyLayer
 
 
 def wave(period: float, frames: int = 256) -> Tensor:
@@ -160,7 +43,7 @@ def test_spectrogram_is_darkest_at_the_period(hop: int | None) -> None:
         assert power.max() == pytest.approx(100 * 2 / 3, rel=1e-3)  # what a pure wave holds under Hann
     starts = [float(mesh.get_coordinates()[0, 0, 0]) for mesh in below.collections]
     assert starts == [start for start, _, _ in spectra]
-    assert "feature 7 through time" in told(figure)
+    assert "feature 7 through time" in texts(figure)
 
 
 def test_spectrogram_of_a_long_or_constant_feature() -> None:
@@ -189,7 +72,7 @@ def test_templates_lie_over_the_frames_they_are_the_mean_of() -> None:
     assert mean.get_xdata().tolist() == mean.get_ydata().tolist() == [0, 1, 2, 3, 4]
     assert below.images[0].get_array().shape == (2, 5)
     assert [label.get_text() for label in below.get_yticklabels()] == ["4"]
-    assert "feature 4, 3 cycles of 5 frames; thick: their mean" in told(figure)
+    assert "feature 4, 3 cycles of 5 frames; thick: their mean" in texts(figure)
 
 
 @pytest.mark.parametrize(("period", "phases"), [(Fraction(15, 2), 3), (Fraction(2), 1), (Fraction(8), 8)])
@@ -208,7 +91,7 @@ def test_of_many_cycles_some_are_drawn() -> None:
     one = FrequencyLayer(Fraction(2), 2, 0, 500, (0,))
     figure, (above, _) = plot_templates(one, torch.rand(500), torch.rand(2, 1), 0, "a line")
     assert 50 <= len(above.lines) - 1 <= 100
-    assert "feature 0, 250 cycles of 2 frames; thick: a line" in told(figure)
+    assert "feature 0, 250 cycles of 2 frames; thick: a line" in texts(figure)
 
 
 LAYOUTS = st.tuples(
@@ -293,3 +176,18 @@ def test_features_are_drawn_on_a_frame_of_any_shape(shape: tuple[int, int, int])
         assert np.array_equal(lines.get_segments(), seen)
         image = render(figure)
         assert image.width < 6 * image.height
+
+
+def test_a_feature_that_repeats_is_like_itself_a_period_later() -> None:
+    wave = torch.sin(torch.arange(600) * 2 * torch.pi / 50)
+    plot = plot_autocorrelogram(wave, [50.0])
+    render(plot[0])
+    line = plot[1].lines[0].get_ydata()
+    assert line[0] == pytest.approx(1)
+    assert line[50] == pytest.approx(550 / 600, abs=0.01)  # biased: as many frames less
+    assert line[25] == pytest.approx(-575 / 600, abs=0.01)
+
+
+def test_a_constant_feature_has_no_autocorrelation() -> None:
+    line = plot_autocorrelogram(torch.ones(64), [])[1].lines[0].get_ydata()
+    assert torch.tensor(line).isfinite().all()

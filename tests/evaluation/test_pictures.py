@@ -9,19 +9,28 @@ from dejavu_torch.experiments.others import Other
 from helpers import Fixed
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, SlidingWindow, SpectrogramAnalysis
-from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
-from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.experiments.pictures import (
+from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, Preprocess, SlidingWindow, SpectrogramAnalysis
+from dejavu_torch.data.truth import as_truth, offset_truth
+from dejavu_torch.evaluation.activation import best_phases
+from dejavu_torch.evaluation.contenders import contend
+from dejavu_torch.evaluation.pictures import (
+    Localization,
+    as_hog_sees,
     best_explained,
-    best_phases,
     draw_pictures,
     leading_layers,
+    paper_pictures,
     slit_scan,
 )
+from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.report import PICTURES
 from dejavu_torch.types import FrequencyLayer, GroundTruth
 
-ALL = ["pr", "auc", "coverage", "chunks", "spectrogram", "templates", "features", "activations"]
+ALL = [
+    *("pairs", "coverage", "scores", "pr", "auc", "chunks"),
+    *("spectrogram", "templates", "features", "activations"),
+]
+UNSCORED = [name for name in ALL if name not in ("pr", "auc")]
 
 
 def layer(period: int, start: int, stop: int, *features: int) -> FrequencyLayer:
@@ -38,14 +47,21 @@ def frames(seed: int, length: int = 120, channels: int = 1) -> Tensor:
     return 0.9 * stripes[:, None] + 0.1 * noise
 
 
+def localized(model: DejaVu, reference: Tensor, query: Tensor, truth: GroundTruth | None) -> Localization:
+    traverses = ArrayTraverse(reference), ArrayTraverse(query)
+    stored, seen = (model.extract_all(traverse) for traverse in traverses)
+    model.learn_features(stored)
+    return Localization(model, *traverses, stored, seen, model.localize(seen), truth, 2)
+
+
 def drawn(
     model: DejaVu, reference: Tensor, query: Tensor, truth: GroundTruth | None, **found: Match
 ) -> dict[str, Picture]:
-    traverse = ArrayTraverse(reference)
-    stored, seen = model.extract_all(traverse), model.extract_all(ArrayTraverse(query))
-    model.learn_features(stored)
-    others = {key: Other(f"the {key}", match) for key, match in found.items()}
-    pictures = draw_pictures(model, traverse, stored, seen, model.localize(seen), truth, 2, others)
+    run = localized(model, reference, query, truth)
+    contenders = {"map": contend("this map", run.match, truth, 2)}
+    contenders |= {key: contend(f"the {key}", match, truth, 2) for key, match in found.items()}
+    pictures = draw_pictures(run, contenders)
+    assert pictures.keys() <= set(PICTURES)
     for picture in pictures.values():
         buffer = io.BytesIO()
         picture.plot[0].savefig(buffer, format="png")
@@ -97,7 +113,7 @@ def test_the_rates_are_those_of_the_layers_they_stand_beside() -> None:
 
 def test_without_truth_nothing_is_scored() -> None:
     pictures = drawn(short(), frames(0), frames(1)[:50], None)
-    assert list(pictures) == ALL[2:]
+    assert list(pictures) == UNSCORED
     assert pictures["activations"].numbers == {}
 
 
@@ -114,24 +130,28 @@ def test_a_truth_that_judges_nothing_gives_no_curve() -> None:
     pictures = drawn(
         short(), frames(0), frames(1), GroundTruth(right, torch.ones(120, dtype=torch.bool), soft)
     )
-    assert list(pictures) == ALL[2:]
+    assert list(pictures) == UNSCORED
 
 
 def test_a_route_without_layers_keeps_what_needs_none() -> None:
     pictures = drawn(DejaVu(periods=Fixed()), frames(0), frames(1), same_places())
-    assert list(pictures) == ["pr", "auc", "coverage", "chunks"]
+    assert list(pictures) == ["coverage", "pr", "auc", "chunks"]
 
 
 def test_ready_features_have_no_frame_to_draw_on() -> None:
     made = [HOG()(frames(seed)) for seed in (0, 1)]
-    assert list(drawn(short(), *made, same_places())) == [name for name in ALL if name != "features"]
+    assert list(drawn(short(), *made, same_places())) == [
+        name for name in ALL if name not in ("pairs", "features")
+    ]
 
 
 def test_one_layer_has_no_partner() -> None:
     model = DejaVu(periods=Fixed(layer(12, 0, 120, 0, 1, 2)))
     pictures = drawn(model, frames(0), frames(1), same_places())
     # the spectrogram is that of SpectrogramAnalysis
-    assert list(pictures) == ["pr", "auc", "coverage", "chunks", "templates", "features"]
+    assert list(pictures) == [
+        *("pairs", "coverage", "scores", "pr", "auc", "chunks", "templates", "features")
+    ]
 
 
 def test_features_are_drawn_for_our_hog_only() -> None:
@@ -141,6 +161,46 @@ def test_features_are_drawn_for_our_hog_only() -> None:
     for module in (Other(), nn.Sequential(nn.AvgPool2d(2), nn.Flatten())):
         model = DejaVu(module, SpectrogramAnalysis(window=60, min_period=4))
         assert "features" not in drawn(model, frames(0), frames(1), None)
+
+
+def test_the_pairs_are_the_frames_that_were_matched() -> None:
+    reference, query = frames(0), frames(1)
+    run = localized(short(), reference, query, same_places())
+    pairs = draw_pictures(run, {})["pairs"]
+    numbers = [int(axis.get_title(loc="left").split()[-1]) for axis in pairs.plot[1].flat]
+    sources = [query, reference, reference] * len(pairs.plot[1])
+    for axis, number, source in zip(pairs.plot[1].flat, numbers, sources, strict=True):
+        assert torch.allclose(torch.tensor(axis.images[0].get_array())[..., 0], source[number, 0])
+    for asked, reported in zip(numbers[::3], numbers[1::3], strict=True):
+        assert int(run.match.index[asked]) == reported
+    assert "No threshold rejects any" in pairs.caption
+    strict = run._replace(match=run.match._replace(accepted=run.match.accepted & False))
+    assert "best match that the threshold rejects" in draw_pictures(strict, {})["pairs"].caption
+
+
+def test_the_score_matrix_is_the_map_s() -> None:
+    run = localized(short(), frames(0), frames(1), same_places())
+    values = draw_pictures(run, {})["scores"].plot[1].images[0].get_array()
+    best = torch.tensor(values).argmin(0)
+    assert torch.equal(best, run.match.index)
+
+
+def test_the_paper_s_own_pictures() -> None:
+    run = localized(short(), frames(0), frames(1), same_places())
+    assert list(paper_pictures(run)) == ["frames", "autocorrelogram", "layers"]
+    assert list(paper_pictures(run._replace(truth=None))) == ["autocorrelogram", "layers"]
+    nothing = localized(DejaVu(periods=Fixed()), frames(0), frames(1), same_places())
+    assert list(paper_pictures(nothing)) == ["frames"]
+    features = localized(short(), *(HOG()(frames(seed)) for seed in (0, 1)), same_places())
+    assert list(paper_pictures(features)) == ["autocorrelogram", "layers"]
+
+
+def test_the_frame_under_the_features_is_what_hog_sees() -> None:
+    hog = HOG(cell=4, resize=(17, 41))
+    model, frame = DejaVu(hog, preprocess=Preprocess(channel="R-B", contrast="patch")), torch.rand(3, 50, 60)
+    seen = as_hog_sees(model, frame)
+    assert seen.shape == (1, 17, 41)
+    assert torch.equal(HOG(cell=4)(seen[None]), model.pipeline(frame[None]))
 
 
 def test_features_are_drawn_on_the_frame_as_hog_resizes_it() -> None:

@@ -1,0 +1,90 @@
+"""What stands side by side in a report: ways to store a route, their scores, and a fixed colour for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from dejavu_torch.data.ground_truth import as_ground_truth, counted
+from dejavu_torch.evaluation.curves import Scores, curve_of, evaluate
+from dejavu_torch.types import GroundTruth, Match, PRCurve
+
+# Told apart by the colour-blind where they share a picture; keys are those of report.json, `map` is ours.
+COLOURS = {
+    "map": "#0072b2",
+    "uncompressed": "#222222",
+    "stride": "#f2b80f",
+    "stride_coarsest": "#c21f0a",
+    "interpolated": "#5d0b81",
+    "hog": "#10b248",
+    "hog_stride_coarsest": "#8fdccb",
+    "null": "#adadad",
+    "null_same_plan": "#785567",
+    "leave_out": "#8c6d1f",
+    "ideal": "#56b4e9",
+    "ideal_leave_out": "#9ecae1",
+    "comparable": "#4a6fe3",
+    "known_boundaries": "#1b2a6b",
+}
+
+
+def colour_of(key: str) -> str:
+    """The colour of a contender by its key; dark grey for one that has none of its own."""
+    return COLOURS.get(key, "#555555")
+
+
+class Contender(NamedTuple):
+    """One way to store the route, how well it is recognised, and what it costs.
+
+    scores, curve: None where there is no ground truth. bytes: None where nothing is stored, as by a null.
+    k: where every k-th frame is stored.
+    """
+
+    name: str
+    scores: Scores | None
+    bytes: int | None = None
+    k: int | None = None
+    curve: PRCurve | None = None
+
+    @property
+    def starts(self) -> float | None:
+        """Recall at which the curve starts: that of all queries that share the best score."""
+        return float(self.curve.recall[0]) if self.curve and len(self.curve.recall) else None
+
+    def as_json(self) -> dict[str, Any]:
+        """The nested entry of report.json."""
+        scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
+        extra = {"bytes": self.bytes, "k": self.k, "curve_starts_at_recall": self.starts}
+        return scores | {name: value for name, value in extra.items() if value is not None}
+
+
+def contend(
+    name: str,
+    match: Match,
+    truth: Tensor | GroundTruth | None,
+    tolerance: int,
+    bytes: int | None = None,
+    k: int | None = None,
+) -> Contender:
+    """Matches as a contender, without scores where there is no ground truth or no query that it scores."""
+    if truth is None or not counted(match.index, as_ground_truth(truth), tolerance).any():
+        return Contender(name, None, bytes, k)
+    scores, curve = evaluate(match, truth, tolerance), curve_of(match, truth, tolerance)
+    return Contender(name, scores, bytes, k, curve)
+
+
+def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
+    """Contenders without those that store the same frames as one before.
+
+    Example:
+        >>> row = Contender("every 2nd frame", None, bytes=100, k=2)
+        >>> list(distinct({"stride": row, "stride_coarsest": row, "null": Contender("null", None)}))
+        ['stride', 'null']
+    """
+    kept: dict[str, Contender] = {}
+    for key, one in contenders.items():
+        if one.k is None or (one.k, one.bytes) not in [(other.k, other.bytes) for other in kept.values()]:
+            kept[key] = one
+    return kept

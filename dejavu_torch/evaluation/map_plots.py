@@ -1,0 +1,132 @@
+"""Pictures of a map: its chunks, its layers, and how they answer a query; each returns (figure, axes)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.evaluation.activation import ActivationRates
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.plots import (
+    DARK,
+    GREY,
+    LABELLED,
+    LAYERS,
+    WRONG,
+    Plot,
+    canvas,
+    period_axis,
+    pixels,
+)
+from dejavu_torch.types import FrequencyLayer, Plan
+
+SHOWN = 12  # layers of a chunk
+BLUE = COLOURS["map"]
+
+
+def plot_chunks(plan: Plan, places: int) -> Plot:
+    """Chunks along the route and the periods found in each; the wider a bar, the more features."""
+    figure, axis = canvas(4.2)
+    axis.set(xlim=(0, places), xlabel="place", ylabel="period (frames)")
+    if not plan:
+        axis.set(yticks=[])
+        axis.text(0.5, 0.5, "this route does not repeat: no layers", ha="center", transform=axis.transAxes)
+        return figure, axis
+    most = max(len(layer.features) for layer in plan)
+    chunks = sorted({(layer.start, layer.stop) for layer in plan})
+    for start, stop in chunks:
+        members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
+        for layer in members:
+            share = len(layer.features) / most
+            style = {"linewidth": 0.6 + 7 * share, "alpha": 0.35 + 0.65 * share}
+            axis.hlines(float(layer.period), start, stop, color=BLUE, **style)
+        leading = sorted(members, key=lambda layer: -len(layer.features))[:2]
+        for layer, along in zip(leading, (0.3, 0.7), strict=False):
+            if len(chunks) <= LABELLED:
+                text = f"{float(layer.period):.4g}"
+                box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
+                where = start + along * (stop - start), float(layer.period)
+                axis.text(*where, text, fontsize=9, ha="center", va="center_baseline", bbox=box)
+    for edge in {edge for chunk in chunks for edge in chunk}:
+        axis.axvline(edge, color=GREY, linewidth=0.8, linestyle=":")
+    periods = [float(layer.period) for layer in plan]
+    period_axis(axis, min(periods) / 1.2, max(periods) * 1.2)
+    axis.set_title(f"widest bar: {most} features", fontsize=10, loc="left")
+    return figure, axis
+
+
+def plot_layers(layers: Sequence[FrequencyLayer]) -> Plot:
+    """Layers of one chunk and their phases along it (figure 2 of the paper).
+
+    Convention: one row a layer, those of most features, by period; the colour is the phase, so that a
+    column of colours is what names a place.
+    """
+    shown = sorted(sorted(layers, key=lambda layer: -len(layer.features))[:SHOWN], key=lambda p: p.period)
+    start, stop = shown[0].start, shown[0].stop
+    figure, axis = canvas(0.24 * len(shown) + 1.5)
+    phases = torch.stack([layer.place_phases / layer.phases for layer in shown])
+    extent = (start - 0.5, stop - 0.5, len(shown) - 0.5, -0.5)
+    image = axis.imshow(
+        phases.numpy(), aspect="auto", extent=extent, cmap="twilight", vmin=0, vmax=1, interpolation="nearest"
+    )
+    axis.set_yticks(range(len(shown)), [f"{float(layer.period):.4g}" for layer in shown])
+    axis.set(xlabel="place", ylabel="period (frames)")
+    axis.set_title(f"phase in {len(shown)} of {len(layers)} layers", loc="left", fontsize=10)
+    figure.colorbar(image, ax=axis, label="phase / period", pad=0.01, aspect=20)
+    return figure, axis
+
+
+def plot_activations(
+    layers: Sequence[FrequencyLayer],
+    scores: Sequence[Tensor],
+    fused: Tensor,
+    query: int,
+    places: Sequence[int] = (),
+    strip: Tensor | None = None,
+    rates: ActivationRates | None = None,
+) -> Plot:
+    """Scores of one query over a chunk: two layers, and all layers fused (figure 17 of the paper).
+
+    Args:
+        layers: two layers of one chunk. scores: for each (n,) eq. 3 at the chunk's places.
+        fused: (n,) eq. 4 at the same places. query: number of the query frame.
+        places: its right places, marked.
+        strip: (C,H,n) one image column for each place, drawn above; None leaves it out.
+        rates: how often each is right, written above it; None leaves it out.
+    """
+    start, stop = layers[0].start, layers[0].stop
+    figure, rows = canvas(4.7 if strip is None else 5.8, len(layers) + 1 + (strip is not None), sharex=True)
+    axes = rows[-len(layers) - 1 :]
+    if strip is not None:
+        rows[0].imshow(pixels(strip), extent=(start, stop, 0, 1), aspect="auto")
+        rows[0].set_yticks([])
+        rows[0].set_title("middle image column of each frame", loc="left", fontsize=10)
+    names = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
+    texts = [""] * len(axes) if rates is None else [rate.describe() for rate in (*rates.layers, rates.fused)]
+    drawn = zip(
+        axes,
+        [*names, "all layers fused"],
+        texts,
+        [*scores, fused],
+        [*LAYERS[: len(layers)], BLUE],
+        strict=True,
+    )
+    where = torch.arange(start, stop)
+    for axis, name, text, values, colour in drawn:
+        axis.plot(where, values, color=colour, linewidth=1.1)
+        best = int(values.argmin())
+        style = {"color": WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
+        axis.plot(where[best], values[best], "v", **style)
+        axis.set_title(f"{name}: {text}" if text else name, loc="left", fontsize=10)
+        axis.set_yticks([])
+    for axis in rows:
+        for place in places:
+            axis.axvline(place, color=DARK, linewidth=0.9, linestyle="--", label="true place")
+    handles, labels = axes[-1].get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
+    figure.supylabel(f"difference of query {query} (lower is better)", fontsize=10)
+    rows[-1].set(xlabel="place", xlim=(start, stop))
+    return figure, rows

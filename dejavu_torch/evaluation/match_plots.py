@@ -1,0 +1,233 @@
+"""Pictures of queries and the places reported for them; each returns (figure, axes)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, WIDTH, WRONG, Plot, canvas, pixels, show_frame
+from dejavu_torch.types import GroundTruth, Match
+
+CELLS = 400  # rows and columns of a score matrix, at most
+LINES = 8  # about as many right places of a query are drawn
+SCORES_AT_ONCE = 2**22  # numbers of Q x N held at a time
+
+
+class Example(NamedTuple):
+    """A query worth showing: why, its number, the place reported, and the nearest right place.
+
+    right is -1 where no right place is known.
+    """
+
+    why: str
+    query: int
+    place: int
+    right: int = -1
+
+
+class ScoreMatrix(NamedTuple):
+    """Scores of queries at places, small enough to draw.
+
+    query: (h,) the number of each row's query. values: (h,w) in [0,1], 0 at the query's best score, 1 at its
+    median and above, NaN where nothing covers; each the least of `block` neighbouring places. places: N.
+    """
+
+    query: Tensor
+    values: Tensor
+    block: int
+    places: int
+
+
+def plot_frames(first: Tensor, second: Tensor, numbers: Sequence[int]) -> Plot:
+    """Frames of both traverses at the same places (figures 5 to 7 of the paper).
+
+    Shape: first, second (K,C,H,W) in [0,1]; numbers: K places.
+    """
+    height, width = first.shape[-2:]
+    most = max(1, min(len(numbers), round(2 + 2 * height / width)))  # wide frames need room
+    columns = next(n for n in range(most, 0, -1) if len(numbers) % n == 0)
+    rows = -(-len(numbers) // columns)
+    side = WIDTH / columns * height / width
+    figure, axes = canvas(2 * rows * (side + 0.28), 2 * rows, columns, squeeze=False)
+    for k, number in enumerate(numbers):
+        for below, frames, name in ((0, first, "reference"), (1, second, "second")):
+            show_frame(axes[2 * (k // columns) + below, k % columns], frames[k], f"{name}, place {number}")
+    return figure, axes
+
+
+def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> list[Example]:
+    """The queries that `plot_pairs` shows: the surest right, the surest wrong, and one at the threshold.
+
+    The last is the surest that the threshold rejects, or, where it rejects none, the least sure of all.
+    Without ground truth the surest of all stands for the first two. A query that is several of these is one
+    example.
+
+    Example:
+        >>> match = Match(torch.tensor([0, 9]), torch.tensor([0.1, 0.2]), torch.tensor([True, False]))
+        >>> for example in example_matches(match, as_ground_truth(torch.tensor([[0], [1]])), tolerance=0):
+        ...     print(example)
+        Example(why='surest right answer, score 0.1', query=0, place=0, right=0)
+        Example(why='surest wrong answer, first above the threshold, score 0.2', query=1, place=9, right=1)
+    """
+    reported = match.index >= 0
+    rejected = reported & ~match.accepted
+    if truth is None:
+        groups = {"surest answer": reported}
+    else:
+        scored = reported & counted(match.index, truth, tolerance)
+        right = is_right(match.index, truth.positives, tolerance)
+        groups = {"surest right answer": scored & right, "surest wrong answer": scored & ~right}
+    if rejected.any():
+        groups["first above the threshold"] = rejected
+    else:
+        groups["least sure answer"] = reported
+    reasons: dict[int, list[str]] = {}
+    for why, group in groups.items():
+        if group.any():
+            sign = -1 if why.startswith("least") else 1
+            query = int(torch.where(group, sign * match.score, torch.inf).argmin())
+            reasons.setdefault(query, []).append(why)
+    examples = []
+    for query, whys in reasons.items():
+        place, nearest = int(match.index[query]), -1
+        if truth is not None and truth.judged[query] and (truth.positives[query] >= 0).any():
+            positives = truth.positives[query][truth.positives[query] >= 0]
+            nearest = int(positives[(positives - place).abs().argmin()])
+        text = f"{', '.join(whys)}, score {float(match.score[query]):.3g}"
+        examples.append(Example(text, query, place, nearest))
+    return examples
+
+
+def plot_pairs(examples: Sequence[Example], frames: Sequence[Sequence[Tensor]]) -> Plot:
+    """Queries beside the reference frames that were reported for them, and those that are right.
+
+    Args:
+        examples: see `example_matches`; a row each.
+        frames: for each the frames (C,H,W) of the query, of the reported place and, where it is known, of the
+            right place.
+    """
+    columns = max(len(row) for row in frames)
+    sides = [max(frame.shape[1] / frame.shape[2] for frame in row) for row in frames]
+    height = sum(WIDTH / columns * side + 0.45 for side in sides)
+    figure, axes = canvas(height, len(examples), columns, squeeze=False, height_ratios=sides)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for row, (one, shown) in enumerate(zip(examples, frames, strict=True)):
+        right = "none is known" if one.right < 0 else f"place {one.right}"
+        titles = (f"query {one.query}", f"reported: place {one.place}", f"right: {right}")
+        for axis, title in zip(axes[row], titles, strict=False):
+            axis.set_title(f"\n{title}", loc="left", fontsize=9, pad=3)  # the empty line is for the heading
+        for axis, frame in zip(axes[row], shown, strict=False):
+            axis.imshow(pixels(frame))
+        heading = axes[row, 0].annotate(
+            one.why, (0, 1), (0, 15), "axes fraction", "offset points", weight="bold"
+        )
+        heading.set(fontsize=9, in_layout=False)
+    return figure, axes
+
+
+def score_matrix(
+    scores: Callable[[Tensor], Tensor], queries: Tensor, cells: int = CELLS
+) -> ScoreMatrix | None:
+    """Scores of queries at all places, brought to at most `cells` rows and columns; None where all are +inf.
+
+    Args:
+        scores: query features (q,D) -> (q,N), lower is better.
+        queries: (Q,D) features; of more than `cells` every k-th is used.
+
+    Convention: only a few rows of Q x N are held at a time. Each query is scaled by itself, from its best
+        score to its median, since scores grow with all that a query has in no place.
+    """
+    chosen = torch.arange(0, len(queries), -(-len(queries) // cells))
+    rows: list[Tensor] = []
+    at_once, block, places = 1, 1, 0
+    done = 0
+    while done < len(chosen):
+        part = chosen[done : done + at_once].to(queries.device)
+        with torch.no_grad():
+            values = scores(queries.index_select(0, part)).float().cpu()
+        done += len(part)
+        places = values.shape[1]
+        block, at_once = -(-places // cells), max(1, SCORES_AT_ONCE // places)
+        closed, least = values.isinf(), values.amin(1, keepdim=True)
+        median = values.masked_fill(closed, torch.nan).nanmedian(1, keepdim=True).values
+        values = ((values - least) / (median - least).clamp(min=1e-12)).clamp(max=1)
+        values = values.masked_fill(closed, torch.inf)
+        padded = torch.nn.functional.pad(values, (0, -places % block), value=torch.inf)
+        rows.append(padded.unflatten(1, (-1, block)).amin(2))
+    matrix = torch.cat(rows)
+    matrix = matrix.masked_fill(matrix.isinf(), torch.nan)
+    return None if matrix.isnan().all() else ScoreMatrix(chosen, matrix, block, places)
+
+
+def plot_score_matrix(matrix: ScoreMatrix, match: Match, truth: GroundTruth | None = None) -> Plot:
+    """How much each query differs from each place, with the places reported and those that are right."""
+    figure, axis = canvas(5.6)
+    queries = len(match.index)
+    extent = (-0.5, queries - 0.5, -0.5, matrix.values.shape[1] * matrix.block - 0.5)
+    axis.set_facecolor(GREY)  # where nothing covers
+    image = axis.imshow(
+        matrix.values.T.numpy(), cmap="gray", vmin=0, vmax=1, origin="lower", aspect="auto", extent=extent
+    )
+    found = match.index >= 0
+    style = {"color": COLOURS["map"], "markersize": 2, "label": "reported place"}
+    axis.plot(torch.arange(queries)[found], match.index[found], ".", **style)
+    if truth is not None:
+        right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.nan)
+        style = {"color": RIGHT, "linewidth": 1, "dashes": (4, 4)}
+        axis.plot(right[:, :: max(1, right.shape[1] // LINES)], **style)
+        axis.plot([], [], label="right place", **style)
+    axis.set(xlim=extent[:2], ylim=(-0.5, matrix.places - 0.5), xlabel="query", ylabel="place")
+    bar = figure.colorbar(image, ax=axis, pad=0.01, aspect=30, ticks=[0, 1])
+    bar.ax.set_yticklabels(["best", "median"])
+    bar.set_label("score among those of the query")
+    figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=4)
+    return figure, axis
+
+
+def plot_coverage(
+    match: Match,
+    truth: Tensor | GroundTruth | None,
+    tolerance: int,
+    places: int,
+    queries: Tensor | None = None,
+) -> Plot:
+    """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9).
+
+    Args:
+        truth: (Q,R) right places, or a GroundTruth, or None where nothing is known.
+        queries: (Q,) the number of each query frame; None is 0..Q-1.
+    """
+    figure, axis = canvas(5)
+    number = torch.arange(len(match.index)) if queries is None else queries
+    reported = match.index >= 0
+
+    def dots(which: Tensor, colour: str, label: str, size: float = 3) -> None:
+        if which.any():
+            axis.plot(number[which], match.index[which], ".", color=colour, markersize=size, label=label)
+
+    missing = ~reported
+    if truth is None:
+        dots(reported, COLOURS["map"], f"{reported.sum()} reported")
+    else:
+        truth = as_ground_truth(truth)
+        scored = counted(match.index, truth, tolerance)
+        right = scored & is_right(match.index, truth.positives, tolerance)
+        wrong = scored & reported & ~right
+        dots(reported & ~scored, GREY, f"{(~scored).sum()} not scored")
+        dots(wrong, WRONG, f"{wrong.sum()} wrong")
+        dots(right, RIGHT, f"{right.sum()} right (within {tolerance} places)", 4)
+        missing &= scored
+    if missing.any():
+        label = f"{missing.sum()} not reported"
+        axis.plot(number[missing], torch.zeros(int(missing.sum())), "|", color=DARK, label=label)
+    first, last = int(number.min()), int(number.max())
+    axis.set(xlabel="query", ylabel="reported place")
+    axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * places, places))
+    figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
+    return figure, axis

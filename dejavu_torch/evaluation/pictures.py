@@ -1,0 +1,399 @@
+"""Every picture of a report, drawn from one localization run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.transform import resize
+from torch import Tensor
+
+from dejavu_torch.database.template_map import TemplateMap
+from dejavu_torch.evaluation.activation import activation_rates, best_phases, layer_distances
+from dejavu_torch.evaluation.contenders import Contender, distinct
+from dejavu_torch.evaluation.controls import template_map_of
+from dejavu_torch.evaluation.feature_plots import (
+    plot_autocorrelogram,
+    plot_features,
+    plot_spectrogram,
+    plot_templates,
+)
+from dejavu_torch.evaluation.map_plots import plot_activations, plot_chunks, plot_layers
+from dejavu_torch.evaluation.match_plots import (
+    example_matches,
+    plot_coverage,
+    plot_frames,
+    plot_pairs,
+    plot_score_matrix,
+    score_matrix,
+)
+from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
+from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.score_plots import plot_auc, plot_curves
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.ground_plane import ground_patch
+from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Traverse
+
+CANDIDATES = 16  # features of a layer from which the one to show is chosen
+EXAMPLES = 4  # places of which the frames of both traverses are shown
+
+
+class Localization(NamedTuple):
+    """A map, the traverses it was made of and queried with, and what was found.
+
+    reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None where there is none.
+    tolerance: distance from a right place, in places, up to which a reported one is right.
+    """
+
+    model: DejaVu
+    reference: Traverse
+    query: Traverse
+    reference_features: Tensor
+    query_features: Tensor
+    match: Match
+    truth: GroundTruth | None
+    tolerance: int
+
+
+def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dict[str, Picture]:
+    """Every picture that can be drawn: one that needs ground truth, frames or layers is left out without.
+
+    Args:
+        contenders: by key, ours under `map`.
+
+    Returns:
+        Of pairs, coverage, scores, pr, auc, ground, velocity, chunks, spectrogram, templates, features and
+        activations those that can be drawn, in this order.
+    """
+    pictures = draw_pairs(run)
+    pictures["coverage"] = Picture(
+        plot_coverage(run.match, run.truth, run.tolerance, run.model.map.places),
+        "places reported",
+        "Where along the route each query was found."
+        + (" A query in its right place is green, in a wrong one red." if run.truth is not None else ""),
+    )
+    pictures |= draw_scores(run) | draw_curves(contenders, run.tolerance) | draw_motion(run)
+    if isinstance(run.model.map, TemplateMap):
+        pictures |= draw_chunks(run.model.map)
+        pictures |= draw_features(run, run.model.map) | draw_activations(run, run.model.map)
+    return pictures
+
+
+def draw_chunks(route: TemplateMap) -> dict[str, Picture]:
+    """The layers of a map along the route."""
+    picture = Picture(
+        plot_chunks(route.plan, route.places),
+        "the map's periods along the route",
+        "Dotted lines cut the route into chunks. Each bar is a layer: the features that repeat with one "
+        "period in one chunk; the wider, the more features.",
+    )
+    return {"chunks": picture}
+
+
+def draw_pairs(run: Localization) -> dict[str, Picture]:
+    """Some queries beside the frames found for them; nothing for ready features, or where none is found."""
+    if not has_frames(run):
+        return {}
+    examples = example_matches(run.match, run.truth, run.tolerance)
+    frames = [
+        [
+            frame_at(run.query, one.query),
+            *(frame_at(run.reference, place) for place in (one.place, one.right) if place >= 0),
+        ]
+        for one in examples
+    ]
+    if not examples:
+        return {}
+    known = "" if run.truth is None else ", and at the right what it should have been"
+    last = (
+        "First above the threshold: the best match that the threshold rejects."
+        if any("threshold" in one.why for one in examples)
+        else "No threshold rejects any; the least sure answer has the worst score."
+    )
+    return {
+        "pairs": Picture(
+            plot_pairs(examples, frames),
+            "queries and what was found",
+            f"A query, beside it the reference frame of the place reported{known}. The lower the score, the "
+            f"surer the match. {last}",
+        )
+    }
+
+
+def draw_scores(run: Localization) -> dict[str, Picture]:
+    """The score matrix; nothing where the map has no layers."""
+    model = run.model
+    matrix = score_matrix(
+        lambda queries: model.map.scores(queries.to(model.map.positions.device)), run.query_features
+    )
+    if matrix is None:
+        return {}
+    shares = []
+    if len(matrix.query) < len(run.match.index):
+        shares.append(f"{len(matrix.query)} of the queries")
+    if matrix.block > 1:
+        shares.append(f"of {matrix.block} neighbouring places the one that fits best")
+    return {
+        "scores": Picture(
+            plot_score_matrix(matrix, run.match, run.truth),
+            "how well each place fits each query",
+            "Dark: the place fits the query about as well as its best one does. What repeats shows as lines "
+            "beside the right places." + (f" Drawn: {'; '.join(shares)}." if shares else ""),
+        )
+    }
+
+
+def draw_curves(contenders: Mapping[str, Contender], tolerance: int) -> dict[str, Picture]:
+    """Precision-recall curves and their areas; nothing where no contender has a curve."""
+    # leave_out has other queries
+    curves = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
+    if not curves:
+        return {}
+    return {
+        "pr": Picture(
+            plot_curves(curves, f"right within {tolerance} places"),
+            "precision and recall",
+            "How many of the reported places are right, against how many of the queries are answered right, "
+            "as the threshold rises. The higher and the further to the right, the better.",
+        ),
+        "auc": Picture(
+            plot_auc(curves),
+            "area under each curve",
+            "The curves above in one number each: this map, baselines that store frames, and nulls, in which "
+            "nothing repeats. A curve starts at the queries of the best score; nothing counts to its left.",
+        ),
+    }
+
+
+def draw_motion(run: Localization) -> dict[str, Picture]:
+    """The ground and its motion; nothing where the reference is not resampled."""
+    reference = run.reference
+    if not isinstance(reference, ResampledTraverse):
+        return {}
+    frame, odometry = frame_at(reference, reference.length // 2), reference.odometry
+    pair = (("reference", reference), ("query", run.query))
+    distances = {
+        f"{role}: {one.name}": one.positions * one.step
+        for role, one in pair
+        if isinstance(one, ResampledTraverse)
+    }
+    return {
+        "ground": Picture(
+            plot_ground(
+                frame, odometry.corners, ground_patch(frame[None], odometry.corners, odometry.size)[0]
+            ),
+            "the ground that is measured",
+            "The corners are right if what lies straight ahead runs straight down the view from above, and "
+            "what repeats along the route repeats at even distances there.",
+        ),
+        "velocity": Picture(
+            plot_velocity(distances, reference.step),
+            "how fast the ground moves",
+            "The motion of the ground from frame to frame, forward above the grey line. Places are even "
+            "steps along it: a camera that stands, or goes back and forth, adds none. A vehicle's speed "
+            "changes smoothly: a curve that jumps, or falls below the line, is a sign of corners that show "
+            "no clear ground.",
+        ),
+    }
+
+
+def draw_features(run: Localization, route: TemplateMap) -> dict[str, Picture]:
+    """One feature through time and folded, and the HOG features of two layers on a frame."""
+    model, plan = run.model, route.plan
+    leading = leading_layers(plan)
+    if not leading:
+        return {}
+    pictures, periods = {}, getattr(model.mapper, "periods", None)
+    layer, templates = plan[leading[0]], feature_templates(route, leading[0])
+    chosen = best_explained(run.reference_features, layer, templates)
+    feature = layer.features[chosen]
+    values = run.reference_features[:, feature : feature + 1].cpu()
+    if isinstance(periods, SpectrogramAnalysis):
+        spectra = periods(values)
+        kept = [
+            [float(p.period) for p in plan if (p.start, p.stop) == (start, stop) and feature in p.features]
+            for start, stop, _ in spectra
+        ]
+        pictures["spectrogram"] = Picture(
+            plot_spectrogram(values[:, 0], spectra, kept, periods.min_period, feature),
+            "a feature and its spectrogram",
+            "One feature of each frame along the route, and how its power is spread over periods in each "
+            "chunk. The map keeps the strongest periods, circled: they put the feature into a layer each.",
+        )
+    made = "the trained template" if model.trained else "their mean"
+    pictures["templates"] = Picture(
+        plot_templates(layer, values[layer.start : layer.stop, 0], templates, chosen, made),
+        "frames of equal phase become templates",
+        "Above, the same feature cut into cycles of one period and laid over each other, and "
+        + ("the template that training made of it" if model.trained else "their mean, which the map stores")
+        + ". Below, the templates of the layer's features, a row each.",
+    )
+    number = (layer.start + layer.stop) // 2
+    if type(model.features) is HOG and len(run.reference.frame_shape) == 3:
+        frame = as_hog_sees(model, frame_at(run.reference, number))
+        layout = model.features.orientations, model.features.cell, model.features.block
+        pictures["features"] = Picture(
+            plot_features(frame, [plan[j] for j in leading], *layout),
+            "where the features of a layer look",
+            f"The HOG features that take part in each layer, drawn on frame {number} as the edges they "
+            "respond to; the stronger a line, the more of the overlapping blocks have it in the layer.",
+        )
+    return pictures
+
+
+def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture]:
+    """Two layers of one chunk answering one query, and their fusion; nothing where no chunk has two layers.
+
+    The chunk and layers of `leading_layers`, and the query whose right place is nearest to the chunk's
+    middle (without ground truth: the middle query).
+    """
+    plan, truth, queries = route.plan, run.truth, run.query_features
+    chosen = leading_layers(plan)
+    if len(chosen) < 2:
+        return {}
+    layers = [plan[j] for j in chosen]
+    start, stop = layers[0].start, layers[0].stop
+    query, places, rates = len(queries) // 2, [], None
+    if truth is not None:
+        query = nearest_query(truth, (start + stop) / 2)
+        right = truth.positives[query].tolist() if truth.judged[query] else []
+        places = [place for place in right if start <= place < stop]
+        best = [best_phases(route, queries, j) for j in chosen]
+        rates = activation_rates(layers, best, run.match.index, truth, run.tolerance, route.places)
+    one = queries[query : query + 1]
+    scores = [layer_distances(route, one, j)[0, plan[j].place_phases] for j in chosen]
+    with torch.no_grad():
+        fused = route.scores(one.to(route.templates.device))[0, start:stop].cpu()
+    strip = slit_scan(run.reference, start, stop)
+    covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
+    explained = (
+        f" Right: within {run.tolerance} places, for a layer in phase. Elsewhere: queries from other chunks, "
+        "the layer's phase counted on; near chance where its period ends with the chunk. All layers fused "
+        "choose from the whole route."
+    )
+    picture = Picture(
+        plot_activations(layers, scores, fused, query, places, strip, rates),
+        "two layers, and all layers fused",
+        "How much one query differs from each place of a chunk: a layer alone fits one place a period, all "
+        f"{covering} of the chunk together one." + (explained if rates else ""),
+        {} if rates is None else rates.as_json(),
+    )
+    return {"activations": picture}
+
+
+def paper_pictures(run: Localization) -> dict[str, Picture]:
+    """Frames, autocorrelogram and layers, which `reproduce` adds (figures 1, 2 and 5 to 7 of the paper)."""
+    pictures: dict[str, Picture] = {}
+    if run.truth is not None and (run.truth.positives >= 0).any() and has_frames(run):
+        middles = [len(run.reference_features) * (k + 0.5) / EXAMPLES for k in range(EXAMPLES)]
+        queries = [nearest_query(run.truth, middle) for middle in middles]
+        places = run.truth.positives[queries].amax(1).tolist()
+        first = torch.stack([frame_at(run.reference, place) for place in places])
+        second = torch.stack([frame_at(run.query, query) for query in queries])
+        pictures["frames"] = Picture(
+            plot_frames(first, second, places),
+            "the route",
+            "The same places on the reference and on the second traverse.",
+        )
+    route = template_map_of(run.model, "the picture of layers")
+    plan = route.plan
+    for j in leading_layers(plan)[:1]:
+        layer = plan[j]
+        feature = layer.features[best_explained(run.reference_features, layer, feature_templates(route, j))]
+        chunk = [p for p in plan if (p.start, p.stop) == (layer.start, layer.stop)]
+        kept = [float(p.period) for p in chunk if feature in p.features]
+        values = run.reference_features[layer.start : layer.stop, feature].cpu()
+        pictures["autocorrelogram"] = Picture(
+            plot_autocorrelogram(values, kept, feature),
+            "a feature against itself",
+            "How alike a feature is to itself so many frames later: where it repeats, it is high at every "
+            "multiple of its period.",
+        )
+        pictures["layers"] = Picture(
+            plot_layers(chunk),
+            "layers and their phases",
+            "One chunk of the map: a row a layer, the colour its phase. A column of phases names a place; "
+            "the next place where all are the same is the least common multiple of the periods away.",
+        )
+    return pictures
+
+
+def leading_layers(plan: Plan) -> list[int]:
+    """Positions of the two layers of one chunk that pictures show, the one of most features first.
+
+    The chunk is the longest that has two layers, else the longest; of equals the first. A chunk of one
+    layer gives one; a map without layers none.
+    """
+    chunks: dict[tuple[int, int], list[int]] = {}
+    for j, layer in enumerate(plan):
+        chunks.setdefault((layer.start, layer.stop), []).append(j)
+    if not chunks:
+        return []
+    best = max(chunks, key=lambda chunk: (len(chunks[chunk]) > 1, chunk[1] - chunk[0], -chunk[0]))
+    return sorted(chunks[best], key=lambda j: -len(plan[j].features))[:2]
+
+
+def feature_templates(route: TemplateMap, j: int) -> Tensor:
+    """Templates of one layer in the units of the features, (P,F): trained weights divided out."""
+    templates: Tensor = route.blocks()[j].detach().cpu()
+    if not len(route.weights):
+        return templates
+    return templates / route.weights.detach().cpu()[list(route.plan[j].features)].clamp(min=1e-6)
+
+
+def best_explained(values: Tensor, layer: FrequencyLayer, templates: Tensor) -> int:
+    """Position in a layer of the feature of which the templates explain the largest share of the variance.
+
+    Only the 16 features whose templates vary most are candidates.
+
+    Shape: values (N,D), templates (P,F) -> 0..F-1.
+    """
+    candidates = templates.var(0, correction=0).argsort(descending=True, stable=True)[:CANDIDATES]
+    columns = torch.tensor(layer.features)[candidates].to(values.device)
+    chosen = values[layer.start : layer.stop].index_select(1, columns).cpu().double()
+    rest = (chosen - templates[layer.place_phases][:, candidates]).square().sum(0)
+    share = 1 - rest / (chosen - chosen.mean(0)).square().sum(0)
+    return int(candidates[share.nan_to_num(-1, neginf=-1).argmax()])
+
+
+def nearest_query(truth: GroundTruth, place: float) -> int:
+    """The query one of whose right places is nearest to a place; the first where none has any."""
+    right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.inf)
+    return int((right - place).abs().amin(1).argmin())
+
+
+def has_frames(run: Localization) -> bool:
+    """Whether both traverses hold frames, not ready features."""
+    return len(run.reference.frame_shape) == len(run.query.frame_shape) == 3
+
+
+def frame_at(traverse: Traverse, number: int) -> Tensor:
+    """One frame of a traverse, (C,H,W)."""
+    return next(traverse.between(number, number + 1))[0].float().cpu()
+
+
+def as_hog_sees(model: DejaVu, frame: Tensor) -> Tensor:
+    """A frame (C,H,W) after the model's preprocessing and HOG's own antialiased resize."""
+    with torch.no_grad():
+        seen: Tensor = model.preprocess(frame[None])
+    size = getattr(model.features, "resize", None)
+    if size is not None and tuple(seen.shape[-2:]) != size:
+        seen = resize(seen, size, antialias=True)
+    return seen[0]
+
+
+def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:
+    """The middle image column of each of the frames [start, stop), side by side: (C,H,stop - start).
+
+    None where the traverse holds features.
+    """
+    if len(traverse.frame_shape) == 1:
+        return None
+    columns = [  # a view would keep the whole frames
+        batch[..., batch.shape[-1] // 2].clone() for batch in traverse.between(start, stop)
+    ]
+    return torch.cat(columns).permute(1, 2, 0).float() if columns else None

@@ -1,0 +1,117 @@
+"""Pictures of scores: curves, areas, chunk lengths and running times; each returns (figure, axes)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of
+from dejavu_torch.evaluation.plots import GREY, Plot, canvas
+
+_OURS = COLOURS["map"]
+_SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
+_LINES = {"hog": "--", "null": ":"}  # by the first part of a key
+_HATCHES = {"hog": "...", "null": "///"}
+
+
+class Length(NamedTuple):
+    """What a map with chunks of `window` frames recognises, and what it stores.
+
+    recall_at_1_comparable: with scores that are comparable between chunks, `reduction="mean"`.
+    """
+
+    window: int
+    recall_at_1: float
+    auc: float
+    recall_at_1_comparable: float
+    map_bytes: int
+    bytes_per_place: float
+
+
+def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
+    """Precision against recall, a line for each contender that has a curve (figures 8 to 10 of the paper).
+
+    Args:
+        contenders: by key, which gives the colour; HOG is dashed, nulls are dotted.
+    """
+    figure, axis = canvas(5.6)
+    for key, one in reversed(list(contenders.items())):  # the first on top
+        if one.curve is None:
+            continue
+        silent = len(one.curve.recall) == 0
+        axis.plot(
+            one.curve.recall,
+            one.curve.precision,
+            _LINES.get(key.partition("_")[0], "-"),
+            color=colour_of(key),
+            label=f"{one.name} (reports nothing)" if silent else one.name,
+            linewidth=2.4 if key == "map" else 1.6,
+        )
+    axis.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision")
+    axis.set_title(title, fontsize=11)
+    axis.grid(alpha=0.25)
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles[::-1], labels[::-1], loc="outside lower left", frameon=False)
+    return figure, axis
+
+
+def plot_auc(contenders: Mapping[str, Contender]) -> Plot:
+    """Area under the curve of each contender that has scores, as a bar in the colour of its curve."""
+    areas = {key: (one.name, one.scores.auc) for key, one in contenders.items() if one.scores}
+    figure, axis = canvas(0.9 + 0.55 * len(areas))
+    bars = axis.barh(range(len(areas)), [area for _, area in areas.values()], height=0.42)
+    for row, (bar, (key, (name, area))) in enumerate(zip(bars, areas.items(), strict=True)):
+        bar.set(facecolor=colour_of(key), hatch=_HATCHES.get(key.partition("_")[0]), edgecolor="white")
+        axis.text(0.008, row - 0.24, name, fontsize=9, va="bottom")
+        axis.text(area + 0.01, row, f"{area:.3f}", fontsize=9, va="center")
+    axis.invert_yaxis()
+    axis.set(xlim=(0, 1.1), yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
+    axis.set_xlabel("area under the precision-recall curve (recall of all queries)")
+    axis.spines["bottom"].set_bounds(0, 1)
+    return figure, axis
+
+
+def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
+    """Recall and storage over the length of the chunks (section VI)."""
+    figure, (above, below) = canvas(5.4, 2, sharex=True)
+    for number, (name, rows) in enumerate(datasets.items()):
+        colour, mark = _SHADES[number % len(_SHADES)], "osD^v"[number % 5]
+        windows = [row.window for row in rows]
+        style = {"color": colour, "marker": mark, "markersize": 6}
+        above.plot(windows, [row.recall_at_1_comparable for row in rows], label=name, **style)
+        above.plot(windows, [row.recall_at_1 for row in rows], linestyle=":", **style | {"markersize": 3})
+        below.plot(windows, [row.bytes_per_place for row in rows], **style)
+    windows = sorted({row.window for rows in datasets.values() for row in rows})
+    below.set_xscale("log", base=2)
+    below.set_xticks(windows, [str(window) for window in windows])
+    below.minorticks_off()
+    above.set(ylabel="recall@1", ylim=(0, 1.02))
+    below.set(xlabel="length of a chunk (frames)", ylabel="bytes per place")
+    below.set_ylim(bottom=0)
+    for axis in (above, below):
+        axis.grid(alpha=0.25)
+    if windows:
+        above.legend(loc="best", frameon=False, fontsize=9)
+    return figure, (above, below)
+
+
+def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
+    """Time of each contender over ours, one bar each, one group for each case.
+
+    Args:
+        cases: at least one: case -> contender -> ratio. Names that start with "dejavu" are ours.
+    """
+    bars = [len(ratios) for ratios in cases.values()]
+    height = 0.5 + 0.3 * sum(bars) + 0.5 * len(bars)
+    figure, axes = canvas(height, len(bars), squeeze=False, height_ratios=bars)
+    for axis, (case, ratios) in zip(axes[:, 0], cases.items(), strict=True):
+        colours = [_OURS if name.startswith("dejavu") else COLOURS.get(name, GREY) for name in ratios]
+        drawn = axis.barh(list(ratios), list(ratios.values()), color=colours, height=0.7)
+        axis.bar_label(drawn, [f"{ratio:.1f}" for ratio in ratios.values()], padding=3, fontsize=9)
+        axis.axvline(1, color=_OURS, linewidth=0.8, linestyle=":")
+        axis.set_title(case, loc="left", fontsize=10)
+        axis.set_xlim(0, 1.12 * max(ratios.values()))
+        axis.invert_yaxis()
+        axis.tick_params(labelsize=9)
+    axes[-1, 0].set_xlabel("time over that of our fastest (lower is better)")
+    return figure, axes[:, 0]

@@ -1,0 +1,249 @@
+"""Reports: tables, sentences, report.json, and the page."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from dejavu_torch.data.truth import as_truth
+from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend
+from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.evaluation.plots import Picture, canvas
+from dejavu_torch.evaluation.report import (
+    PICTURES,
+    Report,
+    headline,
+    score_table,
+    summary,
+    text_table,
+    write_index,
+    write_report,
+)
+from dejavu_torch.types import GroundTruth, Match
+
+SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75)
+FACTS = {
+    "queries": 20,
+    "tolerance": 3,
+    "recall_definition": "TP / all",
+    "version": "1",
+    "torch": "2",
+}
+
+
+def report(facts: dict[str, Any] | None = None, **contenders: Contender) -> Report:
+    return Report(Contender("this map", SCORES, 4000), contenders, FACTS | (facts or {}))
+
+
+def picture(heading: str = "a heading") -> Picture:
+    return Picture(canvas(1), heading, "A caption.")
+
+
+def written(folder: Path, one: Report, **pictures: Picture) -> str:
+    write_report(folder, one, pictures, "a title", "dejavu demo", "the plan")
+    return (folder / "index.html").read_text(encoding="utf-8")
+
+
+def match(scores: list[float]) -> Match:
+    return Match(torch.arange(len(scores)), torch.tensor(scores), torch.ones(len(scores), dtype=torch.bool))
+
+
+@pytest.mark.parametrize(("equal", "late"), [(1, False), (2, True)])
+def test_a_curve_that_starts_late_has_a_star_and_the_star_is_explained(equal: bool, late: bool) -> None:
+    # all are right: the curve starts at the share of those that have the best score
+    scores = [0.1] * equal + [0.2] * (10 - equal)
+    ours = contend("this map", match(scores), torch.arange(10)[:, None], 0)
+    one = report()._replace(ours=ours)
+    assert ours.starts == equal / 10
+    assert score_table(one)[1][1].endswith("*") == late
+    assert ("*: this curve starts at a recall above 0.1" in summary(one)) == late
+    assert one.as_json()["curve_starts_at_recall"] == ours.starts
+
+
+def test_a_match_without_truth_or_that_reports_nothing_is_a_contender_too() -> None:
+    one = contend("x", match([0.1]), None, 0, bytes=7)
+    assert (one.scores, one.curve, one.starts, one.bytes) == (None, None, None, 7)
+    silent = Match(torch.tensor([-1]), torch.tensor([torch.inf]), torch.tensor([False]))
+    nothing = contend("x", silent, torch.tensor([[0]]), 0)
+    assert nothing.starts is None
+    assert nothing.scores is not None
+    unknown = as_truth(torch.tensor([[0]]))._replace(judged=torch.tensor([False]))
+    assert isinstance(unknown, GroundTruth)
+    assert contend("x", match([0.1]), unknown, 0).scores is None
+
+
+def test_bytes_per_place_stand_in_the_table_where_the_places_are_known() -> None:
+    null = Contender("null", SCORES)
+    head, ours, other = score_table(report({"frames": 32}, null=null))
+    assert (head[-1], ours[-1], other[-1]) == ("bytes per place", "125.0", "")
+    head, ours, _ = score_table(report({"frames": 32}, null=null), every=True)
+    assert head[-2:] == ["bytes", "bytes per place"]
+    assert ours[-2:] == ["4000", "125.0"]
+    assert not any("bytes" in cell for cell in score_table(report())[0])
+    for every in (False, True):
+        assert len({len(row) for row in score_table(report({"frames": 32}, null=null), every)}) == 1
+
+
+def test_what_stores_the_same_frames_twice_is_listed_once() -> None:
+    row, other = Contender("every 2nd", SCORES, 100, 2), Contender("every 3rd", SCORES, 70, 3)
+    one = report(stride=row, stride_coarsest=row._replace(name="again"), hog=other)
+    assert [cells[0] for cells in score_table(one)[1:]] == ["this map", "every 2nd", "every 3rd"]
+    assert {"stride", "stride_coarsest", "hog"} <= one.as_json().keys()
+
+
+def test_scores_are_those_of_the_columns() -> None:
+    head, ours = score_table(report(), every=True)
+    assert dict(zip(head[1:], ours[1:], strict=True)) == {
+        "AUC": "0.500",
+        "recall@1": "0.750",
+        "R@100P": "0.100",
+        "P@100R": "0.700",
+        "AUC rep.": "0.600",
+        "R@100P rep.": "0.200",
+    }
+    assert score_table(report())[1] == ["this map", "0.500", "0.750", "0.100"]
+
+
+def test_text_tables_are_aligned() -> None:
+    assert text_table([["", "AUC"], ["a map", "1"]]).splitlines() == ["       AUC", "a map    1"]
+
+
+def test_the_summary_tells_what_was_scored() -> None:
+    facts = {
+        "truth": "place = query",
+        "unit": "places",
+        "unknown": 5,
+        "ignored": 2,
+        "judged": 13,
+        "accepted": 9,
+        "accepted_right": 8,
+        "threshold_of_full_precision": 0.25,
+        "spacing": {"step": 2.5, "reference_frames": 40, "query_frames": None},
+        "seconds_learn": 1.25,
+        "seconds_localize": 2.0,
+    }
+    text = summary(report(facts))
+    for words in (
+        "20 queries; right within 3 places of the truth (place = query)",
+        "15 of the queries are in the truth",
+        "2 report a place that counts neither as right nor as wrong",
+        "Of 13 scored 9 are accepted, 8 correctly",
+        "--threshold 0.25",
+        "40 frames of the reference were resampled to even steps of 2.5 pixels",
+        "localizing 2.0 s",
+    ):
+        assert words in text
+    short = summary(report())
+    assert short == "20 queries; right within 3 frames."
+    facts["spacing"]["query_frames"] = 30  # type: ignore[index]
+    assert "40 frames of the reference and 30 of the query were resampled" in summary(report(facts))
+
+
+def test_the_page_begins_with_plain_words() -> None:
+    baseline = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
+    text = headline(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ")
+    for words in ("20 query frames", "32 places", "75.0 %", "0.500", "125 bytes", "2000", "90.0 %"):
+        assert words in text
+    unscored = report()._replace(ours=Contender("this map", None))
+    assert "no ground truth" in headline(unscored)
+    assert "None" not in headline(unscored) + summary(unscored)
+
+
+def key(folder: Path, one: Report) -> dict[str, str]:
+    """What stands above the first table."""
+    above = written(folder, one).partition("<table")[0]
+    return dict(re.findall(r"<dt>([^<]+)</dt> <dd>([^<]+)</dd>", above))
+
+
+def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path: Path) -> None:
+    assert list(key(tmp_path, report())) == ["AUC", "recall@1", "R@100P"]
+    null, frames = Contender("null", SCORES), Contender("all", SCORES, 100, 1)
+    found = key(tmp_path, report({"frames": 32}, uncompressed=frames, null=null, null_same_plan=null))
+    assert list(found)[3:] == ["bytes per place", "all, every k-th frame", "null"]
+    assert "second" in found["null"]
+    trained = key(tmp_path, report({"trained": {"steps": 1}}, null=null))["null"]
+    assert "backbone" in trained
+    assert "second" not in trained
+
+
+def test_the_words_of_the_last_table_are_explained_beside_it(tmp_path: Path) -> None:
+    below = written(tmp_path, report()).partition("all scores</h2>")[2]
+    assert re.findall(r"<dt>([^<]+)</dt>", below)[:3] == ["P@100R", "rep.", "recall"]
+    assert "TP / all</dd>" in below
+
+
+def test_report_json_has_the_facts_the_scores_and_an_entry_for_each_contender(tmp_path: Path) -> None:
+    one = report({"frames": 32}, stride=Contender("every 2nd", SCORES, 100, 2), null=Contender("null", None))
+    written(tmp_path, one)
+    found = json.loads((tmp_path / "report.json").read_text())
+    assert found == one.as_json()
+    assert found.keys() == FACTS.keys() | {"frames", *Scores._fields, "stride", "null"}
+    assert found["stride"] == SCORES._asdict() | {"bytes": 100, "k": 2}
+    assert found["null"] == dict.fromkeys(Scores._fields)
+
+
+def test_names_are_escaped(tmp_path: Path) -> None:
+    evil = "<script>alert('1 & 2')</script>"
+    one = report({"truth": evil, "version": evil, "frames": 2}, hog=Contender(evil, SCORES))
+    write_report(tmp_path, one, {"pr": Picture(canvas(1), evil, evil)}, evil, evil, evil)
+    page = (tmp_path / "index.html").read_text()
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;") >= 8
+    write_index(tmp_path, [[evil], [evil]], [evil], Picture(canvas(1), evil, evil), {evil: evil}, evil, evil)
+    assert "<script" not in (tmp_path / "index.html").read_text()
+
+
+def test_pictures_of_an_earlier_report_are_removed_and_other_files_stay(tmp_path: Path) -> None:
+    (tmp_path / "own.png").write_bytes(b"")
+    written(tmp_path, report(), **{name: picture() for name in PICTURES})
+    assert {file.stem for file in tmp_path.glob("*.png")} == {*PICTURES, "own"}
+    written(tmp_path, report(), pr=picture())
+    files = {file.name for file in tmp_path.iterdir()}
+    assert files == {"own.png", "pr.png", "index.html", "report.json"}
+    assert (tmp_path / "pr.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_page_fits_a_phone_and_needs_no_other_file(tmp_path: Path) -> None:
+    page = written(tmp_path, report({"frames": 32}), pr=picture("curves"), coverage=picture("places"))
+    assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in page
+    assert page.count("data:image/png;base64,") == 2
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert page.index("<dl>") < page.index("<table") < page.index("curves</h2>") < page.index("places</h2>")
+    # on a narrow screen a cell of the wide table carries its own heading
+    assert '<table class="cards">' in page
+    assert 'data-label="AUC rep."' in page
+    for text in ("the plan</pre>", "dejavu demo\n", "torch 2"):
+        assert text in page
+
+
+def test_each_row_has_the_colour_of_its_curve(tmp_path: Path) -> None:
+    page = written(tmp_path, report(hog=Contender("HOG", SCORES), null=Contender("null", SCORES)))
+    colours = re.findall(r'<i style="background:(#\w+)"></i>([^<]+)', page)
+    expected = [("map", "this map"), ("hog", "HOG"), ("null", "null")]
+    assert colours == [(COLOURS[key], name) for key, name in expected] * 2  # in both tables
+
+
+def test_a_page_leaves_out_what_there_is_not(tmp_path: Path) -> None:
+    write_report(tmp_path, report(), {}, "a title", "a command")
+    page = (tmp_path / "index.html").read_text()
+    for text in ("the map</h2>", "<img", "<ul>", "None", "bytes", "null"):
+        assert text not in page, text
+
+
+def test_an_index_links_its_pages_and_shares_the_table(tmp_path: Path) -> None:
+    rows = [["", "AUC", "R@100P rep."], ["outdoor", "0.5", ""], ["aerial", "0.6", "0.1"]]
+    links = {"outdoor": "outdoor/index.html"}
+    write_index(
+        tmp_path, rows, ["one note", "another"], picture("the heading"), links, "all of them", "dejavu x"
+    )
+    page = (tmp_path / "index.html").read_text()
+    assert re.findall(r'href="([^"]+)">([^<]+)', page) == [("outdoor/index.html", "outdoor")]
+    assert re.findall(r'<td data-label="AUC">([^<]*)</td>', page) == ["0.5", "0.6"]
+    assert re.findall(r"<dt>([^<]+)</dt>", page) == ["AUC", "R@100P", "rep."]
+    for text in ("one note", "another", "the heading</h2>", "dejavu x</pre>", "width=device-width"):
+        assert text in page

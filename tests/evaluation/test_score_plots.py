@@ -1,0 +1,110 @@
+"""Pictures of scores, read back from the figures, and the colours that all pictures share."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import pytest
+import torch
+from drawn import render, texts
+
+from dejavu_torch.evaluation.contenders import COLOURS, Contender
+from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, RIGHT, WRONG
+from dejavu_torch.evaluation.score_plots import Length, plot_auc, plot_curves, plot_lengths, plot_ratios
+from dejavu_torch.types import PRCurve
+
+
+def contender(name: str, auc: float, points: int = 4) -> Contender:
+    curve = PRCurve(*torch.rand(3, points, dtype=torch.float64))
+    return Contender(name, Scores(auc, *torch.rand(5).tolist()), curve=curve)
+
+
+def rgb(colour: str) -> tuple[float, ...]:
+    return tuple(int(colour[j : j + 2], 16) / 255 for j in (1, 3, 5))
+
+
+def test_bars_and_curves_have_the_colour_of_the_key_whatever_else_is_drawn() -> None:
+    everything = {key: contender(f"the {key}", 0.1 * i) for i, key in enumerate(COLOURS)}
+    for keys in (list(COLOURS), ["map", "hog", "null"], ["null_same_plan", "stride"]):
+        shown = {key: everything[key] for key in keys}
+        figure, axis = plot_auc(shown)
+        for key, bar in zip(keys, axis.patches, strict=True):
+            assert bar.get_width() == everything[key].scores.auc
+            assert bar.get_facecolor()[:3] == pytest.approx(rgb(COLOURS[key]))
+        assert {f"the {key}" for key in keys} | {"0.000"} <= set(texts(figure)) | {"0.000"}
+        figure, axis = plot_curves(shown)
+        by_name = {line.get_label(): line for line in axis.lines}
+        for key in keys:
+            line = by_name[f"the {key}"]
+            assert line.get_color() == COLOURS[key]
+            assert line.get_xdata().tolist() == everything[key].curve.recall.tolist()
+        render(figure)
+
+
+def test_a_curve_that_reports_nothing_says_so_and_one_without_scores_is_left_out() -> None:
+    silent, unscored = contender("null: x", 0.0, points=0), Contender("unscored", None)
+    figure, axis = plot_curves({"null": silent, "hog": unscored})
+    assert "null: x (reports nothing)" in texts(figure)
+    assert len(axis.lines) == 1
+    assert len(plot_auc({"null": silent, "hog": unscored})[1].patches) == 1
+
+
+# Machado, Oliveira and Fernandes 2009: how linear RGB looks without one kind of cone
+SIGHT = {
+    "normal": torch.eye(3),
+    "no red": torch.tensor(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "no green": torch.tensor(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+    "no blue": torch.tensor(
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+    ),
+}
+
+
+def oklab(colour: str, sight: torch.Tensor) -> torch.Tensor:
+    """Coordinates in which equal steps look equal; black and white are 1 apart."""
+    value = torch.tensor(rgb(colour))
+    linear = torch.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    cones = torch.tensor(
+        [[0.41222, 0.53633, 0.05145], [0.21190, 0.68070, 0.10740], [0.08830, 0.28172, 0.62998]]
+    )
+    lab = torch.tensor(
+        [[0.21045, 0.79362, -0.00407], [1.97800, -2.42859, 0.45059], [0.02590, 0.78277, -0.80868]]
+    )
+    return lab @ (cones @ (sight @ linear).clamp(0, 1)) ** (1 / 3)
+
+
+@pytest.mark.parametrize("sight", SIGHT)
+@pytest.mark.parametrize(
+    "together",
+    [list(COLOURS.values())[:9], [RIGHT, WRONG, DARK], [RIGHT, WRONG, GREY], [*LAYERS, COLOURS["map"]]],
+)
+def test_colours_that_share_a_picture_differ_for_the_colour_blind(together: list[str], sight: str) -> None:
+    for one, other in combinations(together, 2):
+        apart = (oklab(one, SIGHT[sight]) - oklab(other, SIGHT[sight])).norm()
+        assert apart > 0.05, (one, other)
+
+
+def test_a_colour_means_one_contender() -> None:
+    assert len({*COLOURS.values(), RIGHT, WRONG, GREY, DARK, *LAYERS}) == len(COLOURS) + 6
+
+
+def test_running_times_are_drawn_in_the_colours_of_the_contenders() -> None:
+    _, (axis,) = plot_ratios({"one": {"dejavu (numba)": 1.0, "scipy": 3.0, "uncompressed": 2.0}})
+    colours = [bar.get_facecolor()[:3] for bar in axis.patches]
+    expected = [COLOURS["map"], GREY, COLOURS["uncompressed"]]
+    assert colours == [pytest.approx(rgb(colour)) for colour in expected]
+
+
+def test_recall_and_bytes_over_the_length_of_a_chunk() -> None:
+    rows = [Length(256, 0.8, 0.7, 0.85, 4000, 40.0), Length(512, 0.9, 0.8, 0.95, 3000, 30.0)]
+    plot = plot_lengths({"aerial": rows, "nothing": []})
+    render(plot[0])
+    comparable, printed, *_ = (list(line.get_ydata()) for line in plot[1][0].lines)
+    assert (comparable, printed) == ([0.85, 0.95], [0.8, 0.9])
+    assert list(plot[1][1].lines[0].get_ydata()) == [40.0, 30.0]
+    assert {line.get_color() for line in plot[1][1].lines[:1]} == {COLOURS["map"]}
