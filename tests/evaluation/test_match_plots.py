@@ -6,7 +6,7 @@ import pytest
 import torch
 from drawn import matched, render, texts
 
-from dejavu_torch.data.truth import as_truth
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
     example_matches,
     plot_coverage,
@@ -92,19 +92,19 @@ def test_where_a_threshold_rejects_some_the_best_of_them_is_shown() -> None:
 def test_an_example_is_shown_once_and_only_if_there_is_one() -> None:
     (one,) = example_matches(found([4], [0.1]), None, 0)
     assert one.why == "surest answer, least sure answer, score 0.1"
-    right = example_matches(found([0, 1], [0.1, 0.2]), as_truth(torch.arange(2)[:, None]), 0)
+    right = example_matches(found([0, 1], [0.1, 0.2]), as_ground_truth(torch.arange(2)[:, None]), 0)
     assert [one.why.split(",")[0] for one in right] == ["surest right answer", "least sure answer"]
     assert example_matches(found([-1], [torch.inf]), None, 0) == []
 
 
 def test_the_right_place_shown_is_the_nearest_to_the_one_reported() -> None:
-    truth = as_truth(torch.tensor([[3, 90, -1]]))
+    truth = as_ground_truth(torch.tensor([[3, 90, -1]]))
     (example,) = example_matches(found([80], [0.1]), truth, 0)
     assert example.right == 90
 
 
 def test_pairs_show_query_reported_and_right_place_side_by_side() -> None:
-    examples = example_matches(found([0, 9], [0.1, 0.2]), as_truth(torch.arange(2)[:, None]), 0)
+    examples = example_matches(found([0, 9], [0.1, 0.2]), as_ground_truth(torch.arange(2)[:, None]), 0)
     frames = [[torch.rand(3, 8, 12), torch.rand(1, 16, 16), torch.rand(1, 16, 16)] for _ in examples]
     figure, axes = plot_pairs(examples, frames)
     assert {"query 0", "reported: place 9", "right: place 1"} <= {text.strip() for text in texts(figure)}
@@ -150,7 +150,7 @@ def test_places_that_nothing_covers_stay_empty() -> None:
 
 
 def test_the_score_matrix_is_drawn_with_reported_and_right_places() -> None:
-    match, truth = matched(0, 7, -1, 3), as_truth(torch.tensor([[0, 5], [1, -1], [2, -1], [3, -1]]))
+    match, truth = matched(0, 7, -1, 3), as_ground_truth(torch.tensor([[0, 5], [1, -1], [2, -1], [3, -1]]))
     matrix = score_matrix(lambda rows: torch.rand(len(rows), 10), torch.rand(4, 2))
     assert matrix is not None
     figure, axis = plot_score_matrix(matrix, match, truth)

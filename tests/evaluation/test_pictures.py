@@ -5,12 +5,11 @@ from fractions import Fraction
 
 import pytest
 import torch
-from dejavu_torch.experiments.others import Other
-from helpers import Fixed
+from helpers import Fixed, template_model
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, Preprocess, SlidingWindow, SpectrogramAnalysis
-from dejavu_torch.data.truth import as_truth, offset_truth
+from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
 from dejavu_torch.evaluation.activation import best_phases
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.pictures import (
@@ -72,7 +71,7 @@ def drawn(
 
 
 def short(**options: object) -> DejaVu:
-    return DejaVu(HOG(), SpectrogramAnalysis(window=60, min_period=4), **options)  # type: ignore[arg-type]
+    return template_model(HOG(), SpectrogramAnalysis(window=60, min_period=4), **options)  # type: ignore[arg-type]
 
 
 def same_places(length: int = 120) -> GroundTruth:
@@ -94,7 +93,7 @@ def test_every_picture_of_frames_that_repeat() -> None:
 
 
 def test_a_route_of_one_chunk_has_nothing_elsewhere() -> None:
-    model = DejaVu(periods=SpectrogramAnalysis(window=120, min_period=4))
+    model = template_model(periods=SpectrogramAnalysis(window=120, min_period=4))
     pictures = drawn(model, frames(0), frames(1), same_places())
     numbers = pictures["activations"].numbers
     assert [rate["outside"] for rate in (*numbers["layers"], numbers["fused"])] == [None] * 3
@@ -103,7 +102,7 @@ def test_a_route_of_one_chunk_has_nothing_elsewhere() -> None:
 def test_the_rates_are_those_of_the_layers_they_stand_beside() -> None:
     """Two layers that each answer for their own period only: swapped, neither would be in phase."""
     values = (torch.arange(90)[:, None] % torch.tensor([9.0, 9.0, 10.0])) + torch.tensor([0.0, 1.0, 2.0])
-    model = DejaVu(periods=Fixed(layer(9, 0, 90, 0, 1), layer(10, 0, 90, 2)))
+    model = template_model(periods=Fixed(layer(9, 0, 90, 0, 1), layer(10, 0, 90, 2)))
     rates = drawn(model, values, values, as_ground_truth(offset_truth(90, 90)))["activations"].numbers[
         "layers"
     ]
@@ -134,7 +133,7 @@ def test_a_truth_that_judges_nothing_gives_no_curve() -> None:
 
 
 def test_a_route_without_layers_keeps_what_needs_none() -> None:
-    pictures = drawn(DejaVu(periods=Fixed()), frames(0), frames(1), same_places())
+    pictures = drawn(template_model(periods=Fixed()), frames(0), frames(1), same_places())
     assert list(pictures) == ["coverage", "pr", "auc", "chunks"]
 
 
@@ -146,7 +145,7 @@ def test_ready_features_have_no_frame_to_draw_on() -> None:
 
 
 def test_one_layer_has_no_partner() -> None:
-    model = DejaVu(periods=Fixed(layer(12, 0, 120, 0, 1, 2)))
+    model = template_model(periods=Fixed(layer(12, 0, 120, 0, 1, 2)))
     pictures = drawn(model, frames(0), frames(1), same_places())
     # the spectrogram is that of SpectrogramAnalysis
     assert list(pictures) == [
@@ -159,7 +158,7 @@ def test_features_are_drawn_for_our_hog_only() -> None:
         """Looks at the frame otherwise."""
 
     for module in (Other(), nn.Sequential(nn.AvgPool2d(2), nn.Flatten())):
-        model = DejaVu(module, SpectrogramAnalysis(window=60, min_period=4))
+        model = template_model(module, SpectrogramAnalysis(window=60, min_period=4))
         assert "features" not in drawn(model, frames(0), frames(1), None)
 
 
@@ -189,7 +188,7 @@ def test_the_paper_s_own_pictures() -> None:
     run = localized(short(), frames(0), frames(1), same_places())
     assert list(paper_pictures(run)) == ["frames", "autocorrelogram", "layers"]
     assert list(paper_pictures(run._replace(truth=None))) == ["autocorrelogram", "layers"]
-    nothing = localized(DejaVu(periods=Fixed()), frames(0), frames(1), same_places())
+    nothing = localized(template_model(periods=Fixed()), frames(0), frames(1), same_places())
     assert list(paper_pictures(nothing)) == ["frames"]
     features = localized(short(), *(HOG()(frames(seed)) for seed in (0, 1)), same_places())
     assert list(paper_pictures(features)) == ["autocorrelogram", "layers"]
@@ -204,7 +203,7 @@ def test_the_frame_under_the_features_is_what_hog_sees() -> None:
 
 
 def test_features_are_drawn_on_the_frame_as_hog_resizes_it() -> None:
-    model = DejaVu(HOG(cell=4, resize=(16, 40)), SpectrogramAnalysis(window=60, min_period=4))
+    model = template_model(HOG(cell=4, resize=(16, 40)), SpectrogramAnalysis(window=60, min_period=4))
     pictures = drawn(model, frames(0, channels=3), frames(1, channels=3), None)
     assert pictures["features"].plot[1].flat[0].images[0].get_array().shape == (16, 40)
     assert "frame 30" in pictures["features"].caption
@@ -229,16 +228,16 @@ def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain() -> No
     noise = torch.randn(80, 3)
     stored = torch.stack([torch.ones(80), wave + noise[:, 0], wave + 0.1 * noise[:, 1], 5 * noise[:, 2]], 1)
     one = layer(8, 0, 80, 0, 1, 2, 3)
-    templates = DejaVu(periods=Fixed(one)).learn_features(stored).map.blocks()[0]
+    templates = template_model(periods=Fixed(one)).learn_features(stored).map.blocks()[0]
     assert best_explained(stored, one, templates) == 2
 
 
 def test_best_phases_are_those_that_the_chunk_has() -> None:
     # period 50 in a chunk of 20 frames from 10: phases 10..29; the others' templates are 0
     stored = torch.randn(40, 6).abs() + 1
-    model = DejaVu(periods=Fixed(layer(50, 10, 30, *range(6)))).learn_features(stored)
+    model = template_model(periods=Fixed(layer(50, 10, 30, *range(6)))).learn_features(stored)
     queries = torch.cat([stored[10:30], torch.zeros(1, 6)])
-    best = best_phases(model, queries, 0)
+    best = best_phases(model.map, queries, 0)
     assert best[:20].tolist() == list(range(10, 30))
     assert 10 <= int(best[20]) < 30
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from dejavu_torch.data.truth import as_truth
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import Picture, canvas
@@ -72,7 +72,7 @@ def test_a_match_without_truth_or_that_reports_nothing_is_a_contender_too() -> N
     nothing = contend("x", silent, torch.tensor([[0]]), 0)
     assert nothing.starts is None
     assert nothing.scores is not None
-    unknown = as_truth(torch.tensor([[0]]))._replace(judged=torch.tensor([False]))
+    unknown = as_ground_truth(torch.tensor([[0]]))._replace(judged=torch.tensor([False]))
     assert isinstance(unknown, GroundTruth)
     assert contend("x", match([0.1]), unknown, 0).scores is None
 

@@ -17,7 +17,7 @@ from test_evenly import footage as ground
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truth import as_truth
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.frames import Clips, StoredFrames, as_frames, store
@@ -101,7 +101,7 @@ def test_validation_and_query_come_in_order_as_they_are() -> None:
 
 def test_parts_are_as_one_behind_the_other() -> None:
     parts = [store(numbered(count, first)) for count, first in ((5, 0), (3, 50), (4, 90))]
-    frames = StoredFrames(parts[0], as_truth(torch.arange(12)[:, None]), *parts[1:])
+    frames = StoredFrames(parts[0], as_ground_truth(torch.arange(12)[:, None]), *parts[1:])
     assert len(frames) == 12
     index = torch.randperm(12).repeat(2)
     batch = frames[index.tolist()]
@@ -109,7 +109,7 @@ def test_parts_are_as_one_behind_the_other() -> None:
     assert torch.equal(batch.truth.positives[:, 0], index)
     assert torch.equal(frames[[5]].frames, as_frames(parts[1][:1]))
     features = [torch.randn(4, 3, dtype=torch.float64) for _ in range(2)]
-    both = StoredFrames(features[0], as_truth(torch.arange(8)[:, None]), features[1])
+    both = StoredFrames(features[0], as_ground_truth(torch.arange(8)[:, None]), features[1])
     assert torch.equal(both[[7, 0]].frames, torch.stack([features[1][3], features[0][0]]))
 
 
