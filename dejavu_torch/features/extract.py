@@ -24,11 +24,11 @@ def feature_batches(
     device: torch.device | str = "cpu",
     progress: str | None = None,
 ) -> Iterator[Tensor]:
-    """Run the frames of a traverse through a feature module, in order, without gradients.
+    """Features of the frames of a traverse, in order, without gradients.
 
     Args:
-        traverse: frames (B,C,H,W), or ready features (B,D), which pass as they are.
-        module: (B,C,H,W) -> (B,D). Runs in eval mode; its own mode is restored.
+        traverse: frames (B,C,H,W), or ready features (B,D), which are passed on.
+        module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time; fewer where they are large.
         progress: text of a progress bar on stderr, shown on a terminal only; None is no bar.
 
@@ -53,7 +53,7 @@ def feature_batches(
             bad = ~features.isfinite().all(1)
             if bad.any():
                 first = done + int(bad.nonzero()[0])
-                first = int(getattr(traverse, "frame", range(first + 1))[first])  # as the camera gave it
+                first = int(getattr(traverse, "frame", range(first + 1))[first])  # of the source
                 raise InputError(
                     f"{traverse.name}: frame {first} gives NaN or infinite features; expected finite numbers"
                 )
