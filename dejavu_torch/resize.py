@@ -20,7 +20,8 @@ def resize_frames(frames: Tensor, size: tuple[int, int] | None) -> Tensor:
     """
     if size is None or tuple(frames.shape[-2:]) == tuple(size):
         return frames
+    height, width = size
     from kornia.geometry.transform import resize  # loading kornia takes a third of a second
 
-    resized: Tensor = resize(frames, tuple(size), antialias=True)
+    resized: Tensor = resize(frames, (height, width), antialias=True)
     return resized

@@ -159,8 +159,9 @@ def measured_distance(resampled: ResampledTraverse) -> float | None:
     span, metres = (getattr(resampled.traverse, name, None) for name in ("ground_span", "distance"))
     if span is None or metres is None:
         return None
-    rows = float(resampled.positions[-1]) * resampled.step  # of pixels
-    return rows * float(span) / (resampled.normalizer.size[0] - 1) / float(metres[-1] - metres[0])
+    rows = float(resampled.positions[-1]) * resampled.step  # of pixels; the patch spans `ground_span` metres
+    measured = rows / (resampled.odometry.size[0] - 1) * float(span)
+    return measured / float(metres[-1] - metres[0])
 
 
 def structure_cuts(reference: Traverse) -> list[int]:
@@ -287,8 +288,9 @@ def known_boundaries(
 def _mapper(model: DejaVu) -> TemplateMapper | None:
     """The model's mapper, where it is one of templates on a spectrogram analysis."""
     mapper = model.mapper
-    known = isinstance(mapper, TemplateMapper) and isinstance(mapper.periods, SpectrogramAnalysis)
-    return mapper if known else None
+    if isinstance(mapper, TemplateMapper) and isinstance(mapper.periods, SpectrogramAnalysis):
+        return mapper
+    return None
 
 
 def _settings(mapper: TemplateMapper) -> dict[str, Any]:

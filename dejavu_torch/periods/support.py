@@ -91,7 +91,7 @@ def support_of(periods: Sequence[int], places: int) -> Support:
         )
     whole = tuple(int(period) for period in periods)
     phases = [np.arange(1, places) % period for period in whole]  # of every difference D
-    differ = int(sum(phase != 0 for phase in phases).min())
+    differ = int(np.sum([phase != 0 for phase in phases], 0).min())
     around = [np.minimum(phase, period - phase) for phase, period in zip(phases, whole, strict=True)]
     return Support(
         whole,
@@ -100,7 +100,7 @@ def support_of(periods: Sequence[int], places: int) -> Support:
         tuple(math.gcd(a, b) for a, b in combinations(whole, 2)),
         differ,
         max(0, (differ - 1) // 2),
-        int(sum(around)[1:].min()),
+        int(np.sum(around, 0)[1:].min()),
     )
 
 
