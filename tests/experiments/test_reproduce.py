@@ -49,6 +49,7 @@ def aerial() -> Comparison:
     return reproduce("aerial", frames=FRAMES, lengths=LENGTHS)
 
 
+@pytest.mark.slow
 def test_the_second_traverse_stands_at_top_level(aerial: Comparison) -> None:
     pair = [open_source(f"sim:aerial?frames={FRAMES}&traverse={traverse}") for traverse in (0, 1)]
     alone = compare(pair[0], pair[1], model=paper_model()).report.as_json()
@@ -57,6 +58,7 @@ def test_the_second_traverse_stands_at_top_level(aerial: Comparison) -> None:
         assert report[key] == alone[key], key
 
 
+@pytest.mark.slow
 def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial: Comparison) -> None:
     report = aerial.report.as_json()
     assert report["ideal"]["recall_at_1"] > 0.99 > report["recall_at_1"]
@@ -64,6 +66,7 @@ def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial: Comparis
     assert report["published"] == PUBLISHED["aerial"]._asdict()
 
 
+@pytest.mark.slow
 def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> None:
     rows = aerial.report.facts["chunk_lengths"]
     assert [row["window"] for row in rows] == [512, 1024]  # 2048 is longer than the route
@@ -82,6 +85,7 @@ def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> No
     assert rows[0]["recall_at_1_comparable"] == again.recall_at_1
 
 
+@pytest.mark.slow
 def test_section_five_sets_the_papers_numbers_beside_ours(aerial: Comparison) -> None:
     head, paper, ideal, leave_out, own, *others = section_five({"aerial": aerial.report})
     assert paper[1:4] == ["0.2064", "0.9590", "0.9813"]
@@ -101,11 +105,13 @@ def test_section_five_sets_the_papers_numbers_beside_ours(aerial: Comparison) ->
     assert {len(row) for row in (head, paper, ideal, own, *others)} == {len(head)}
 
 
+@pytest.mark.slow
 def test_every_picture_of_the_paper_is_there(aerial: Comparison) -> None:
     assert {"frames", "autocorrelogram", "layers", "pr", "auc", "coverage", "chunks"} < set(aerial.pictures)
     assert {"spectrogram", "templates", "features", "activations"} < set(aerial.pictures)
 
 
+@pytest.mark.slow
 def test_each_dataset_tells_what_its_map_holds(aerial: Comparison) -> None:
     facts = aerial.report.facts
     (line,) = route_lines({"aerial": aerial.report})
@@ -115,6 +121,7 @@ def test_each_dataset_tells_what_its_map_holds(aerial: Comparison) -> None:
     assert "no periods in 0 chunks" in route_lines({"aerial": nothing})[0]
 
 
+@pytest.mark.slow
 def test_a_number_the_paper_does_not_tell_is_left_empty(aerial: Comparison) -> None:
     report = aerial.report._replace(
         facts={**aerial.report.facts, "published": Published(0.0032, None, 0.6998)._asdict()}
@@ -127,6 +134,7 @@ def test_other_datasets_are_refused() -> None:
         reproduce("moon")
 
 
+@pytest.mark.slow
 def test_the_command_writes_an_index_over_the_reports(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -157,6 +165,7 @@ def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.
     return distance
 
 
+@pytest.mark.slow
 def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
     facts, route = outdoor.report.facts, outdoor.model.map
     assert facts["unit"] != "frames"
@@ -170,6 +179,7 @@ def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
     assert bend(metres_of(outdoor, 0, route.frame_of(torch.arange(route.places)))) < 2.5
 
 
+@pytest.mark.slow
 def test_the_measured_distance_is_reported(outdoor: Comparison) -> None:
     measured = outdoor.report.facts["measured_distance"]
     assert list(measured.values()) == pytest.approx([1, 1], abs=0.05)
@@ -177,6 +187,7 @@ def test_the_measured_distance_is_reported(outdoor: Comparison) -> None:
     assert f"is {measured['reference']:.3f} and {measured['query']:.3f} of the true one" in line
 
 
+@pytest.mark.slow
 def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> None:
     assert outdoor.truth is not None
     right = outdoor.truth.positives[:, 0]
@@ -187,6 +198,7 @@ def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> 
     assert (reference - query).abs().max() < 0.8  # metres; a step is about 0.4
 
 
+@pytest.mark.slow
 def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
     cuts = structure_cuts(open_source("sim:outdoor?frames=420"))
     assert cuts
@@ -202,6 +214,7 @@ def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
     assert {"velocity", "frames", "layers", "autocorrelogram"} < set(outdoor.pictures)
 
 
+@pytest.mark.slow
 def test_comparable_scores_are_means_on_the_same_map(outdoor: Comparison) -> None:
     mapper = TemplateMapper(SpectrogramAnalysis(64, **PAPER))
     model = DejaVu(mapper=mapper).learn_features(outdoor.reference_features)
@@ -213,6 +226,7 @@ def test_comparable_scores_are_means_on_the_same_map(outdoor: Comparison) -> Non
     assert outdoor.report.ours.scores != comparable
 
 
+@pytest.mark.slow
 def test_other_lengths_store_the_positions_of_the_frames_too(outdoor: Comparison) -> None:
     row = outdoor.report.facts["chunk_lengths"][1]
     assert (row["window"], row["map_bytes"]) == (64, outdoor.report.facts["map_bytes"])
@@ -230,6 +244,7 @@ def test_cuts_are_the_frames_at_which_a_structure_starts_or_stops() -> None:
     assert structure_cuts(ArrayTraverse(torch.rand(64, 3))) == []
 
 
+@pytest.mark.slow
 def test_the_effect_of_boundaries_is_a_line(aerial: Comparison) -> None:
     assert boundary_lines({"aerial": aerial.report}) == []
     effects = {"cuts": 7, "known_boundaries": BoundaryEffect(32, 10, 20, 0.25, None)._asdict()}
