@@ -14,7 +14,7 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"types"},
+    {"types", "resize"},
     {"features", "periods", "data"},
     {"database"},
     {"recognition"},
@@ -55,7 +55,7 @@ def rooms_imported(source: str, file: Path) -> Iterator[tuple[int, str]]:
 
 
 def front_door_rank() -> int:
-    """Whoever imports the front door imports all the rooms that it opens at once, not those it opens lazily."""
+    """Whoever imports the front door imports the rooms that it opens at once, not the lazy ones."""
     tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
     source = ast.unparse([node for node in tree.body if not isinstance(node, ast.If)])
     return max(RANK[room] for _, room in rooms_imported(source, Path("__init__.py")))

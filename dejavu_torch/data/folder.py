@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
@@ -63,7 +63,7 @@ class ImageFolder(IndexedTraverse):
         image = read_image(file)
         size = fitted_size(image.shape[1], image.shape[2], self.width, self.height)
         if size != image.shape[1:]:
-            image = interpolate(image[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+            image = resize_frames(image[None], size)[0].clamp(0, 1)
         channels, height, width = image.shape
         shape = f"{height} x {width} pixels of {channels} channel{'s' * (channels > 1)}"
         self._first = self._first or (file.name, shape)

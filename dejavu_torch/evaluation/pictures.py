@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.transform import resize
 from torch import Tensor
 
 from dejavu_torch.database.template_map import TemplateMap
@@ -36,6 +35,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Traverse
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
@@ -380,10 +380,7 @@ def as_hog_sees(model: DejaVu, frame: Tensor) -> Tensor:
     """A frame (C,H,W) after the model's preprocessing and HOG's own antialiased resize."""
     with torch.no_grad():
         seen: Tensor = model.preprocess(frame[None])
-    size = getattr(model.features, "resize", None)
-    if size is not None and tuple(seen.shape[-2:]) != size:
-        seen = resize(seen, size, antialias=True)
-    return seen[0]
+    return resize_frames(seen, getattr(model.features, "resize", None))[0]
 
 
 def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:

@@ -3,30 +3,71 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from math import inf
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 import dejavu_torch
 from dejavu_torch.data.files import make_output_folder, whole_file
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.evaluation.score_plots import plot_ratios
-from dejavu_torch.experiments.race import Row, Run, Runner, race
 from dejavu_torch.features.hog import hog
 from dejavu_torch.types import InputError
 
 BATCH = 64
-PATIENCE = 60  # seconds for one contender, all its runs together
+AT_MOST = 60  # seconds for all runs of one contender together
 COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu")
+MEMORY = Path("/proc/self/statm")
 
 Sizes = Sequence[tuple[int, int]]
+Run = Callable[[], Tensor]
+
+
+class Program(NamedTuple):
+    """A contender: a program that can do the work of a case.
+
+    name: ours start with "dejavu". threads: that it may use. prepare: imports what it needs and returns
+    what does the work; a result with fewer rows than the case has stands for a part of the work.
+    """
+
+    name: str
+    threads: int
+    prepare: Callable[[], Run]
+
+
+class Row(NamedTuple):
+    """What one contender took for one case; None where it is not known.
+
+    seconds: for the whole case, best of the repeats. seconds_first: of the first run, with all that is
+    loaded and compiled for it. ratio_to_ours: seconds over those of our fastest. peak_bytes: most
+    memory held during a run beyond what was held before. bytes: of the result. difference: largest to
+    our result. measured_rows: where only a part of the case was run: seconds and bytes are scaled up
+    from it, seconds_first and peak_bytes are its own. skipped: why there are no figures.
+    """
+
+    case: str
+    contender: str
+    seconds: float | None = None
+    seconds_first: float | None = None
+    ratio_to_ours: float | None = None
+    peak_bytes: int | None = None
+    bytes: int | None = None
+    threads: int | None = None
+    difference: float | None = None
+    measured_rows: int | None = None
+    skipped: str | None = None
 
 
 def bench_matcher(
@@ -87,7 +128,7 @@ def _hog_case(case: str, some: Tensor, frames: int, repeats: int) -> list[Row]:
         one(pictures[0])
         began = time.perf_counter()
         one(pictures[0])
-        possible = PATIENCE / (repeats + 2) / (time.perf_counter() - began)
+        possible = AT_MOST / (repeats + 2) / (time.perf_counter() - began)
         part = min(frames, 1 + int(possible))
 
         def run() -> Tensor:
@@ -98,8 +139,11 @@ def _hog_case(case: str, some: Tensor, frames: int, repeats: int) -> list[Row]:
 
         return run
 
-    threads = torch.get_num_threads()
-    return race(case, Runner("dejavu", threads, lambda: ours), [Runner("scikit-image", 1, skimage)], repeats)
+    contenders = [
+        Program("dejavu", torch.get_num_threads(), lambda: ours),
+        Program("scikit-image", 1, skimage),
+    ]
+    return benchmark(case, contenders, repeats)
 
 
 def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_compile: bool) -> list[Row]:
@@ -134,18 +178,95 @@ def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_co
         pairwise = partial(faiss.pairwise_distances, metric=faiss.METRIC_L1)
         return lambda: torch.from_numpy(pairwise(query.numpy(), templates.numpy()))
 
-    return race(
-        case,
-        Runner("dejavu", threads, lambda: partial(phase_distances, query, templates)),
-        [
-            Runner("dejavu (eager torch)", threads, eager),
-            Runner("torch.cdist", threads, lambda: partial(torch.cdist, query, templates, p=1.0)),
-            Runner("torch.compile", threads, compiled),
-            Runner("scipy cdist", 1, scipy),
-            Runner("faiss", threads, faiss),
-        ],
-        repeats,
-    )
+    contenders = [
+        Program("dejavu", threads, lambda: partial(phase_distances, query, templates)),
+        Program("dejavu (eager torch)", threads, eager),
+        Program("torch.cdist", threads, lambda: partial(torch.cdist, query, templates, p=1.0)),
+        Program("torch.compile", threads, compiled),
+        Program("scipy cdist", 1, scipy),
+        Program("faiss", threads, faiss),
+    ]
+    return benchmark(case, contenders, repeats)
+
+
+def benchmark(case: str, contenders: Sequence[Program], repeats: int) -> list[Row]:
+    """Time all in turn, round after round, and compare every result with that of the first, which is ours.
+
+    Convention: not counted are one run of each that loads and compiles, and one that measures memory.
+        An error of the first is raised; one of another is a row that names it.
+    """
+    rows: dict[str, Row] = {}
+    runs: dict[str, tuple[Run, float]] = {}
+    expected: Tensor | None = None
+    bar = tqdm(total=len(contenders) * (1 + repeats), desc=case, disable=None, leave=False)
+    for name, threads, prepare in contenders:
+        bar.update()
+        try:
+            began = time.perf_counter()
+            run = prepare()
+            result = run()
+            first = time.perf_counter() - began
+            peak = peak_memory(run)
+            expected = result if expected is None else expected
+            difference = float((result - expected[: len(result)]).abs().max())
+        except Exception as error:  # whatever another program fails with
+            if expected is None:
+                raise
+            line = " ".join(str(error).split())
+            rows[name] = Row(case, name, skipped=f"{type(error).__name__}: {line}"[:200])
+            continue
+        rows[name] = Row(
+            case,
+            name,
+            seconds_first=first,
+            peak_bytes=peak,
+            bytes=result.nbytes * len(expected) // len(result),
+            threads=threads,
+            difference=difference,
+            measured_rows=len(result) if len(result) < len(expected) else None,
+        )
+        runs[name] = run, len(expected) / len(result)
+        del result  # it would hide what the next one needs
+    best = dict.fromkeys(runs, inf)
+    for _ in range(repeats):
+        for name, (run, scale) in runs.items():
+            began = time.perf_counter()
+            run()
+            best[name] = min(best[name], scale * (time.perf_counter() - began))
+            bar.update()
+    bar.close()
+    fastest = min(seconds for name, seconds in best.items() if name.startswith("dejavu"))
+    for name, seconds in best.items():
+        rows[name] = rows[name]._replace(seconds=seconds, ratio_to_ours=seconds / fastest)
+    return list(rows.values())
+
+
+def peak_memory(run: Run) -> int | None:
+    """Most bytes of memory during a run beyond those before it; None where the system has no /proc."""
+    if not MEMORY.exists():
+        return None
+    before = most = _resident()
+    done = threading.Event()
+
+    def watch() -> None:
+        nonlocal most
+        while not done.wait(0.002):
+            most = max(most, _resident())
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        result = run()
+        last = _resident()  # with the result: a run that keeps Python's lock stops the watcher
+        del result
+    finally:
+        done.set()
+        watcher.join()
+    return max(most, last) - before
+
+
+def _resident() -> int:
+    return int(MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 BENCHES = {"matcher": bench_matcher}

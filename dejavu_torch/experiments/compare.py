@@ -121,7 +121,7 @@ def compare(
         known = _ground_truth(truth, sources, reference, query, interpolate, lengths)
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
-    match = _of_shown_frames(match, model.map)
+    match = of_shown_frames(match, model.map)
     run = Localization(model, reference, query, reference_features, query_features, match, known, tolerance)
     contenders = _contenders(run, seed, leave_out, progress)
     facts = _facts(run, clock)
@@ -217,7 +217,7 @@ def _check_places(route: PlaceMap, name: str, places: int) -> None:
         )
 
 
-def _of_shown_frames(match: Match, route: PlaceMap) -> Match:
+def of_shown_frames(match: Match, route: PlaceMap) -> Match:
     """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
     return match._replace(index=route.place_of(route.frame_of(match.index)))
 
@@ -232,7 +232,7 @@ def _contenders(run: Localization, seed: int, leave_out: int | None, progress: b
     size = model.summary().map_bytes
     contenders = {"map": contend("this map", run.match, run.truth, tolerance, size)}
     for key, (name, match, bytes, k) in baselines.items():
-        truth, match = run.truth, _of_shown_frames(match, model.map)
+        truth, match = run.truth, of_shown_frames(match, model.map)
         if key == "leave_out":  # its queries are the places themselves
             truth = ground_truth_in_places(as_ground_truth(_own_frames(model.map)), model.map.place_of)
         contenders[key] = contend(name, match, truth, tolerance, bytes, k)

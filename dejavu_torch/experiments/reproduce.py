@@ -1,48 +1,53 @@
-"""The paper's experiments on simulated routes, beside the paper's own numbers (section V)."""
+"""The paper's experiments on simulated routes, beside the paper's own figures (section V)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
+from dejavu_torch.data.ground_truth import counted, is_right
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.truth import places_of_frames
-from dejavu_torch.database.scores import Matcher
-from dejavu_torch.evaluation.contenders import contend
-from dejavu_torch.evaluation.controls import leave_out_match, same_settings
+from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.evaluation.contenders import Contender, contend
+from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.pictures import Localization, paper_pictures
+from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
-from dejavu_torch.evaluation.score_plots import Length
-from dejavu_torch.experiments.boundaries import known_boundaries
-from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.section_five import PUBLISHED
+from dejavu_torch.evaluation.score_plots import Length, plot_lengths
+from dejavu_torch.experiments.compare import Comparison, compare, of_shown_frames
+from dejavu_torch.experiments.paper_tables import PUBLISHED
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 LENGTHS = (256, 512, 1024, 2048)
 PATCH = (32, 32)  # pixels: as many rows as the region of ground has in a frame, and some more
+SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "short")  # of the analysis, but for its chunks
 
 
 def paper_model(reference: Traverse | None = None) -> DejaVu:
-    """The paper's letter: the settings of configs/paper.yaml.
+    """The settings of configs/paper.yaml, the paper to the letter.
 
     Args:
-        reference: a railway, whose `ground` gives the velocity (section IV-B); others are taken as they come.
+        reference: a traverse whose `ground`, where it has one, gives the velocity (section IV-B).
     """
     periods = SpectrogramAnalysis(min_period=8, peaks="bins", false_alarm=None, short="refuse")
     ground = getattr(reference, "ground", None)
     velocity = None if ground is None else GroundOdometry(ground, PATCH)
-    return DejaVu(periods=periods, reduction="sum", velocity=velocity)
+    return DejaVu(mapper=TemplateMapper(periods, reduction="sum"), velocity=velocity)
 
 
 def reproduce(
     dataset: str,
     model: DejaVu | None = None,
+    *,
     tolerance: int = 5,
     seed: int = 0,
     frames: int | None = None,
@@ -54,19 +59,20 @@ def reproduce(
     Args:
         dataset: a key of `PUBLISHED`.
         model: settings; None is `paper_model` of the dataset.
-        tolerance: frames within which a place is right, inclusive.
+        tolerance: places within which one is right, inclusive.
         seed: of the simulated route. frames: its length, None is the simulator's own.
-        lengths: of chunks, frames, to compare.
+        lengths: of chunks, in places, to compare.
         progress: show progress bars on a terminal.
 
     Returns:
-        The comparison of the second traverse. Its report has two more entries: `ideal`, the paper's
-        conditions, in which the database itself is queried and every frame stands in its own templates;
-        and `ideal_leave_out`, where all frames within the tolerance of the query are left out of every
-        mean. The fact `chunk_lengths` tells recall and bytes for each of `lengths`. Where the simulator
-        tells where structures start and stop, two entries tell what that costs: `comparable`, the same
-        chunks with scores that are comparable between them, and `known_boundaries`, chunks cut there; the
-        fact `boundaries` tells recall near to the cuts and far from them in both.
+        The comparison of the second traverse, with more entries in its report:
+
+        - `ideal`, the paper's conditions: the database itself is queried, and every frame is part of its own
+          templates; `ideal_leave_out`, where all frames within the tolerance of the query are left out of
+          every mean;
+        - `comparable` and `known_boundaries`, on a route whose simulator knows its structures, see
+          `known_boundaries`; the fact `boundaries` has their `BoundaryEffect`;
+        - the facts `published`, `chunk_lengths`, a `Length` each, and `measured_distance` of a train.
 
     Raises:
         InputError: an unknown dataset, or bad input of any of the stages.
@@ -75,78 +81,91 @@ def reproduce(
         raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(PUBLISHED)}")
     address = f"sim:{dataset}?seed={seed}" + (f"&frames={frames}" if frames else "")
     reference, query = open_source(address), open_source(f"{address}&traverse=1")
-    result = compare(
-        reference,
-        query,
-        model=paper_model(reference) if model is None else model,
-        tolerance=tolerance,
-        progress=progress,
-    )
-    model, stored = result.model, result.stored
-    itself = torch.arange(len(stored))[:, None]
-    matches = {
-        "ideal": ("ideal: the database itself", model.localize(stored)),
-        "ideal_leave_out": (
-            f"ideal, +-{tolerance} frames left out",
-            leave_out_match(model, stored, tolerance),
-        ),
-    }
-    contenders = dict(result.report.contenders)
-    for key, (name, match) in matches.items():
-        contenders[key] = contend(name, match, itself, tolerance)
-    found = chunk_lengths(result, tolerance, lengths)
-    facts = {
+    model = paper_model(reference) if model is None else model
+    result = compare(reference, query, model=model, tolerance=tolerance, progress=progress)
+    contenders = {**result.report.contenders, **ideal(result, tolerance)}
+    facts: dict[str, Any] = {
         **result.report.facts,
         "published": PUBLISHED[dataset]._asdict(),
-        "chunk_lengths": [row._asdict() for row in found],
+        "chunk_lengths": [row._asdict() for row in chunk_lengths(result, tolerance, lengths)],
     }
     if isinstance(result.reference, ResampledTraverse) and isinstance(result.query, ResampledTraverse):
-        shares = {"reference": way_share(result.reference), "query": way_share(result.query)}
-        facts["way_measured"] = shares
+        pair = {"reference": result.reference, "query": result.query}
+        facts["measured_distance"] = {name: measured_distance(one) for name, one in pair.items()}
     cuts = structure_places(result, structure_cuts(reference))
-    if cuts and result.truth is not None:
-        known = known_boundaries(result, cuts, tolerance)
-        contenders |= {"comparable": known.fixed, "known_boundaries": known.known}
-        facts["boundaries"] = {
-            "cuts": len(cuts),
-            "comparable": known.fixed_effect._asdict(),
-            "known_boundaries": known.known_effect._asdict(),
-        }
-    run = Localization(
-        *(model, result.reference, result.query, stored, result.seen, result.match, result.truth, tolerance)
+    if cuts:
+        boundaries = known_boundaries(result, cuts, tolerance)
+        contenders |= {key: contender for key, (contender, _) in boundaries.items()}
+        effects = {key: effect._asdict() for key, (_, effect) in boundaries.items()}
+        facts["boundaries"] = {"cuts": len(cuts), **effects}
+    pictures = paper_pictures(Localization(*result[2:], tolerance))
+    return result._replace(
+        report=Report(result.report.ours, contenders, facts), pictures={**pictures, **result.pictures}
     )
-    pictures = paper_pictures(run) | dict(result.pictures)
-    return result._replace(report=Report(result.report.ours, contenders, facts), pictures=pictures)
+
+
+def ideal(result: Comparison, tolerance: int) -> dict[str, Contender]:
+    """The database queried with itself: the paper's conditions, and the same with the neighbours left out."""
+    model, features = result.model, result.reference_features
+    itself = torch.arange(len(features))[:, None]
+    left_out, name = leave_out_match(model, features, tolerance), f"ideal, +-{tolerance} frames left out"
+    return {
+        "ideal": contend("ideal: the database itself", model.localize(features), itself, tolerance),
+        "ideal_leave_out": contend(name, left_out, itself, tolerance),
+    }
 
 
 def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int] = LENGTHS) -> list[Length]:
     """Recall and storage of maps whose chunks have other lengths (section VI).
 
     Args:
-        result: with the other settings. lengths: in frames; those longer than the reference are left out.
+        result: with the other settings. lengths: in places; those longer than the reference are left out.
+
+    Returns:
+        A row for each length; none without ground truth, or with periods of another finder.
     """
-    rows: list[Length] = []
-    model, stored = result.model, result.stored
-    if result.truth is None or not isinstance(model.periods, SpectrogramAnalysis):
-        return rows
-    names = ("min_period", "strongest", "peaks", "false_alarm", "similar", "short")
-    kept = {name: getattr(model.periods, name) for name in names}
+    mapper, places = _mapper(result.model), len(result.reference_features)
+    if result.truth is None or mapper is None:
+        return []
+    rows = []
     for window in lengths:
-        if window <= len(stored):
-            other = same_settings(model)
-            other.periods = SpectrogramAnalysis(window, **kept)
-            other.learn_features(stored, result.reference)
-            size, found = other.map_bytes, []
-            for reduction in (model.matcher.reduction, "mean"):
-                other.matcher = Matcher(model.matcher.metric, reduction)
-                found.append(evaluate(other.localize(result.seen), result.truth, tolerance))
-            scores = found[0].recall_at_1, found[0].auc, found[1].recall_at_1
-            rows.append(Length(window, *scores, size, size / len(stored)))
+        if window > places:
+            continue
+        periods = SpectrogramAnalysis(window, **_settings(mapper))
+        model = _learned(result, TemplateMapper(periods, mapper.metric, mapper.reduction))
+        size = model.summary().map_bytes
+        scores = evaluate(_localized(model, result), result.truth, tolerance)
+        template_map_of(model, "a comparable score").reduction = "mean"
+        comparable = evaluate(_localized(model, result), result.truth, tolerance).recall_at_1
+        rows.append(Length(window, scores.recall_at_1, scores.auc, comparable, size, size / places))
     return rows
 
 
+def lengths_picture(reports: Mapping[str, Report]) -> Picture:
+    """Recall and bytes over the length of the chunks, a line for each dataset."""
+    rows = {
+        name: [Length(**row) for row in report.facts["chunk_lengths"]] for name, report in reports.items()
+    }
+    return Picture(
+        plot_lengths(rows),
+        "how long should a chunk be?",
+        "Recall on the second traverse, and bytes per place, of maps whose chunks have other lengths. The "
+        "paper's is 1024 frames. Dotted: with the printed sum, which favours a last chunk that is shorter.",
+    )
+
+
+def measured_distance(resampled: ResampledTraverse) -> float | None:
+    """The distance that the ground shows, as a share of what a simulated train travels; None elsewhere."""
+    span, metres = (getattr(resampled.traverse, name, None) for name in ("ground_span", "distance"))
+    if span is None or metres is None:
+        return None
+    rows = float(resampled.positions[-1]) * resampled.step  # of pixels; the patch spans `ground_span` metres
+    measured = rows / (resampled.odometry.size[0] - 1) * float(span)
+    return measured / float(metres[-1] - metres[0])
+
+
 def structure_cuts(reference: Traverse) -> list[int]:
-    """Reference frames at which something that repeats starts or stops, where the traverse tells.
+    """Reference frames at which something that repeats starts or stops, where the traverse knows.
 
     A simulated railway has `structures`, (name, period, start, stop) in metres, and `distance`, (N,)
     metres of each frame.
@@ -155,24 +174,135 @@ def structure_cuts(reference: Traverse) -> list[int]:
     if structures is None or distance is None:
         return []
     metres = {float(edge) for _, _, start, stop in structures for edge in (start, stop)}
-    inside = [edge for edge in sorted(metres) if float(distance[0]) < edge < float(distance[-1])]
-    return sorted(
-        set(torch.searchsorted(distance.double(), torch.tensor(inside, dtype=torch.float64)).tolist())
-    )
-
-
-def way_share(even: ResampledTraverse) -> float | None:
-    """How far the ground says that a simulated train came, as a share of how far it did; None elsewhere."""
-    span, metres = (getattr(even.traverse, name, None) for name in ("ground_span", "distance"))
-    if span is None or metres is None:
-        return None
-    rows = float(even.way[-1]) * even.step
-    return rows * float(span) / (even.normalizer.size[0] - 1) / float(metres[-1] - metres[0])
+    inside = [edge for edge in metres if float(distance[0]) < edge < float(distance[-1])]
+    frames = torch.searchsorted(distance.double(), torch.tensor(inside, dtype=torch.float64))
+    return sorted(set(frames.tolist()))
 
 
 def structure_places(result: Comparison, cuts: Sequence[int]) -> list[int]:
     """Frames of the reference as places of its map, each once."""
-    if result.shown is None:
-        return list(cuts)
-    places: list[int] = places_of_frames(torch.tensor(cuts), result.shown).unique().tolist()
+    places: list[int] = result.model.map.place_of(torch.tensor(cuts, dtype=torch.int64)).unique().tolist()
     return places
+
+
+class GivenChunks(SpectrogramAnalysis):
+    """The spectrogram analysis on chunks that are known beforehand.
+
+    Args:
+        cuts: the places at which a chunk ends and the next begins, increasing.
+        settings: see SpectrogramAnalysis; window and hop have no effect.
+
+    Convention: a piece of fewer than two of the shortest periods joins the piece before it.
+    """
+
+    def __init__(self, cuts: Sequence[int], **settings: Any) -> None:
+        super().__init__(**settings)
+        self.cuts = list(cuts)
+
+    def chunks(self, frames: int) -> list[tuple[int, int]]:
+        """The chunks [start, stop) of a traverse of `frames` frames."""
+        shortest = 2 * self.min_period
+        if frames < shortest:
+            raise InputError(f"the traverse has {frames} frames; expected at least {shortest}, two periods")
+        edges = [0]
+        for cut in self.cuts:
+            if edges[-1] + shortest <= cut <= frames - shortest:
+                edges.append(cut)
+        return list(pairwise([*edges, frames]))
+
+
+class BoundaryEffect(NamedTuple):
+    """Recall@1 of queries near to where something starts or stops, and of the others.
+
+    near: places within which a query counts as near. queries_near, queries_far: how many there are.
+    recall_at_1_near, recall_at_1_far: None where there are none.
+    """
+
+    near: int
+    queries_near: int
+    queries_far: int
+    recall_at_1_near: float | None
+    recall_at_1_far: float | None
+
+
+def boundary_effect(
+    match: Match, truth: GroundTruth, cuts: Sequence[int], tolerance: int, near: int = 32
+) -> BoundaryEffect:
+    """Recall@1 near to the cuts and far from them.
+
+    Args:
+        cuts: places at which something starts or stops, at least one.
+        near: places.
+
+    Shape: match and truth of Q queries.
+    """
+    if not cuts:
+        raise InputError("there are no cuts; expected at least one place at which something starts or stops")
+    answered = counted(match.index, truth, tolerance) & (truth.positives >= 0).any(1)
+    right = is_right(match.index, truth.positives, tolerance)
+    distance = (truth.positives[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
+    close = ((distance <= near) & (truth.positives >= 0)).any(1)
+
+    def recall(which: Tensor) -> float | None:
+        return float(right[which].double().mean()) if which.any() else None
+
+    inside, outside = answered & close, answered & ~close
+    return BoundaryEffect(near, int(inside.sum()), int(outside.sum()), recall(inside), recall(outside))
+
+
+def known_boundaries(
+    result: Comparison, cuts: Sequence[int], tolerance: int
+) -> dict[str, tuple[Contender, BoundaryEffect]]:
+    """What it costs that chunks do not end where what repeats starts and stops (section V, underground).
+
+    Returns:
+        Two maps of comparable scores (`reduction="mean"`), each with its recall near to the cuts and far from
+        them: `comparable` on the chunks of the comparison, `known_boundaries` on chunks that end at the cuts.
+        The printed sum of eq. 4 would hide the effect: of chunks of different size the one of the fewest
+        features gets nearly all queries.
+
+    Raises:
+        InputError: a comparison without ground truth, or with periods of another finder.
+    """
+    mapper, truth = _mapper(result.model), result.truth
+    if truth is None or mapper is None:
+        raise InputError(
+            "known boundaries need a ground truth and SpectrogramAnalysis; this comparison has not both"
+        )
+    contenders = {
+        "comparable": ("the same chunks, comparable scores", mapper.periods),
+        "known_boundaries": (
+            "chunks cut where structures start and stop, comparable scores",
+            GivenChunks(cuts, **_settings(mapper)),
+        ),
+    }
+    found = {}
+    for key, (name, periods) in contenders.items():
+        model = _learned(result, TemplateMapper(periods, mapper.metric, "mean"))
+        match, size = _localized(model, result), model.summary().map_bytes
+        contender = contend(name, match, truth, tolerance, size)
+        found[key] = contender, boundary_effect(match, truth, cuts, tolerance)
+    return found
+
+
+def _mapper(model: DejaVu) -> TemplateMapper | None:
+    """The model's mapper, where it is one of templates on a spectrogram analysis."""
+    mapper = model.mapper
+    if isinstance(mapper, TemplateMapper) and isinstance(mapper.periods, SpectrogramAnalysis):
+        return mapper
+    return None
+
+
+def _settings(mapper: TemplateMapper) -> dict[str, Any]:
+    """The settings of a spectrogram analysis, but for its chunks."""
+    return {name: getattr(mapper.periods, name) for name in SETTINGS}
+
+
+def _learned(result: Comparison, mapper: TemplateMapper) -> DejaVu:
+    """The model of a comparison with a map of another mapper."""
+    model = with_mapper(result.model, mapper)
+    return model.learn_features(result.reference_features, result.reference)
+
+
+def _localized(model: DejaVu, result: Comparison) -> Match:
+    return of_shown_frames(model.localize(result.query_features), model.map)

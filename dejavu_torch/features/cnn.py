@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
+from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError
 
 FLAT = 2 / 255  # contrast below which nothing is blown up
@@ -120,8 +120,7 @@ class SmallCNN(nn.Module):
                 f"SmallCNN got frames {tuple(frames.shape)}; expected (B,{self.channels},H,W), "
                 f"as channels={self.channels} says"
             )
-        if tuple(frames.shape[-2:]) != self.resize:
-            frames = antialiased_resize(frames, self.resize, antialias=True)
+        frames = resize_frames(frames, self.resize)
         if self.cell:
             frames = local_contrast(frames, self.cell)
         features: Tensor = self.linear(self.convolutions(frames).flatten(1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator
 
 import torch
@@ -14,8 +13,6 @@ from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-BATCH_NUMBERS = 2**26  # in the frames of a batch, 256 MB
-
 
 def feature_batches(
     traverse: Traverse,
@@ -24,11 +21,11 @@ def feature_batches(
     device: torch.device | str = "cpu",
     progress: str | None = None,
 ) -> Iterator[Tensor]:
-    """Run the frames of a traverse through a feature module, in order, without gradients.
+    """Features of the frames of a traverse, in order, without gradients.
 
     Args:
-        traverse: frames (B,C,H,W), or ready features (B,D), which pass as they are.
-        module: (B,C,H,W) -> (B,D). Runs in eval mode; its own mode is restored.
+        traverse: frames (B,C,H,W), or ready features (B,D), which are passed on.
+        module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time; fewer where they are large.
         progress: text of a progress bar on stderr, shown on a terminal only; None is no bar.
 
@@ -44,8 +41,7 @@ def feature_batches(
     )
     try:
         module.eval()
-        room = BATCH_NUMBERS // max(1, math.prod(frame_shape(traverse)))
-        for batch in traverse.batches(max(1, min(batch_size, room))):
+        for batch in traverse.batches(traverse.batch_size(batch_size)):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
             if features.dtype in (torch.float16, torch.bfloat16):  # too coarse to add up and to transform
@@ -53,7 +49,7 @@ def feature_batches(
             bad = ~features.isfinite().all(1)
             if bad.any():
                 first = done + int(bad.nonzero()[0])
-                first = int(getattr(traverse, "frame", range(first + 1))[first])  # as the camera gave it
+                first = int(getattr(traverse, "frame", range(first + 1))[first])  # of the source
                 raise InputError(
                     f"{traverse.name}: frame {first} gives NaN or infinite features; expected finite numbers"
                 )
@@ -87,11 +83,6 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
             f"expected features ({len(batch)}, D)"
         )
     return features
-
-
-def frame_shape(traverse: Traverse) -> tuple[int, ...]:
-    """Shape of one frame of a traverse: (C,H,W), or (D,) where it gives ready features."""
-    return traverse.frame_shape
 
 
 def check_queries(

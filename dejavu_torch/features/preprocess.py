@@ -1,4 +1,4 @@
-"""What may come ahead of the features: one channel of the colours, and even contrast."""
+"""What may be done to frames ahead of the features: choose a channel, normalise the contrast."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import math
 from typing import Literal, get_args
 
 import torch
-from kornia.color import rgb_to_grayscale
-from kornia.enhance import equalize_clahe
 from torch import Tensor, nn
 
 from dejavu_torch.features.hog import parts
@@ -19,7 +17,7 @@ FLAT = 1 / 255  # one step of an 8-bit image: a smaller standard deviation says 
 
 
 def check_frames(frames: Tensor) -> None:
-    """Refuse what are no frames."""
+    """Refuse what is not a batch of float frames."""
     if frames.ndim != 4 or not frames.is_floating_point():
         raise InputError(
             f"preprocess got {tuple(frames.shape)} {frames.dtype}; expected float frames (B,C,H,W) in [0, 1]"
@@ -27,7 +25,7 @@ def check_frames(frames: Tensor) -> None:
 
 
 def channel_name(channel: str) -> str:
-    """The name as it is kept: "grey", "R", "R-B"; letters in either case are understood."""
+    """The name of a channel as it is kept: "grey", "R", "R-B"; upper and lower case mean the same."""
     name = str(channel).strip().upper()
     letters = name.split("-")
     if name == "GREY":
@@ -59,7 +57,7 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
     Args:
         frames: RGB; for "grey" also frames that are grey already, which pass unchanged.
         channel: "grey" (luminance, 0.299 R + 0.587 G + 0.114 B), "R", "G", "B", or the difference of
-            two of them such as "R-B", in either case. A difference lies in [-1, 1].
+            two of them such as "R-B", in upper or lower case. A difference lies in [-1, 1].
 
     Shape: (B,C,H,W) -> (B,1,H,W).
 
@@ -79,6 +77,8 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
     if count != 3:
         raise InputError(f"channel {name!r} of frames with {count} channels; expected the 3 of RGB")
     if name == "grey":
+        from kornia.color import rgb_to_grayscale  # loading kornia takes a third of a second
+
         grey: Tensor = rgb_to_grayscale(frames)
         return grey
     first, *second = (frames[:, COLOURS.index(colour), None] for colour in name.split("-"))
@@ -163,6 +163,8 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     """
     check_frames(frames)
     check_clahe(clip_limit, grid)
+    from kornia.enhance import equalize_clahe
+
     rows, columns = int(grid[0]), int(grid[1])
     height, width = frames.shape[-2:]
     if height <= rows or width <= columns:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.periods.finder import PeriodFinder
-from dejavu_torch.periods.layers import cluster_layers
+from dejavu_torch.periods.layers import layers_of
 from dejavu_torch.periods.stft import Spectrogram
 from dejavu_torch.types import InputError, Plan
 
@@ -29,16 +29,6 @@ class Spectrum(NamedTuple):
     start: int
     stop: int
     power: Tensor
-
-
-def bin_period(length: int, k: int) -> int:
-    """Period, in whole frames, of bin k of a spectrum over `length` frames: round(length / k).
-
-    Example:
-        >>> bin_period(1024, 11), bin_period(1024, 6)  # the paper's two periods
-        (93, 171)
-    """
-    return (2 * length + k) // (2 * k)
 
 
 def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", "local"]) -> Tensor:
@@ -99,23 +89,20 @@ class SpectrogramAnalysis(PeriodFinder):
         peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
         false_alarm: a chunk gets layers only where some frequency holds a larger share of its feature's
             power than white noise would show anywhere in the chunk with at most this probability
-            (`noise_share`), so that frames without any order get none. Smooth footage passes, whether
-            it repeats or not. None asks nothing (the paper).
-        similar: features share a layer when their frequencies lie within this many bins of the
-            layer's most common period; 0 means the same rounded period (the paper).
-        short: what to do with a traverse shorter than the window: "shrink" the window to the
-            traverse and log it, or "refuse".
+            (`noise_share`), so that frames in random order get none. Smooth footage passes, whether
+            it repeats or not. None: every chunk gets layers (the paper).
+        short: for a traverse shorter than the window: "shrink" the window to it and log that, or "refuse".
 
     Shape: features (N,D) -> tuple of G spectra, one for each chunk, each (n // 2 + 1, D).
 
-    Convention: Hann window, not centred. What remains after the last whole window is a shorter
-        window of its own; a remainder under two of the shortest periods can show none and is left
-        out. A feature that does not vary inside a chunk has no power there. Where a chunk is too
-        short for any wave to pass `false_alarm`, one logged line says so.
+    Convention: Hann window, not centred. The frames after the last whole window are a shorter window of
+        their own, left out where they are fewer than two of the shortest periods. A feature that does not
+        vary inside a chunk has no power there. Features of equal `bin_period` share a layer (`layers_of`).
+        Where a chunk is too short for any wave to pass `false_alarm`, one logged line says so.
 
     Raises:
-        InputError: not (N,D), not finite, fewer than two of the shortest periods, or a traverse
-            shorter than the window where `short` is "refuse".
+        InputError: not a float tensor (N,D), not finite, fewer frames than two of the shortest periods, or
+            than the window where `short` is "refuse".
 
     Example:
         >>> wave = torch.sin(torch.arange(256) * 2 * torch.pi / 32)[:, None]
@@ -131,7 +118,6 @@ class SpectrogramAnalysis(PeriodFinder):
         strongest: int = 2,
         peaks: Literal["local", "bins"] = "local",
         false_alarm: float | None = 1e-3,
-        similar: float = 0.0,
         short: Literal["shrink", "refuse"] = "shrink",
     ) -> None:
         super().__init__()
@@ -142,10 +128,10 @@ class SpectrogramAnalysis(PeriodFinder):
             )
         if hop is not None and not 1 <= hop <= window:
             raise InputError(f"spectrogram got hop={hop}; expected 1..{window} (the window)")
-        if peaks not in ("local", "bins") or short not in ("shrink", "refuse") or similar < 0:
+        if peaks not in ("local", "bins") or short not in ("shrink", "refuse"):
             raise InputError(
-                f"spectrogram got peaks={peaks!r}, short={short!r}, similar={similar}; expected peaks "
-                "'local' or 'bins', short 'shrink' or 'refuse', similar >= 0"
+                f"spectrogram got peaks={peaks!r}, short={short!r}; expected peaks 'local' or 'bins', "
+                "short 'shrink' or 'refuse'"
             )
         if false_alarm is not None and not 0 < false_alarm < 1:
             raise InputError(
@@ -157,9 +143,8 @@ class SpectrogramAnalysis(PeriodFinder):
         self.strongest = strongest
         self.peaks = peaks
         self.false_alarm = false_alarm
-        self.similar = similar
         self.short = short
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
     def chunks(self, frames: int) -> list[tuple[int, int]]:
         """The chunks [start, stop) that a traverse of `frames` frames is cut into."""
@@ -169,42 +154,44 @@ class SpectrogramAnalysis(PeriodFinder):
                 f"the traverse has {frames} frame{'s' * (frames != 1)}; expected at least {shortest}, "
                 f"two periods of {self.min_period}"
             )
-        window = self.window
-        if frames < window:
+        window = min(self.window, frames)
+        if window < self.window:
             if self.short == "refuse":
-                raise InputError(f"the traverse has {frames} frames; expected at least {window}, the window")
-            self._tell(f"window shrunk from {window} to {frames} frames, the whole traverse")
-            window = frames
+                raise InputError(
+                    f"the traverse has {frames} frames; expected at least {self.window}, the window"
+                )
+            self._warn_once(f"window shrunk from {self.window} to {frames} frames, the whole traverse")
         hop = min(self.hop or window, window)
-        starts = range(0, frames - window + 1, hop)
-        chunks = [(start, start + window) for start in starts]
-        rest = chunks[-1][1] if hop == window else starts[-1] + hop
+        chunks = [(start, start + window) for start in range(0, frames - window + 1, hop)]
+        rest = chunks[-1][0] + hop
         if chunks[-1][1] < frames and frames - rest >= shortest:
             chunks.append((rest, frames))
         return chunks
 
     def forward(self, features: Tensor) -> tuple[Spectrum, ...]:
-        chunks = self.chunks(len(_checked(features)))
-        return tuple(Spectrum(start, stop, _power(features[start:stop])) for start, stop in chunks)
+        check_features(features)
+        chunks = self.chunks(len(features))
+        return tuple(Spectrum(start, stop, chunk_power(features[start:stop])) for start, stop in chunks)
 
     def plan(self, features: Tensor) -> Plan:
         """The layers of a traverse, the one place where gradients stop.
 
         Shape: features (N,D) -> plan, ordered by chunk and then by period.
         """
+        check_features(features)
+        layers = []
         with torch.no_grad():
-            layers = []
-            for start, stop in self.chunks(len(_checked(features))):
-                bins, share = self._strongest(features[start:stop].detach())
+            for start, stop in self.chunks(len(features)):
+                bins, share = self._strongest(features[start:stop])
                 if self._stands_out(share, start, stop):
-                    layers += cluster_layers(bins, start, stop, self.similar)
-            return tuple(layers)
+                    layers += layers_of(bins, start, stop)
+        return tuple(layers)
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
         kept, shares = [], []
         for columns in chunk.split(max(1, NUMBERS_AT_ONCE // len(chunk)), 1):
-            power = _power(columns)
+            power = chunk_power(columns)
             bins = strongest_bins(power, self.strongest, len(chunk) // self.min_period, self.peaks)
             share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
             kept.append(bins)
@@ -217,31 +204,31 @@ class SpectrogramAnalysis(PeriodFinder):
             return True
         least = noise_share((stop - start) // 2, len(share), self.false_alarm)
         if least > HANN_PEAK:
-            self._tell(f"frames {start}-{stop - 1}: too few to tell a period from noise, so none is kept")
+            self._warn_once(f"frames {start}-{stop - 1}: too few to tell a period from noise; no layers here")
         return bool((share > least).any())
 
-    def _tell(self, message: str) -> None:
-        """Log a warning, once."""
-        if message not in self._told:
+    def _warn_once(self, message: str) -> None:
+        if message not in self._logged:
             log.warning(message)
-            self._told.add(message)
+            self._logged.add(message)
 
     def extra_repr(self) -> str:
-        names = ("window", "hop", "min_period", "strongest", "peaks", "false_alarm", "similar", "short")
+        names = ("window", "hop", "min_period", "strongest", "peaks", "false_alarm", "short")
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
 
-def _checked(features: Tensor) -> Tensor:
-    """The features, if they are (N,D) floats."""
+def check_features(features: Tensor) -> None:
+    """Refuse what is not a float tensor (N,D)."""
+    if not isinstance(features, Tensor):
+        raise InputError(f"spectrogram got a {type(features).__name__}; expected a float tensor (N,D)")
     if features.ndim != 2 or not features.is_floating_point():
         raise InputError(
             f"spectrogram got {tuple(features.shape)} {features.dtype}; expected float features (N,D)"
         )
-    return features
 
 
-def _power(chunk: Tensor) -> Tensor:
-    """Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
+def chunk_power(chunk: Tensor) -> Tensor:
+    """Power of the Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
     if not chunk.isfinite().all():
         raise InputError("spectrogram got features that are not finite; expected finite numbers")
     length = len(chunk)

@@ -1,4 +1,4 @@
-"""`dejavu bench`: who takes part, what is compared, and what is written."""
+"""`dejavu bench`: the contenders, what is compared, and what is written."""
 
 from __future__ import annotations
 
@@ -14,9 +14,18 @@ from helpers import refused
 from matplotlib.figure import Figure
 
 from dejavu_torch.evaluation.report import text_table
+from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.experiments import bench
-from dejavu_torch.experiments.bench import bench_matcher, bench_table, run_bench, write_bench
-from dejavu_torch.experiments.race import Row, Run, Runner, race
+from dejavu_torch.experiments.bench import (
+    Program,
+    Row,
+    Run,
+    bench_matcher,
+    bench_table,
+    benchmark,
+    run_bench,
+    write_bench,
+)
 
 
 def small(**options: object) -> list[Row]:
@@ -60,7 +69,7 @@ def test_a_size_is_that_of_the_result(rows: dict[tuple[str, str], Row]) -> None:
     assert rows[L1, "scipy cdist"].bytes == 9 * 410 * 8
 
 
-def test_threads_are_told(rows: dict[tuple[str, str], Row]) -> None:
+def test_threads_are_reported(rows: dict[tuple[str, str], Row]) -> None:
     assert rows[L1, "dejavu"].threads == torch.get_num_threads()
     assert rows[L1, "scipy cdist"].threads == rows[HOG, "scikit-image"].threads == 1
 
@@ -72,7 +81,7 @@ def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
         assert [row.ratio_to_ours for row in mine] == [row.seconds and row.seconds / ours for row in mine]
 
 
-def test_who_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
     found = {row.contender: row for row in small(images=[])}
     assert found["faiss"].skipped is not None
@@ -83,7 +92,7 @@ def test_who_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "PATIENCE", 0)
+    monkeypatch.setattr(bench, "AT_MOST", 0)
     ours, theirs = small(distances=[])
     assert (ours.measured_rows, theirs.measured_rows) == (None, 1)
     assert theirs.bytes == ours.bytes
@@ -109,11 +118,11 @@ class Counted:
         return self.value
 
 
-def test_a_race_goes_round_by_round_after_the_warm_up() -> None:
+def test_contenders_take_turns_after_the_warm_up() -> None:
     log: list[str] = []
     a = Counted("a", torch.zeros(4), log, pause=0.2)
     b = Counted("b", torch.tensor([0.0, 0.5]), log)
-    first, second = race("case", Runner("dejavu", 1, a.ready), [Runner("other", 2, b.ready)], 3)
+    first, second = benchmark("case", [Program("dejavu", 1, a.ready), Program("other", 2, b.ready)], 3)
     watched = 0 if first.peak_bytes is None else 1
     assert log == ["a ready", *["a"] * (1 + watched), "b ready", *["b"] * (1 + watched), *["a", "b"] * 3]
     assert first.seconds is not None
@@ -123,24 +132,24 @@ def test_a_race_goes_round_by_round_after_the_warm_up() -> None:
     assert (second.measured_rows, second.bytes, second.threads) == (2, 16, 2)
 
 
-def test_an_error_of_ours_is_raised_and_one_of_theirs_told() -> None:
+def test_an_error_of_ours_is_raised_and_one_of_theirs_is_a_row() -> None:
     def broken() -> Run:
         raise ZeroDivisionError("of\nno use")
 
     fine = Counted("a", torch.zeros(2), [])
-    rows = race("case", Runner("dejavu", 1, fine.ready), [Runner("other", 1, broken)], 1)
+    rows = benchmark("case", [Program("dejavu", 1, fine.ready), Program("other", 1, broken)], 1)
     assert rows[1] == Row("case", "other", skipped="ZeroDivisionError: of no use")
     with pytest.raises(ZeroDivisionError):
-        race("case", Runner("dejavu", 1, broken), [Runner("other", 1, fine.ready)], 1)
+        benchmark("case", [Program("dejavu", 1, broken), Program("other", 1, fine.ready)], 1)
 
 
 def test_peak_memory_sees_what_is_freed_again() -> None:
     if not Path("/proc/self/statm").exists():
-        pytest.skip("nobody tells")
+        pytest.skip("no /proc")
 
     # in a process of its own, where nothing else is freed meanwhile
     code = (
-        "import time, torch; from dejavu_torch.experiments.race import peak_memory\n"
+        "import time, torch; from dejavu_torch.experiments.bench import peak_memory\n"
         "def run():\n"
         "    large = torch.ones(16, 2**20)\n"  # 64 MiB
         "    time.sleep(0.1)\n"
@@ -162,8 +171,8 @@ def test_what_is_written(tmp_path: Path, rows: dict[tuple[str, str], Row]) -> No
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.json", "bench.png"]
 
 
-def test_a_bar_for_each_who_ran() -> None:
-    figure, axes = bench.plot_ratios({"one": {"dejavu": 1.0, "other": 2.5}, "two": {"dejavu": 1.0}})
+def test_a_bar_for_each_contender() -> None:
+    figure, axes = plot_ratios({"one": {"dejavu": 1.0, "other": 2.5}, "two": {"dejavu": 1.0}})
     assert isinstance(figure, Figure)
     assert [axis.get_title("left") for axis in axes] == ["one", "two"]
     assert [[bar.get_width() for bar in axis.patches] for axis in axes] == [[1.0, 2.5], [1.0]]
@@ -190,7 +199,7 @@ def test_run_bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(bench.BENCHES, "matcher", lambda frames, repeats: rows if frames == 8 else [])
     assert run_bench("matcher", tmp_path / "new", frames=8) == rows
     assert (tmp_path / "new" / "bench.json").exists()
-    with refused("'brew' is unknown; expected matcher"):
+    with refused("'brew'", "matcher"):
         run_bench("brew", tmp_path / "other")
     (tmp_path / "file").touch()
     with refused("file"):
@@ -201,5 +210,5 @@ def test_run_bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     "wrong", [{"frames": 0}, {"repeats": 0}, {"images": [(24, 0)]}, {"distances": [(1, 0, 1)]}]
 )
 def test_nothing_to_measure_is_refused(wrong: dict[str, object]) -> None:
-    with refused("the bench got", "expected at least 1"):
+    with refused("at least 1"):
         small(**wrong)

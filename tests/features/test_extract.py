@@ -6,11 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from helpers import refused
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, InputError, Traverse
 from dejavu_torch.features import extract
-from dejavu_torch.features.extract import feature_batches, features_of, frame_shape
+from dejavu_torch.features.extract import feature_batches, features_of
 
 
 class Pooled(nn.Module):
@@ -101,11 +102,11 @@ def test_ready_features_pass_as_they_are() -> None:
 def test_a_bad_frame_is_named_by_its_number(bad: float, size: int) -> None:
     frames = torch.rand(8, 1, 16, 16)
     frames[5, 0, 8, 8] = bad
-    with pytest.raises(InputError, match=r"frame 5 gives NaN or infinite features; expected finite"):
+    with refused("frame 5", "NaN or infinite"):
         list(feature_batches(ArrayTraverse(frames), HOG(), size))
     features = torch.rand(8, 3)
     features[5, 1] = bad
-    with pytest.raises(InputError, match=r"frame 5 "):
+    with refused("frame 5 "):
         list(feature_batches(ArrayTraverse(features), HOG(), size))
 
 
@@ -115,7 +116,7 @@ def test_a_bad_frame_is_named_by_its_number(bad: float, size: int) -> None:
     ids=["images", "one vector", "one row"],
 )
 def test_a_module_that_makes_no_feature_rows_is_refused(module: nn.Module) -> None:
-    with pytest.raises(InputError, match=r"made .* of \(4, 1, 2, 2\); expected features \(4, D\)"):
+    with refused("(4, 1, 2, 2)", "(4, D)"):
         list(feature_batches(ArrayTraverse(torch.rand(4, 1, 2, 2)), module))
 
 
@@ -123,13 +124,13 @@ def test_a_module_that_makes_no_feature_rows_is_refused(module: nn.Module) -> No
     "batch", [torch.rand(2, 3, 4), torch.zeros(2, 1, 4, 4, dtype=torch.uint8), torch.zeros(2, 3).long()]
 )
 def test_a_batch_that_is_neither_frames_nor_features_is_refused(batch: Tensor) -> None:
-    with pytest.raises(InputError, match=r"the list gives batches .*; expected float frames"):
+    with refused("the list", str(tuple(batch.shape)), str(batch.dtype), "float frames"):
         list(feature_batches(Listed(batch), HOG()))
 
 
 def test_a_traverse_without_frames_is_refused() -> None:
     module = Pooled().train()
-    with pytest.raises(InputError, match=r"the list holds no frames; expected at least one"):
+    with refused("the list", "no frames"):
         list(feature_batches(Listed(), module))
     assert module.training
 
@@ -138,13 +139,6 @@ def test_features_of_keeps_gradients() -> None:
     frames = torch.rand(2, 1, 16, 16, requires_grad=True)
     features_of(frames, HOG()).sum().backward()
     assert frames.grad is not None
-
-
-def test_frame_shape() -> None:
-    assert frame_shape(ArrayTraverse(torch.rand(3, 2))) == (2,)
-    assert frame_shape(ArrayTraverse(torch.rand(3, 1, 4, 5))) == (1, 4, 5)
-    with pytest.raises(InputError, match="no frames"):
-        frame_shape(Listed())
 
 
 def test_coarse_floats_become_float32() -> None:

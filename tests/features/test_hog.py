@@ -1,4 +1,4 @@
-"""HOG: skimage is the oracle, gradcheck the judge of gradients."""
+"""HOG: skimage is the oracle of the values, gradcheck that of the gradients."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from kornia.geometry.transform import resize
 from skimage.feature import hog as skimage_hog
 from torch import Tensor
 
-from dejavu_torch import HOG, InputError, hog
-from dejavu_torch.database.mapfile import recipe_of
+from dejavu_torch import HOG, hog
+from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.features.hog import cell_histograms, gradients
+from dejavu_torch.model import REGISTRY
 
 SIZES = [(16, 16), (64, 64), (37, 45), (64, 41), (33, 100), (21, 16)]
 
@@ -164,14 +166,7 @@ def test_module_equals_function() -> None:
         arguments |= {"bins": bins, "gradient": gradient}
         module = HOG(**arguments)
         assert torch.equal(module(frames), hog(frames, **arguments))
-        assert torch.equal(HOG(**recipe_of(module).init_args)(frames), module(frames))
-
-
-def test_state_dict_round_trip() -> None:
-    module, other = HOG(), HOG()
-    other.load_state_dict(module.state_dict())
-    frames = torch.rand(1, 1, 32, 32)
-    assert torch.equal(module(frames), other(frames))
+        assert torch.equal(HOG(**recipe_of(module, REGISTRY).init_args)(frames), module(frames))
 
 
 def test_double_follows_the_input() -> None:
@@ -179,34 +174,35 @@ def test_double_follows_the_input() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "message"),
+    ("frames", "facts"),
     [
-        (torch.rand(1, 32, 32), r"\(1, 32, 32\) torch\.float32; expected float frames \(B,C,H,W\)"),
-        (torch.zeros(1, 1, 32, 32, dtype=torch.uint8), r"torch\.uint8; expected float frames"),
-        (torch.rand(1, 1, 15, 40), r"15 x 40 pixels; expected at least one block, 16 x 16"),
-        (torch.rand(1, 1, 40, 15), r"40 x 15 pixels; expected at least one block, 16 x 16"),
+        (torch.rand(1, 32, 32), ("(1, 32, 32) torch.float32", "(B,C,H,W)")),
+        (torch.zeros(1, 1, 32, 32, dtype=torch.uint8), ("torch.uint8", "float")),
+        (torch.rand(1, 1, 15, 40), ("15 x 40", "16 x 16")),
+        (torch.rand(1, 1, 40, 15), ("40 x 15", "16 x 16")),
     ],
+    ids=["one axis less", "bytes", "too low", "too narrow"],
 )
-def test_frames_that_do_not_fit_are_refused(frames: Tensor, message: str) -> None:
-    with pytest.raises(InputError, match=message) as error:
+def test_frames_that_do_not_fit_are_refused(frames: Tensor, facts: tuple[str, ...]) -> None:
+    with refused(*facts):
         hog(frames)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "facts"),
     [
-        ({"orientations": 0}, r"orientations=0.*expected at least 1"),
-        ({"cell": 0}, r"cell=0.*expected at least 1"),
-        ({"block": -1}, r"block=-1.*expected at least 1"),
-        ({"resize": (32, 8)}, r"resize=\(32, 8\); expected .* at least 16"),
-        ({"resize": (32,)}, r"resize=\(32,\); expected \(height, width\)"),
-        ({"bins": "soft"}, r"bins='soft'; expected 'hard' or 'linear'"),
-        ({"gradient": "scharr"}, r"gradient='scharr'; expected 'central' or 'sobel'"),
+        ({"orientations": 0}, ("orientations=0", "at least 1")),
+        ({"cell": 0}, ("cell=0", "at least 1")),
+        ({"block": -1}, ("block=-1", "at least 1")),
+        ({"resize": (32, 8)}, ("resize=(32, 8)", "at least 16")),
+        ({"resize": (32,)}, ("resize=(32,)", "(height, width)")),
+        ({"bins": "soft"}, ("bins='soft'", "'hard' or 'linear'")),
+        ({"gradient": "scharr"}, ("gradient='scharr'", "'central' or 'sobel'")),
     ],
+    ids=str,
 )
-def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_arguments_that_make_no_sense_are_refused(arguments: dict, facts: tuple[str, ...]) -> None:
+    with refused(*facts):
         HOG(**arguments)
 
 
@@ -346,5 +342,5 @@ def test_each_pixel_takes_its_strongest_channel(gradient: str) -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("bins", "soft"), ("gradient", "scharr")])
 def test_the_function_refuses_unknown_names(name: str, value: str) -> None:
-    with pytest.raises(InputError, match=f"{name}='{value}'; expected"):
+    with refused(f"{name}={value!r}"):
         hog(torch.rand(1, 1, 16, 16), **{name: value})

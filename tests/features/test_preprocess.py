@@ -1,4 +1,4 @@
-"""Preprocess: a literal loop in float64 is the oracle, gradcheck the judge of gradients."""
+"""Preprocess: a literal loop in float64 is the oracle of the values, gradcheck that of the gradients."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from kornia.enhance import equalize_clahe
 from torch import Tensor
 
-from dejavu_torch.database.mapfile import recipe_of
+from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.features.preprocess import Preprocess, equalise, normalise_patches, select_channel
+from dejavu_torch.model import REGISTRY
 
 
 def patch_oracle(image: np.ndarray, patch: int) -> np.ndarray:
@@ -250,7 +251,7 @@ def test_a_large_batch_is_worked_off_in_parts(choice: dict) -> None:
 @pytest.mark.parametrize("choice", CHOICES)
 def test_a_recipe_builds_the_same_module(choice: dict) -> None:
     module = Preprocess(**choice)
-    again = Preprocess(**recipe_of(module).init_args)
+    again = Preprocess(**recipe_of(module, REGISTRY).init_args)
     assert repr(again) == repr(module)
     assert again.grid == module.grid
     assert isinstance(again.grid, tuple)

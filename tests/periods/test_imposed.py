@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from fractions import Fraction
 
 import pytest
 import torch
-from helpers import refused
+from helpers import Fixed, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.database.mapfile import build, recipe_of
-from dejavu_torch.database.template_map import CompressedMap, Matcher
-from dejavu_torch.database.templates import PhaseTemplates
+from dejavu_torch.database.recipe import build, recipe_of
+from dejavu_torch.database.template_map import Reduction, TemplateMap, TemplateMapper
+from dejavu_torch.model import REGISTRY
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.support import support_of, supportive_periods
@@ -22,8 +23,8 @@ from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
 
 
-def learnt(features: Tensor, plan: Plan) -> CompressedMap:
-    return CompressedMap(plan, PhaseTemplates()(features, plan), *features.shape)
+def learned(features: Tensor, plan: Plan, reduction: Reduction = "mean") -> TemplateMap:
+    return TemplateMapper(Fixed(*plan), reduction=reduction)(features)
 
 
 @given(
@@ -43,16 +44,10 @@ def test_the_plan_does_not_depend_on_the_features() -> None:
     assert finder.plan(torch.rand(400, 4)) == finder.plan(torch.zeros(400, 4, dtype=torch.float64))
 
 
-def test_separate_layers_have_their_own_equal_slices_in_the_order_given() -> None:
-    plan = ImposedPeriods([7, 4, 5], separate=True).plan(torch.rand(300, 6))
-    assert [(layer.phases, layer.features) for layer in plan] == [(7, (0, 1)), (4, (2, 3)), (5, (4, 5))]
-
-
 def test_no_periods_given_chooses_supportive_ones_for_the_route() -> None:
-    finder = ImposedPeriods(bin=5, templates=80, corrects=1)
-    chosen = tuple(layer.phases for layer in finder.plan(torch.rand(2698, 2)))
-    assert chosen == supportive_periods(540, 80, 1)  # 2698 frames: the last bin is short
-    assert len(ImposedPeriods(bin=3, templates=80, layers=4).plan(torch.rand(600, 2))) == 4
+    chosen = tuple(layer.phases for layer in ImposedPeriods(bin=5).plan(torch.rand(2698, 2)))
+    assert chosen == supportive_periods(540)  # 2698 frames: the last bin is short
+    assert support_of(chosen, 540).corrects == 1
 
 
 @pytest.mark.parametrize("frames", [2, 5, 6, 11])
@@ -68,12 +63,18 @@ def test_one_long_period_classifies_places() -> None:
     means = torch.stack([part.mean(0) for part in features.split(5)])
     for phases in (5, 9):
         plan = ImposedPeriods([phases]).plan(features)
-        (block,) = learnt(features, plan).blocks()
+        route = learned(features, plan, "sum")
+        (block,) = route.blocks()
         torch.testing.assert_close(block[:5], means)
         assert block[5:].count_nonzero() == 0
-        scores = Matcher("l1", "sum")(features, learnt(features, plan))
         expected = torch.cdist(features, means, p=1.0)[:, torch.arange(23) // 5]
-        torch.testing.assert_close(scores, expected)
+        torch.testing.assert_close(route.scores(features), expected)
+
+
+def separate(plan: Plan) -> Plan:
+    """The same layers, each of 13 features of its own."""
+    slices = [tuple(range(13 * j, 13 * (j + 1))) for j in range(len(plan))]
+    return tuple(replace(layer, features=own) for layer, own in zip(plan, slices, strict=True))
 
 
 def one_hot(plan: Plan, place: Tensor) -> Tensor:
@@ -82,28 +83,15 @@ def one_hot(plan: Plan, place: Tensor) -> Tensor:
 
 
 def test_a_wrong_layer_is_corrected() -> None:
-    finder = ImposedPeriods(separate=True)
-    layers = len(finder.periods_for(2700))
-    assert finder.support(2700, tolerance=5).corrects == 1
-    plan = finder.plan(torch.rand(2700, 13 * layers))
+    plan = separate(ImposedPeriods().plan(torch.rand(2700, 1)))
     features = one_hot(plan, torch.arange(2700))
-    route = learnt(features, plan)
+    route = learned(features, plan)
     place = torch.arange(0, 2700, 7)
-    for wrong in range(layers):
+    for wrong in range(len(plan)):
         seen = features[place]
         seen[:, 13 * wrong : 13 * (wrong + 1)] = torch.eye(13)[torch.randint(13, (len(place),))]
-        found = best_match(Matcher()(seen, route)).index
+        found = best_match(route.scores(seen)).index
         assert torch.equal(found // 5, place // 5)
-
-
-def test_support_counts_in_bins() -> None:
-    finder = ImposedPeriods([11, 13], bin=5)
-    assert finder.support(100, tolerance=0) == support_of([11, 13], 20, tolerance=0)
-    assert finder.support(96, tolerance=5) == support_of([11, 13], 20, tolerance=1)
-    assert finder.support(101, tolerance=6) == support_of([11, 13], 21, tolerance=2)
-    # nine bins, fewer than either period: the nearest are 1, 2 or 3 bins apart in both layers
-    assert [finder.support(45, tolerance).torus_distance for tolerance in (0, 5, 6)] == [2, 4, 6]
-    assert ImposedPeriods().support(2700, 5).periods == supportive_periods(540, 53)
 
 
 def test_places_that_look_alike_are_logged_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
@@ -130,10 +118,10 @@ def test_staggered_layers_place_a_frame_finer_than_their_bins() -> None:
     """Where each layer names its bin, how far off is the place that all of them agree on?"""
     frames, errors = 900, {}
     for stagger in (False, True):
-        finder = ImposedPeriods([5, 7, 8, 9, 11, 13], bin=5, separate=True, stagger=stagger)
-        plan = finder.plan(torch.rand(frames, 6 * 13))
+        finder = ImposedPeriods([5, 7, 8, 9, 11, 13], bin=5, stagger=stagger)
+        plan = separate(finder.plan(torch.rand(frames, 1)))
         features = one_hot(plan, torch.arange(frames))
-        found = best_match(Matcher()(features, learnt(features, plan))).index
+        found = best_match(learned(features, plan).scores(features)).index
         errors[stagger] = (found - torch.arange(frames)).abs()
     assert errors[False].max() == 4
     assert errors[False].float().mean() == 2
@@ -142,20 +130,12 @@ def test_staggered_layers_place_a_frame_finer_than_their_bins() -> None:
     assert errors[True][near].float().mean() < 1
 
 
-@pytest.mark.parametrize(
-    "finder", [ImposedPeriods(), ImposedPeriods([4, 9], 3, 20, 0, 2, True, True), ImposedPeriods(layers=5)]
-)
+@pytest.mark.parametrize("finder", [ImposedPeriods(), ImposedPeriods([4, 9], 3, True)])
 def test_it_is_rebuilt_from_its_recipe(finder: ImposedPeriods) -> None:
-    again = build(recipe_of(finder), PeriodFinder)
+    recipe = recipe_of(finder, REGISTRY)
+    again = build(recipe, PeriodFinder, REGISTRY)
     assert repr(again) == repr(finder)
-    assert recipe_of(again) == recipe_of(finder)
-
-
-def test_it_tells_its_arguments() -> None:
-    assert repr(ImposedPeriods([4, 9], separate=True)) == (
-        "ImposedPeriods(periods=[4, 9], bin=5, templates=None, corrects=1, layers=None, separate=True, "
-        "stagger=False)"
-    )
+    assert recipe_of(again, REGISTRY) == recipe
 
 
 @pytest.mark.parametrize("periods", [[], [1, 4], [4, 4], [4.0, 5], ["4"]])
@@ -172,7 +152,3 @@ def test_bad_input_is_refused() -> None:
     for shape in [(1, 4), (8,), (8, 0), (2, 3, 4)]:
         with refused(str(shape), "(N,D) with N >= 2, D >= 1"):
             ImposedPeriods().plan(torch.zeros(shape))
-    with refused("3 layers", "8 features", "multiple of 3"):
-        ImposedPeriods([4, 5, 7], separate=True).plan(torch.rand(50, 8))
-    with refused("20 templates", "540 places", "49 templates"):
-        ImposedPeriods(templates=20).plan(torch.rand(2700, 8))

@@ -10,13 +10,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch import InputError, SpectrogramAnalysis
+from dejavu_torch import SpectrogramAnalysis
 from dejavu_torch.periods import spectrogram
-from dejavu_torch.periods.spectrogram import bin_period, noise_share, strongest_bins
+from dejavu_torch.periods.layers import bin_period
+from dejavu_torch.periods.spectrogram import noise_share, strongest_bins
 from dejavu_torch.types import Plan
 
 
@@ -32,17 +34,6 @@ def literal(window: int = 1024, **other: object) -> SpectrogramAnalysis:
 
 def periods_of(plan: Plan, feature: int) -> list[int]:
     return [int(layer.period) for layer in plan if feature in layer.features]
-
-
-@pytest.mark.parametrize(("k", "period"), [(11, 93), (6, 171), (2, 512), (128, 8), (3, 341), (10, 102)])
-def test_golden_bins_of_1024(k: int, period: int) -> None:
-    assert bin_period(1024, k) == period
-
-
-@given(st.integers(16, 4096), st.data())
-def test_a_bin_names_the_nearest_whole_period(length: int, data: st.DataObject) -> None:
-    k = data.draw(st.integers(1, length // 2))
-    assert abs(bin_period(length, k) - Fraction(length, k)) <= Fraction(1, 2)
 
 
 @pytest.mark.parametrize("peaks", ["bins", "local"])
@@ -177,7 +168,7 @@ def test_convention_3_others_shrink_a_long_window_and_say_so(caplog: pytest.LogC
 
 
 def test_convention_3_the_paper_refuses_a_long_window() -> None:
-    with pytest.raises(InputError, match=r"300 frames; expected at least 1024, the window"):
+    with refused("300 frames", "1024"):
         literal()(torch.randn(300, 1))
     assert len(literal()(torch.randn(1024, 1))) == 1
 
@@ -249,16 +240,14 @@ def test_a_feature_may_be_constant_in_one_chunk_only() -> None:
     assert [(layer.start, int(layer.period)) for layer in plan] == [(128, 16)]
 
 
-@pytest.mark.parametrize("analysis", [literal(128), SpectrogramAnalysis(128, similar=1.0)])
+@pytest.mark.parametrize("analysis", [literal(128), SpectrogramAnalysis(128)])
 def test_offset_and_scale_do_not_matter(analysis: SpectrogramAnalysis) -> None:
     features = torch.randn(300, 6, dtype=torch.float64) + 3 * wave(300, 16, over=128)[:, None]
     assert analysis.plan(features)
     assert analysis.plan(4 * features + 0.5) == analysis.plan(features)
 
 
-@pytest.mark.parametrize(
-    "analysis", [literal(128), SpectrogramAnalysis(128), SpectrogramAnalysis(128, similar=1)]
-)
+@pytest.mark.parametrize("analysis", [literal(128), SpectrogramAnalysis(128)])
 def test_permuting_features_permutes_only_their_numbers(analysis: SpectrogramAnalysis) -> None:
     features = torch.randn(300, 12)
     for j in range(12):
@@ -274,13 +263,10 @@ def test_permuting_features_permutes_only_their_numbers(analysis: SpectrogramAna
     assert described(analysis.plan(features[:, order]), list(range(12))) == described(plan, place)
 
 
-def test_features_of_similar_period_share_a_layer() -> None:
-    """Similar: within so many bins of the layer's most common period."""
+def test_features_of_the_same_whole_period_share_a_layer() -> None:
     features = torch.stack([wave(256, k) for k in (16, 16, 17, 30)], 1)
-    apart = SpectrogramAnalysis(256, strongest=1).plan(features)
-    assert [(int(layer.period), layer.features) for layer in apart] == [(9, (3,)), (15, (2,)), (16, (0, 1))]
-    together = SpectrogramAnalysis(256, strongest=1, similar=1.1).plan(features)
-    assert [(int(layer.period), layer.features) for layer in together] == [(9, (3,)), (16, (0, 1, 2))]
+    plan = SpectrogramAnalysis(256, strongest=1).plan(features)
+    assert [(int(layer.period), layer.features) for layer in plan] == [(9, (3,)), (15, (2,)), (16, (0, 1))]
 
 
 def test_gradients_are_right() -> None:
@@ -297,45 +283,42 @@ def test_gradients_stop_at_the_plan() -> None:
     assert features.grad is None
 
 
-def test_state_dict_round_trip() -> None:
-    analysis = SpectrogramAnalysis(64)
-    SpectrogramAnalysis(64).load_state_dict(analysis.state_dict())
-
-
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "facts"),
     [
-        ({"window": 7}, r"window=7, min_period=4.*expected .*window >= 2 \* min_period"),
-        ({"min_period": 1}, r"min_period=1.*expected min_period >= 2"),
-        ({"strongest": 0}, r"strongest=0.*expected .*strongest >= 1"),
-        ({"hop": 0}, r"hop=0; expected 1\.\.1024"),
-        ({"hop": 1025}, r"hop=1025; expected 1\.\.1024"),
-        ({"peaks": "all"}, r"peaks='all'.*expected .*'local' or 'bins'"),
-        ({"short": "pad"}, r"short='pad'.*expected .*'shrink' or 'refuse'"),
-        ({"similar": -1.0}, r"similar=-1\.0.*expected .*similar >= 0"),
-        ({"false_alarm": 0.0}, r"false_alarm=0\.0; expected None or a number in \(0, 1\)"),
-        ({"false_alarm": 1.0}, r"false_alarm=1\.0; expected"),
+        ({"window": 7}, ("window=7, min_period=4", "window >= 2 * min_period")),
+        ({"min_period": 1}, ("min_period=1", "min_period >= 2")),
+        ({"strongest": 0}, ("strongest=0", "strongest >= 1")),
+        ({"hop": 0}, ("hop=0", "1..1024")),
+        ({"hop": 1025}, ("hop=1025", "1..1024")),
+        ({"peaks": "all"}, ("peaks='all'", "'local' or 'bins'")),
+        ({"short": "pad"}, ("short='pad'", "'shrink' or 'refuse'")),
+        ({"false_alarm": 0.0}, ("false_alarm=0.0", "(0, 1)")),
+        ({"false_alarm": 1.0}, ("false_alarm=1.0", "(0, 1)")),
     ],
+    ids=str,
 )
-def test_arguments_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_arguments_that_make_no_sense_are_refused(arguments: dict, facts: tuple[str, ...]) -> None:
+    with refused(*facts):
         SpectrogramAnalysis(**arguments)
 
 
 @pytest.mark.parametrize(
-    ("features", "message"),
+    ("features", "facts"),
     [
-        (torch.randn(100), r"\(100,\) torch\.float32; expected float features \(N,D\)"),
-        (torch.zeros(100, 2).long(), r"torch\.int64; expected float features"),
-        (torch.full((100, 2), torch.nan), r"not finite; expected finite numbers"),
-        (torch.randn(7, 2), r"7 frames; expected at least 8, two periods of 4"),
-        (torch.randn(1, 2), r"1 frame; expected at least 8"),
+        (torch.randn(100), ("(100,) torch.float32", "(N,D)")),
+        (torch.zeros(100, 2).long(), ("torch.int64", "float")),
+        (np.zeros((100, 2), np.float32), ("ndarray", "tensor (N,D)")),
+        (torch.full((100, 2), torch.nan), ("not finite",)),
+        (torch.randn(7, 2), ("7 frames", "at least 8", "two periods of 4")),
+        (torch.randn(1, 2), ("1 frame;", "at least 8")),
     ],
+    ids=["one axis", "integers", "numpy", "NaN", "7 frames", "1 frame"],
 )
-def test_features_that_do_not_fit_are_refused(features: Tensor, message: str) -> None:
-    with pytest.raises(InputError, match=message) as error:
-        SpectrogramAnalysis().plan(features)
-    assert "\n" not in str(error.value)
+def test_features_that_do_not_fit_are_refused(features: Tensor, facts: tuple[str, ...]) -> None:
+    for refusing in (SpectrogramAnalysis().plan, SpectrogramAnalysis()):
+        with refused(*facts):
+            refusing(features)
 
 
 @pytest.mark.parametrize("at_once", [1, 1000, 2**30])
@@ -352,14 +335,14 @@ def test_the_plan_does_not_depend_on_how_many_features_are_in_hand(
 
 def test_planning_transforms_few_features_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = []
-    power = spectrogram._power
+    power = spectrogram.chunk_power
 
     def watched(chunk: Tensor) -> Tensor:
         sizes.append(chunk.numel())
         return power(chunk)
 
     monkeypatch.setattr(spectrogram, "NUMBERS_AT_ONCE", 1024)
-    monkeypatch.setattr(spectrogram, "_power", watched)
+    monkeypatch.setattr(spectrogram, "chunk_power", watched)
     SpectrogramAnalysis(window=128).plan(torch.randn(2048, 64))
     assert sizes == [1024] * (2048 * 64 // 1024)
 

@@ -42,6 +42,7 @@ assert torch.equal(Spectrogram(**hamming)(wave), StftSpectrogram(**hamming)(wave
 """
 
 
+@pytest.mark.slow
 def test_fallback_equals_torchaudio(tmp_path: Path) -> None:
     """Against a copy of torchaudio without its compiled library, which may refuse this torch."""
     spec = importlib.util.find_spec("torchaudio")

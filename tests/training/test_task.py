@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from dejavu_torch.data.truthfile import read_truth
 from dejavu_torch.recognition.deploy import Localizer
 from helpers import Fixed
 from pytorch_lightning import Callback, Trainer
@@ -17,7 +18,6 @@ from torch import Tensor, nn
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truthfile import read_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.periods.imposed import ImposedPeriods

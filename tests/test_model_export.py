@@ -1,0 +1,148 @@
+"""`DejaVu` itself goes through torch.export and torch.compile, with the eager scores whatever the batch."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers import Fixed
+from torch import Tensor, nn
+
+from dejavu_torch import HOG, DejaVu, Embedding, ImposedPeriods, Preprocess, TemplateMapper
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.types import FrequencyLayer, Plan
+
+BATCHES = (1, 8, 100)
+CHUNKS: Plan = (  # overlapping, with gaps, and a rational period
+    FrequencyLayer(4, 4, 0, 20, (0, 2)),
+    FrequencyLayer("5/2", 3, 5, 25, (0, 1)),
+    FrequencyLayer(7, 7, 10, 25, (3,)),
+    FrequencyLayer(7, 7, 30, 50, (1, 2, 3)),
+)
+UNCOVERED = [*range(25, 30), *range(50, 60)]
+BACKBONES: dict[str, Callable[[], nn.Module]] = {
+    "HOG": HOG,
+    "HOG resized": lambda: HOG(resize=(24, 16), bins="linear", gradient="sobel"),
+    "SmallCNN": lambda: SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4),
+    "Embedding": lambda: Embedding(nn.Conv2d(3, 4, 3), dimension=8, resize=(16, 16), grid=2, cell=4),
+}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "l1": {"metric": "l1"},
+    "l1, sum": {"metric": "l1", "reduction": "sum"},
+    "l2": {"metric": "l2"},
+    "cosine, sum": {"metric": "cosine", "reduction": "sum"},
+    "callable": {"metric": lambda a, b: (a[:, None] - b).abs().amax(2)},
+    "temperature": {"temperature": 0.1},
+}
+
+
+def learned(backbone: str) -> DejaVu:
+    """A model of a route of 60 colour frames."""
+    periods = ImposedPeriods([3, 4, 5], bin=4)
+    return DejaVu(BACKBONES[backbone](), TemplateMapper(periods)).learn(torch.rand(60, 3, 32, 24)).eval()
+
+
+def of_chunks(**settings: Any) -> DejaVu:
+    """A model of 4 features and several chunks, with places that no layer covers."""
+    mapper = TemplateMapper(Fixed(*CHUNKS), **settings)
+    return DejaVu(mapper=mapper).learn_features(torch.rand(60, 4)).eval()
+
+
+def exported(model: DejaVu, queries: Tensor) -> torch.export.ExportedProgram:
+    return torch.export.export(model, (queries,), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}})
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_exported_model_scores_frames_as_the_model_does(backbone: str) -> None:
+    model = learned(backbone)
+    run = exported(model, torch.rand(2, 3, 32, 24)).module()
+    for batch in BATCHES:
+        queries = torch.rand(batch, 3, 32, 24)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_compiled_model_scores_frames_as_the_model_does(backbone: str) -> None:
+    model = learned(backbone)
+    torch.compiler.reset()
+    run = torch.compile(model, fullgraph=True, backend="eager")
+    for batch in BATCHES:
+        queries = torch.rand(batch, 3, 32, 24)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
+def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> None:
+    model = learned("HOG")
+    torch.compiler.reset()
+    run = torch.compile(model, fullgraph=True, dynamic=True)
+    for batch in (8, 100):
+        queries = torch.rand(batch, 3, 32, 24)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_every_setting_of_a_map_is_exported(settings: dict[str, Any]) -> None:
+    model = of_chunks(**settings)
+    program, buffer = exported(model, torch.rand(2, 4)), io.BytesIO()
+    torch.export.save(program, buffer)
+    buffer.seek(0)
+    loaded = torch.export.load(buffer).module()
+    for batch in (1, 3, 7):
+        queries = torch.rand(batch, 4)
+        expected = model(queries)
+        assert expected[:, UNCOVERED].isposinf().all()
+        for run in (program.module(), loaded):
+            scores = run(queries)
+            assert scores.dtype == torch.float32
+            torch.testing.assert_close(scores, expected, rtol=0, atol=1e-6)
+
+
+def test_a_map_is_compiled() -> None:
+    model = of_chunks(temperature=0.1)
+    torch.compiler.reset()
+    run = torch.compile(model, fullgraph=True, backend="eager")
+    for queries in (torch.rand(1, 4), torch.rand(7, 4)):
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_weights_of_the_features_count(training: bool) -> None:
+    model, queries = of_chunks(), torch.rand(5, 4)
+    before = model(queries)
+    model.map.trainable(weights=True, start=torch.tensor([0.5, 1.0, 2.0, 0.0]))
+    if not training:
+        model.map.freeze()
+    expected = model(queries)
+    assert not torch.allclose(expected[:, :20], before[:, :20])
+    torch.testing.assert_close(exported(model, queries[:2]).module()(queries), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("preprocess", [Preprocess("grey"), Preprocess("R-B", "patch")], ids=repr)
+def test_preprocessing_is_part_of_the_exported_model(preprocess: Preprocess) -> None:
+    model = DejaVu(mapper=TemplateMapper(ImposedPeriods([3, 4])), preprocess=preprocess)
+    model.learn(torch.rand(40, 3, 32, 24)).eval()
+    queries = torch.rand(8, 3, 32, 24)
+    run = exported(model, queries[:2]).module()
+    torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+def test_a_map_without_layers_is_exported() -> None:
+    model = DejaVu(mapper=TemplateMapper(Fixed())).learn_features(torch.rand(20, 4)).eval()
+    assert exported(model, torch.rand(2, 4)).module()(torch.rand(5, 4)).isposinf().all()
+
+
+def test_gradients_reach_the_backbone() -> None:
+    model = learned("SmallCNN")
+    scores = model(torch.rand(3, 3, 32, 24))
+    scores.sum().backward()
+    for parameter in model.parameters():
+        assert parameter.grad is not None
+        assert parameter.grad.isfinite().all()
+        assert parameter.grad.abs().max() > 0
