@@ -9,8 +9,7 @@ import torch
 from helpers import refused
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, ArrayTraverse, InputError, Traverse
-from dejavu_torch.features import extract
+from dejavu_torch import HOG, ArrayTraverse, InputError, Traverse, types
 from dejavu_torch.features.extract import feature_batches, features_of
 
 
@@ -147,7 +146,7 @@ def test_coarse_floats_become_float32() -> None:
 
 
 def test_batches_of_large_frames_are_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extract, "BATCH_NUMBERS", 3 * 16 * 16 + 1)
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 3 * 16 * 16 + 1)
     frames = torch.rand(7, 1, 16, 16)
     batches = list(feature_batches(ArrayTraverse(frames), HOG(), 64))
     assert [len(batch) for batch in batches] == [3, 3, 1]
