@@ -177,8 +177,8 @@ def test_one_frame_is_a_route() -> None:
     [
         ({"frames": 0}, r"frames=0; expected 1 <= frames"),
         ({"frames": 10**6}, r"frames=1000000; expected 1 <= frames <= 32768"),
-        ({"seed": -1}, r"seed=-1; expected 0 <= seed"),
-        ({"traverse": -1}, r"traverse=-1; expected 0 <= traverse"),
+        ({"seed": -1}, r"seed=-1; expected seed >= 0"),
+        ({"traverse": -1}, r"traverse=-1; expected traverse >= 0"),
         ({"size": 8}, r"size=8; expected 16 <= size <= 256"),
         ({"noise": -0.1}, r"noise=-0\.1; expected 0 <= noise <= 1"),
         ({"noise": float("nan")}, r"noise=nan; expected"),
