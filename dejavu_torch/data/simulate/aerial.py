@@ -1,21 +1,21 @@
-"""A road seen from a drone, painted procedurally: the built-in route.
+"""A road seen from a drone, painted procedurally: `sim:aerial`.
 
 One image column is one frame step, about 0.25 m of road. The lane dashes repeat exactly every
-`DASH_PERIOD` frames and the chevrons every `CHEVRON_PERIOD`; everything else is found once.
+`DASH_PERIOD` frames and the chevrons every `CHEVRON_PERIOD`; everything else occurs once.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.simulate.paint import DARK, GRAVEL, ROAD, WHITE, Canvas, Random, house, tree, vehicle
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.data.simulate.route import Random, SimulatedRoute, option, rgb
 
 DASH_PERIOD = 93
 CHEVRON_PERIOD = 171
@@ -23,10 +23,98 @@ VIEW = 64  # the camera sees VIEW x VIEW image pixels
 MARGIN = 8  # columns beyond the first and the last view, so that yaw never leaves the image
 HEIGHT = 96  # rows of the painted image; the camera flies along the middle one
 
+ROAD = 40.0  # image row of the road's middle
 HALF, LANE = 14.0, 6.3  # rows from the road's middle to its edge, to a lane's middle
+SUN = (0.75, -0.66)  # direction towards the sun, (x, y)
+
+# colours, rrggbb
+WHITE, GRAVEL, GLASS, DARK = "edebe0", "998f7a", "1a212b", "0d0f12"
 ASPHALT, MEADOW = "69696b", "597036"
+ROOFS = ("99452e", "7a3d2e", "5c5e66", "856b54")
+LEAVES = ("2e5c1f", "3d6626", "4f5e24", "266633", "47612b")
+PAINTS = ("e6e6e8", "b81a1a", "1f3880", "1a1a1f", "9ea3ab", "d4b329", "266161")
 CROPS = (("4d6e2b", 0.20), ("ad9459", 0.10), ("755940", 0.20), (MEADOW, 0.0), ("918052", 0.15))
 PLOTS = ("trees", "trees", "trees", "bushes", "bushes", "house", "house", "lane", "pond", "parking")
+
+
+class Canvas(NamedTuple):
+    """Pixels (3,h,w) painted in place, at column x and y rows below the road's middle, with a fine grain."""
+
+    pixels: Tensor
+    grain: Tensor
+    x: Tensor
+    y: Tensor
+    scale: int  # canvas pixels per image pixel
+
+    @staticmethod
+    def over(pixels: Tensor, scale: int, random: Random) -> Canvas:
+        y, x = ((torch.arange(n) + 0.5) / scale for n in pixels.shape[1:])
+        grain = random.texture(len(y), len(x), 5.0 * scale)
+        return Canvas(pixels, grain, x, y[:, None] - ROAD, scale)
+
+    def near(self, x: float, y: float, reach: float = 45.0, turn: float = 0.0) -> Canvas:
+        """The square within reach of (x, y), with x and y relative to that point and turned by radians."""
+        rows, columns = (
+            slice(*(max(0, math.floor((at + side * reach) * self.scale)) for side in (-1, 1)))
+            for at in (y + ROAD, x)
+        )
+        pixels, grain = self.pixels[:, rows, columns], self.grain[rows, columns]
+        dx, dy, c, s = self.x[columns] - x, self.y[rows] - y, math.cos(turn), math.sin(turn)
+        return Canvas(pixels, grain, c * dx + s * dy, c * dy - s * dx, self.scale)
+
+    def fill(self, distance: Tensor, colour: str, shade: Tensor | float = 1.0, alpha: float = 1.0) -> None:
+        """Blend in colour * shade where distance, in image pixels, is negative; antialiased."""
+        cover = (0.5 - self.scale * distance).clamp(0, 1) * alpha
+        self.pixels.add_(cover * (rgb(colour) * shade - self.pixels))
+
+    def box(self, x: float, y: float, length: float, width: float, corner: float = 0.0) -> Tensor:
+        """Signed distance to a rounded rectangle around (x, y)."""
+        a, b = (self.x - x).abs() - length / 2 + corner, (self.y - y).abs() - width / 2 + corner
+        return torch.hypot(a.clamp(min=0), b.clamp(min=0)) + torch.maximum(a, b).clamp(max=0) - corner
+
+    def blob(self, radius: float, random: Random) -> Tensor:
+        """Signed distance, roughly, to an uneven disc around the origin."""
+        angle = torch.atan2(self.y, self.x)
+        bumps = sum(0.09 * torch.sin(k * angle + random.uniform(0, 2 * math.pi)) for k in (2, 3, 5))
+        return torch.hypot(self.x, self.y) - radius * (1 + bumps)
+
+
+def _paint_tree(canvas: Canvas, random: Random, x: float, y: float, radius: float) -> None:
+    """A tree or bush with its shadow."""
+    p, fall = canvas.near(x, y, 2 * radius), 0.75 * radius
+    p.fill(torch.hypot(p.x + fall * SUN[0], p.y + fall * SUN[1]) - radius, DARK, alpha=0.55)
+    light = 1 + 0.38 * (p.x * SUN[0] + p.y * SUN[1]) / radius + 0.22 * p.grain
+    p.fill(p.blob(radius, random), random.pick(LEAVES), light)
+
+
+def _paint_house(canvas: Canvas, random: Random, x: float, y: float) -> None:
+    """A house with a ridged roof, a chimney and its shadow."""
+    p, roof = canvas.near(x, y, turn=random.uniform(-0.15, 0.15)), random.pick(ROOFS)
+    length, width = random.uniform(30, 46), random.uniform(22, 28)
+    chimney = length * random.uniform(-0.35, 0.35)
+    p.fill(p.box(-7 * SUN[0], -7 * SUN[1], length, width), DARK, alpha=0.6)
+    slopes = torch.where(p.y < 0, 1.2, 0.78) + 0.05 * torch.sin(2.6 * p.y) + 0.05 * p.grain
+    p.fill(p.box(0, 0, length, width), roof, slopes)
+    p.fill(p.box(0, 0, length, 0.9), roof, 1.45)
+    p.fill(p.box(chimney - 2, -2, 5, 3), DARK, alpha=0.5)
+    p.fill(p.box(chimney, -4, 3.2, 3.2), GRAVEL)
+
+
+def _paint_vehicle(
+    canvas: Canvas, random: Random, x: float, y: float, heading: int, lorry: bool = False
+) -> None:
+    """A car or a lorry along the road; heading is +1 towards growing columns, else -1."""
+    p, paint = canvas.near(x, y, 26, random.uniform(-0.02, 0.02)), random.pick(PAINTS)
+    length, width, fall = (44.0, 9.6, 3.0) if lorry else (random.uniform(16, 20), 7.6, 1.6)
+    p.fill(p.box(-fall * SUN[0], -fall * SUN[1], length + 0.6, width + 0.6, 2), DARK, alpha=0.65)
+    if lorry:
+        p.fill(p.box(-5 * heading, 0, 34, width, 0.6), random.pick(PAINTS), 1 + 0.05 * p.grain)
+        p.fill(p.box(17.5 * heading, 0, 9, width - 0.6, 1.5), paint)
+        p.fill(p.box(20.8 * heading, 0, 1.8, width - 2, 0.6), GLASS)
+    else:
+        p.fill(p.box(0, 0, length, width, 2.4), paint, 1 - 0.03 * p.y)
+        p.fill(p.box(-0.8 * heading, 0, 0.62 * length, width - 1.4, 1.6), GLASS)
+        p.fill(p.box(-1.0 * heading, 0, 0.34 * length, width - 2.0, 1.0), paint, 1.08)
 
 
 def _paint_fields(canvas: Canvas, random: Random, tone: Tensor) -> None:
@@ -68,7 +156,7 @@ def _paint_plot(canvas: Canvas, random: Random, kind: str, x: float, side: int) 
 
 
 def road_markings(columns: int, scale: int = 1) -> tuple[Tensor, Tensor]:
-    """Coverage of the markings that repeat, the lane dashes and the chevrons.
+    """Coverage of the markings that repeat: lane dashes and chevrons.
 
     Column x of either equals column x + its period, exactly.
 
@@ -88,9 +176,9 @@ def road_markings(columns: int, scale: int = 1) -> tuple[Tensor, Tensor]:
 
 
 def _paint_road(canvas: Canvas, random: Random, tone: Tensor, lanes: list[tuple[float, int]]) -> None:
-    """The carriageway with its grain, repairs, cracks and markings; lanes cut the edge line."""
+    """The carriageway with its grain, repairs, cracks and markings; lanes interrupt the edge line."""
     speckle, half = random.normal(*tone.shape), canvas.y.abs() - HALF
-    tracks = torch.cos((canvas.y.abs() - LANE) * 0.98)  # where the wheels roll
+    tracks = torch.cos((canvas.y.abs() - LANE) * 0.98)  # worn by wheels
     canvas.fill(half, ASPHALT, 1 + 0.05 * speckle + 0.05 * tone + 0.035 * tracks)
     x = 0.0
     while (x := x + random.uniform(20, 110)) < canvas.x[-1]:
@@ -101,9 +189,8 @@ def _paint_road(canvas: Canvas, random: Random, tone: Tensor, lanes: list[tuple[
             repair = p.box(0, 0, length, random.uniform(4, 9), 0.5)
             p.fill(torch.maximum(repair, within), ASPHALT, random.pick((0.68, 0.78, 1.16)) + 0.06 * p.grain)
         else:
-            bend = (
-                random.uniform(-0.6, 0.6) * p.x + 1.6 * torch.sin(p.x / random.uniform(3, 6)) + 0.7 * p.grain
-            )
+            slant, wave = random.uniform(-0.6, 0.6), random.uniform(3, 6)
+            bend = slant * p.x + 1.6 * torch.sin(p.x / wave) + 0.7 * p.grain
             crack = torch.maximum((p.y + bend).abs() - 0.45, torch.hypot(p.x, p.y) - length / 2)
             p.fill(torch.maximum(crack, within), DARK, 2.5, alpha=0.8)
     edges = (half + 1.6).abs() - 0.65
@@ -116,11 +203,11 @@ def _paint_road(canvas: Canvas, random: Random, tone: Tensor, lanes: list[tuple[
 
 
 def paint_route(frames: int, seed: int = 0) -> Tensor:
-    """Paint the route from above, without the vehicles that only one flight meets.
+    """Paint the route from above, without the traffic of any one flight.
 
     Args:
         frames: number of camera positions, one image column apart.
-        seed: chooses everything that is found once; the markings are the same for every seed.
+        seed: chooses everything except the markings, which are the same for every seed.
 
     Shape: (3, HEIGHT, frames + VIEW + 2 * MARGIN) float32 in [0,1].
     """
@@ -142,103 +229,87 @@ def paint_route(frames: int, seed: int = 0) -> Tensor:
         for _ in range(count):
             radius = random.uniform(6, 12) if kind == "trees" else random.uniform(2, 4.5)
             across = HALF + 4 + radius + random.uniform(0, 34 - radius)
-            tree(canvas, random, x + random.uniform(-35, 35), side * across, radius)
+            _paint_tree(canvas, random, x + random.uniform(-35, 35), side * across, radius)
         if kind == "house":
-            house(canvas, random, x, side * random.uniform(36, 42))
+            _paint_house(canvas, random, x, side * random.uniform(36, 42))
         if kind == "parking":
             for place in (-14, 12)[: random.pick((1, 2))]:
-                vehicle(canvas, random, x + place, side * (HALF + 6.5), side)
+                _paint_vehicle(canvas, random, x + place, side * (HALF + 6.5), side)
     return F.avg_pool2d(canvas.pixels.clamp(0, 1), scale)
 
 
-class AerialRoad(Traverse):
-    """A flight along a painted road, one image column per frame.
+@dataclass(eq=False)
+class AerialRoad(SimulatedRoute):
+    """A flight along a painted road, one image column per frame: `sim:aerial`.
 
     Frame i of every flight over the same seed is centred on the same column, so place i is frame i.
-    Each flight has its own standing vehicles, light, drift, yaw and sensor noise. Flight 0, the
-    reference, flies steadier than the others.
+    Each flight has its own traffic, light, drift, yaw and sensor noise; flight 0, the reference, is
+    steadier than the others.
 
     Args:
-        seed: chooses the route.
-        traverse: chooses the flight; 0 is the reference.
-        frames: number of frames.
-        size: height and width of a frame in pixels; it always shows VIEW x VIEW image pixels.
-        noise: standard deviation of the sensor noise, on the scale where white is 1.
-        drift: largest sideways drift, in image pixels.
-        yaw: largest turn of the camera, in degrees.
+        seed: chooses the route, at least 0.
+        traverse: chooses the flight, at least 0; 0 is the reference.
+        frames: number of frames, 1 to 32768.
+        size: height and width of a frame in pixels, 16 to 256; it always shows VIEW x VIEW image pixels.
+        noise: standard deviation of the sensor noise, 0 to 1, on the scale where white is 1.
+        drift: largest sideways drift, 0 to 8 image pixels.
+        yaw: largest turn of the camera, 0 to 5 degrees.
+
+    Raises:
+        InputError: an argument that is no number or out of its range.
+
+    Example:
+        >>> next(AerialRoad(traverse=1, frames=3).batches(8)).shape
+        torch.Size([3, 3, 64, 64])
     """
 
-    length: int
-    place: Tensor
+    seed: int = option(0, 0)
+    traverse: int = option(0, 0)
+    frames: int = option(3072, 1, 2**15)
+    size: int = option(64, 16, 256)
+    noise: float = option(0.025, 0, 1)
+    drift: float = option(3.0, 0, 8)
+    yaw: float = option(1.5, 0, 5)
 
-    def __init__(
-        self,
-        seed: int = 0,
-        traverse: int = 0,
-        frames: int = 3072,
-        size: int = 64,
-        noise: float = 0.025,
-        drift: float = 3.0,
-        yaw: float = 1.5,
-    ) -> None:
-        query = []
-        for key, value, low, high, usual in (
-            ("seed", seed, 0, 2**63 - 1, None),
-            ("traverse", traverse, 0, 2**63 - 1, None),
-            ("frames", frames, 1, 2**15, None),
-            ("size", size, 16, 256, 64),
-            ("noise", noise, 0, 1, 0.025),
-            ("drift", drift, 0, 8, 3.0),
-            ("yaw", yaw, 0, 5, 1.5),
-        ):
-            if not low <= value <= high:
-                raise InputError(f"sim:aerial has {key}={value}; expected {low} <= {key} <= {high}")
-            if value != usual:
-                query.append(f"{key}={value}")
-        self.name = "sim:aerial?" + "&".join(query)
-        self.seed, self.traverse, self.size, self.noise = seed, traverse, size, noise
-        self.length, self.place = frames, torch.arange(frames, dtype=torch.float64)
+    kind = "aerial"
 
-        random, swing = Random("flight", seed, traverse), 1.0 if traverse else 0.4
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.length, self.place = self.frames, torch.arange(self.frames, dtype=torch.float64)
+        random, swing = Random("flight", self.seed, self.traverse), 1.0 if self.traverse else 0.4
         looks = [random.pick(values) for values in ((0.78, 0.84, 1.16), (0.86, 1.16), (-0.06, 0.06))]
-        level, gamma, tint = looks if traverse else (1.0, 1.0, 0.0)
-        self._drift = drift * swing * random.wander(frames)
-        self._yaw = math.radians(yaw) * swing * random.wander(frames)
-        warm = tint + 0.03 * random.wander(frames)
+        level, gamma, tint = looks if self.traverse else (1.0, 1.0, 0.0)
+        self._drift = self.drift * swing * random.wander(self.frames)
+        self._yaw = math.radians(self.yaw) * swing * random.wander(self.frames)
+        warm = tint + 0.03 * random.wander(self.frames)
         balance = torch.stack([1 + warm, torch.ones_like(warm), 1 - warm], 1)
-        self._gain = (balance * level * (1 + 0.12 * swing * random.wander(frames))[:, None]).float()
-        self._gamma = (gamma + 0.06 * swing * random.wander(frames)).float()
+        self._gain = (balance * level * (1 + 0.12 * swing * random.wander(self.frames))[:, None]).float()
+        self._gamma = (gamma + 0.06 * swing * random.wander(self.frames)).float()
 
     @cached_property
     def _scene(self) -> Tensor:
-        """The painted route with this flight's vehicles on it, (3, HEIGHT, W)."""
+        """The painted route with this flight's traffic, (3, HEIGHT, W)."""
         image, random = paint_route(self.length, self.seed), Random("traffic", self.seed, self.traverse)
         canvas = Canvas.over(image, 1, random)
         for heading in (-1, 1):
             x = random.uniform(0, 200)
             while x < image.shape[2]:
                 y, lorry = heading * LANE + random.uniform(-0.8, 0.8), random.uniform(0, 1) < 0.25
-                vehicle(canvas, random, x, y, heading, lorry)
+                _paint_vehicle(canvas, random, x, y, heading, lorry)
                 x += random.uniform(90, 600)
         return image.clamp_(0, 1)
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        """Yield the frames in order, at most `size` at a time. Shape: (B,3,S,S) float32 in [0,1]."""
-        if size < 1:
-            raise InputError(f"a batch holds {size} frames; expected at least 1")
+    def _frames(self, at: Tensor) -> Tensor:
         fine = math.ceil(VIEW / self.size)  # a small frame averages samples that lie an image pixel apart
         across = ((torch.arange(fine * self.size).double() + 0.5) / (fine * self.size) - 0.5) * VIEW
         down, (height, width) = across[:, None], self._scene.shape[1:]
-        for start in range(0, self.length, size):
-            at = torch.arange(start, min(start + size, self.length))
-            c, s, drift = (curve[at, None, None] for curve in (self._yaw.cos(), self._yaw.sin(), self._drift))
-            column = at[:, None, None] + (MARGIN + VIEW / 2) + c * across - s * down
-            row = HEIGHT / 2 + drift + s * across + c * down
-            grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], -1).float()
-            seen = F.grid_sample(self._scene.expand(len(at), -1, -1, -1), grid, align_corners=False)
-            seen = F.avg_pool2d(seen, fine) * self._gain[at, :, None, None]
-            seen = seen ** self._gamma[at, None, None, None]
-            for frame, i in zip(seen, at.tolist(), strict=True):
-                random = Random("noise", self.seed, self.traverse, i)
-                frame += self.noise * random.normal(3, self.size, self.size)
-            yield seen.clamp_(0, 1)
+        c, s, drift = (curve[at, None, None] for curve in (self._yaw.cos(), self._yaw.sin(), self._drift))
+        column = at[:, None, None] + (MARGIN + VIEW / 2) + c * across - s * down
+        row = HEIGHT / 2 + drift + s * across + c * down
+        grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], -1).float()
+        seen = F.grid_sample(self._scene.expand(len(at), -1, -1, -1), grid, align_corners=False)
+        seen = F.avg_pool2d(seen, fine) * self._gain[at, :, None, None]
+        seen = seen ** self._gamma[at, None, None, None]
+        for frame, i in zip(seen, at.tolist(), strict=True):
+            frame += self.noise * Random("noise", self.seed, self.traverse, i).normal(*frame.shape)
+        return seen.clamp_(0, 1)

@@ -1,22 +1,27 @@
-"""A world drawn along a straight track: flat sheets, textured, with objects that stand on them.
+"""A world along a straight track: flat sheets with objects on them, and the painter that draws frames of it.
 
 Metres: s along the track, x to the right and y up from the camera's mean position. A sheet runs along
-the whole track, so each pixel's ray meets it at a distance ahead that never changes, and a frame taken
-at s is one lookup at s + that distance, composited front to back.
+the whole track, so each pixel's ray meets it at a constant distance ahead, and a frame taken at s is one
+lookup per sheet at s + that distance, composited front to back.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.data.simulate.route import rgb
+
 FAR = 240.0  # metres ahead beyond which everything is haze
 FOCAL = 0.55  # focal length, of the frame's width: 85 degrees across
 HORIZON = 0.38  # how far down the frame the horizon lies, of its height
+
+Point = tuple[float, float]
 
 
 class View:
@@ -27,7 +32,7 @@ class View:
         margin: rows and columns beyond it on every side.
 
     Attributes:
-        up, right: (P,) metres that each pixel's ray rises and goes aside per metre ahead.
+        up, right: (P,) metres by which each pixel's ray rises and moves aside per metre ahead.
 
     Convention: square pixels; a point (x, y, ahead) is seen `FOCAL * width * x / ahead` pixels right of the
         frame's middle and `FOCAL * width * y / ahead` above the horizon, `HORIZON * height` below its top.
@@ -42,7 +47,7 @@ class View:
         right = (across - 0.5 * width) * self.pixel
         self.up, self.right = (t.flatten() for t in torch.meshgrid(up, right, indexing="ij"))
 
-    def project(self, x: float, y: float, ahead: float) -> tuple[float, float]:
+    def project(self, x: float, y: float, ahead: float) -> Point:
         """Where a point is seen: (0, 0) the centre of the top left pixel, (1, 1) of the bottom right one."""
         height, width = self.size
         across = 0.5 * width + x / ahead / self.pixel
@@ -50,70 +55,8 @@ class View:
         return (across - 0.5) / (width - 1), (down - 0.5) / (height - 1)
 
 
-class Thing:
-    """Equal boxes that stand on a sheet, one at each position along the track.
-
-    Args:
-        low, high: where across the sheet, in metres from its first edge.
-        colour: rrggbb.
-        at: (n,) increasing positions in metres of the side that faces the camera.
-        length: metres along the track.
-        depth: metres by which the box rises from the sheet towards the camera's path.
-        opacity: 0 to 1. lit: True for what shines by itself.
-    """
-
-    def __init__(
-        self,
-        low: float,
-        high: float,
-        colour: str,
-        at: Tensor,
-        length: float,
-        depth: float = 0.0,
-        opacity: float = 1.0,
-        lit: bool = False,
-    ) -> None:
-        self.low, self.high, self.length, self.depth = low, high, length, depth
-        self.opacity, self.lit = opacity, lit
-        self.colour = torch.tensor(list(bytes.fromhex(colour))).view(3, 1) / 255
-        gap = float(at.diff().min()) if len(at) > 1 else math.inf
-        self._cell = min(gap, 64.0) * 0.999  # no cell holds two positions
-        self._origin, self._gap = float(at[0]), gap
-        self._at = torch.cat([torch.tensor([-math.inf]), at.float()])
-        cells = int((float(at[-1]) - self._origin) / self._cell) + 2
-        ends = self._origin + self._cell * torch.arange(1, cells + 1, dtype=torch.float64)
-        self._upto = torch.searchsorted(at.double(), ends, right=True)
-        self.first = self._origin
-        # seen from FAR ahead, a box hides what lies behind it
-        self.last = float(at[-1]) + length + (FAR if depth else 0)
-
-    def _count(self, s: Tensor) -> Tensor:
-        """How many stand at s or before."""
-        cell = ((s - self._origin) / self._cell).clamp(-1, len(self._upto) - 1).floor().long()
-        count = torch.where(cell >= 0, self._upto[cell.clamp(min=0)], 0)
-        return count - (self._at[count] > s).long()
-
-    def behind(self, s: Tensor) -> Tensor:
-        """Metres from the last position at s or before, infinite where there is none."""
-        return s - self._at[self._count(s)]
-
-    def cover(self, s: Tensor, half: Tensor, slope: Tensor) -> Tensor:
-        """The part of [s - half, s + half] on the sheet that the boxes hide.
-
-        Args:
-            slope: metres along the sheet that one metre of depth hides.
-        """
-        extent = (self.length + self.depth * slope).clamp(max=self._gap)
-        hidden = []
-        for edge in (s - half, s + half):
-            count = self._count(edge)
-            hidden.append((count, torch.minimum(edge - self._at[count], extent)))
-        (first, before), (second, after) = hidden
-        return (((second - first) * extent + after - before) / (2 * half)).clamp(0, 1)
-
-
 class Rays(NamedTuple):
-    """Where one view's rays meet one sheet; each (P,)."""
+    """Where the rays of one view meet one sheet; each (P,)."""
 
     pixels: Tensor
     ahead: Tensor  # metres along the track
@@ -122,7 +65,96 @@ class Rays(NamedTuple):
     slope: Tensor  # metres ahead per metre towards the camera's path
     wide: Tensor  # pixel's extent along the track, metres
     tall: Tensor  # and across
-    detail: list[tuple[int, int, Tensor]]  # each level of the texture, with the rays that see that one
+    detail: list[tuple[int, int, Tensor]]  # texture levels, each with the rays that read it
+
+
+@dataclass(eq=False)
+class Thing:
+    """Equal boxes that stand on a sheet, one at each position along the track.
+
+    Args:
+        sheet: its name.
+        low, high: extent across the sheet, in metres from its first edge.
+        colour: rrggbb.
+        at: (n,) increasing positions, or one, in metres, of the side that faces the camera.
+        length: metres along the track.
+        depth: metres by which the box rises from the sheet towards the camera's path.
+        opacity: 0 to 1. lit: True for what shines by itself.
+    """
+
+    sheet: str
+    low: float
+    high: float
+    colour: str
+    at: Tensor | float
+    length: float
+    depth: float = 0.0
+    opacity: float = 1.0
+    lit: bool = False
+
+    def __post_init__(self) -> None:
+        at = torch.as_tensor(self.at, dtype=torch.float64).flatten()
+        self._paint = rgb(self.colour)[..., 0]
+        self._at = torch.cat([torch.tensor([-math.inf]), at.float()])
+        self._gap = float(at.diff().min()) if len(at) > 1 else math.inf
+        self.first = float(at[0])
+        # seen from FAR ahead, a box hides what lies behind it
+        self.last = float(at[-1]) + self.length + (FAR if self.depth else 0)
+
+    def _last(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """How many stand at s or before, and metres from the last of them, infinite where there is none."""
+        count = torch.searchsorted(self._at, s.contiguous(), right=True) - 1
+        return count, s - self._at[count]
+
+    def cover(self, s: Tensor, half: Tensor, slope: Tensor) -> Tensor:
+        """The part of [s - half, s + half] on the sheet that the boxes hide.
+
+        Args:
+            slope: metres along the sheet that one metre of depth hides.
+        """
+        extent = (self.length + self.depth * slope).clamp(max=self._gap)
+        (first, before), (second, after) = self._last(s - half), self._last(s + half)
+        before, after = torch.minimum(before, extent), torch.minimum(after, extent)
+        return (((second - first) * extent + after - before) / (2 * half)).clamp(0, 1)
+
+    def draw(
+        self, rays: Rays, place: Tensor, across: Tensor, half: Tensor, paint: Tensor, alpha: Tensor
+    ) -> None:
+        """Paint the boxes over their sheet, in place."""
+        rise = self.depth * rays.slope  # metres of sheet that the box's face hides
+        top = rays.across - rays.skew * rise
+        reach = rays.tall + 0.5
+        near = torch.maximum(rays.across, top) > self.low - reach
+        here = (near & (torch.minimum(rays.across, top) < self.high + reach)).nonzero().flatten()
+        if len(here):
+            s, met = place[:, here], across[:, here]
+            cover = self.cover(s, half[:, here], rays.slope[here])
+            if self.depth:  # the ray meets the box before it meets the sheet
+                met = met - rays.skew[here] * torch.minimum(self._last(s)[1], rise[here])
+            cover = (cover * _within(met, rays.tall[here], self.low, self.high) * self.opacity)[:, None]
+            paint[:, :, here] = torch.lerp(paint[:, :, here], self._paint, cover)
+            alpha[:, :, here] = torch.lerp(alpha[:, :, here], torch.ones(()), cover)
+
+
+class Light(NamedTuple):
+    """What a traverse's light does to a world.
+
+    lamp: strength of the headlight next to the train; it falls off over `reach` metres.
+    ambient: (S,) light along the track, one value per metre. haze: (3,1) what distance fades into.
+    fade: metres over which it does.
+    """
+
+    lamp: float
+    reach: float
+    ambient: Tensor
+    haze: Tensor
+    fade: float
+
+    def at(self, ahead: Tensor, s: Tensor) -> Tensor:
+        place = s.clamp(0, len(self.ambient) - 2)
+        cell = place.long()
+        here = torch.lerp(self.ambient[cell], self.ambient[cell + 1], place - cell)
+        return here + self.lamp / (1 + (ahead / self.reach) ** 2)
 
 
 class Sheet:
@@ -134,14 +166,8 @@ class Sheet:
         cell: metres of one texture cell across and along.
     """
 
-    def __init__(
-        self,
-        a: tuple[float, float],
-        b: tuple[float, float],
-        texture: Tensor | None = None,
-        cell: tuple[float, float] = (0.1, 0.2),
-    ) -> None:
-        self.a, self.b, self.texture, self.cell = a, b, texture, cell
+    def __init__(self, a: Point, b: Point, texture: Tensor | None = None, cell: Point = (0.1, 0.2)) -> None:
+        self.a, self.cell = a, cell
         self.size = math.dist(a, b)
         self.along = (b[0] - a[0]) / self.size, (b[1] - a[1]) / self.size
         x, y = self.along[1], -self.along[0]
@@ -149,11 +175,7 @@ class Sheet:
         self.normal = (x, y) if distance > 0 else (-x, -y)
         self.distance = abs(distance)
         self.things: list[Thing] = []
-        self._levels: dict[tuple[int, int], Tensor] = {}
-
-    def add(self, *things: Thing) -> Sheet:
-        self.things.extend(things)
-        return self
+        self._levels = {} if texture is None else {(0, 0): texture}
 
     def rays(self, view: View) -> Rays:
         facing = self.normal[0] * view.right + self.normal[1] * view.up
@@ -164,27 +186,84 @@ class Sheet:
         reach = tall + 0.5
         seen = (facing > 0) & (ahead < FAR) & (across > -reach) & (across < self.size + reach)
         pixels = seen.nonzero().flatten()
+        ahead, across, skew, tall = (values[pixels] for values in (ahead, across, skew, tall))
         slope = ahead / self.distance
-        every = ahead, across, skew, slope, tall * slope, tall
-        ahead, across, skew, slope, wide, tall = (values[pixels] for values in every)
-        return Rays(pixels, ahead, across, skew, slope, wide, tall, self._detail(wide, tall))
+        return Rays(pixels, ahead, across, skew, slope, tall * slope, tall, self._detail(tall * slope, tall))
 
     def _detail(self, wide: Tensor, tall: Tensor) -> list[tuple[int, int, Tensor]]:
-        """The levels whose texels are as large as the pixels, and which rays each serves."""
-        if self.texture is None:
+        """The levels whose texels are as large as the pixels, and which rays read each."""
+        if not self._levels:
             return []
-        across, along = (
-            (a / b).log2().round().clamp(0, 6) for a, b in zip((tall, wide), self.cell, strict=True)
-        )
-        pairs, which = torch.stack([across, along], 1).long().unique(dim=0, return_inverse=True)
+        levels = [(a / b).log2().round().clamp(0, 6) for a, b in zip((tall, wide), self.cell, strict=True)]
+        pairs, which = torch.stack(levels, 1).long().unique(dim=0, return_inverse=True)
         return [(*pair, (which == k).nonzero().flatten()) for k, pair in enumerate(pairs.tolist())]
 
-    def level(self, down: int, along: int) -> Tensor:
+    def _level(self, down: int, along: int) -> Tensor:
         """The texture averaged over 2^down x 2^along cells."""
-        assert self.texture is not None
-        if down == along == 0:
-            return self.texture
         if (down, along) not in self._levels:
-            pooled = F.avg_pool2d(self.texture, (2**down, 2**along), ceil_mode=True)
-            self._levels[down, along] = pooled
+            self._levels[down, along] = F.avg_pool2d(self._levels[0, 0], (2**down, 2**along), ceil_mode=True)
         return self._levels[down, along]
+
+    def draw(self, rays: Rays, light: Light, s: Tensor, step: Tensor, sway: Tensor) -> tuple[Tensor, Tensor]:
+        """Colour times opacity (B,3,P) and opacity (B,1,P) of the sheet; arguments as `Painter.draw`."""
+        aside, shift = ((sway[:, :1] * x + sway[:, 1:] * y).float() for x, y in (self.normal, self.along))
+        ahead = rays.ahead * (1 - aside / self.distance)
+        across = rays.across + rays.skew * (ahead - rays.ahead) + shift
+        where = s[:, None] + ahead.double()
+        place = where.float()
+        paint, alpha = torch.zeros(len(s), 3, len(rays.pixels)), torch.zeros(len(s), 1, len(rays.pixels))
+        for down, along, here in rays.detail:
+            image = self._level(down, along)
+            u = where[:, here] / (self.cell[1] * 2**along)
+            v = across[:, here] / (self.cell[0] * 2**down)
+            grid = torch.stack([(2 * u / image.shape[2] - 1).float(), 2 * v / image.shape[1] - 1], -1)
+            texels = F.grid_sample(
+                image.expand(len(s), -1, -1, -1), grid[:, None], padding_mode="border", align_corners=False
+            )[:, :, 0]
+            inside = _within(across[:, here], rays.tall[here], 0.0, self.size)[:, None]
+            paint[:, :, here], alpha[:, :, here] = texels[:, :3] * inside, texels[:, 3:] * inside
+        half = (rays.wide + step[:, None].float()) / 2
+        near, far = float(s.min()), float(s.max()) + FAR
+        live = [thing for thing in self.things if thing.first < far and thing.last > near]
+        for thing in live:
+            if not thing.lit:
+                thing.draw(rays, place, across, half, paint, alpha)
+        fog = torch.exp(-rays.ahead / light.fade)
+        paint = paint * (light.at(ahead, place) * fog)[:, None] + alpha * (1 - fog) * light.haze
+        for thing in live:
+            if thing.lit:
+                thing.draw(rays, place, across, half, paint, alpha)
+        return paint, alpha
+
+
+def _within(across: Tensor, tall: Tensor, low: float, high: float) -> Tensor:
+    """The part of each pixel within [low, high] across the sheet."""
+    top, bottom = (across + tall / 2).clamp(max=high), (across - tall / 2).clamp(min=low)
+    return ((top - bottom) / tall).clamp(0, 1)
+
+
+class Painter:
+    """Draws the frames of one view on a list of sheets, nearest first, and the sky (3,P) behind them."""
+
+    def __init__(self, view: View, sheets: list[Sheet], light: Light, sky: Tensor) -> None:
+        self.view, self.sheets, self.light, self.sky = view, sheets, light, sky
+        self._rays = [sheet.rays(view) for sheet in sheets]
+
+    def draw(self, s: Tensor, step: Tensor, sway: Tensor) -> Tensor:
+        """Frames at these places.
+
+        Args:
+            s: (B,) float64 metres. step: (B,) metres that the camera moves during the exposure.
+            sway: (B,2) metres of the camera right and up of its mean.
+
+        Shape: -> (B,3,H,W), the view's shape.
+        """
+        colour = torch.zeros(len(s), *self.sky.shape)
+        clear = torch.ones(len(s), 1, self.sky.shape[1])
+        for sheet, rays in zip(self.sheets, self._rays, strict=True):
+            if len(rays.pixels):
+                paint, alpha = sheet.draw(rays, self.light, s, step, sway)
+                left = clear[:, :, rays.pixels]
+                colour[:, :, rays.pixels] += left * paint
+                clear[:, :, rays.pixels] = left * (1 - alpha)
+        return (colour + clear * self.sky).view(len(s), 3, *self.view.shape)

@@ -1,0 +1,121 @@
+"""What every simulated route shares: checked options, an address, frames on demand, repeatable draws.
+
+A new route is one subclass of `SimulatedRoute`, named in `SIMULATORS` (`simulate/__init__.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import field, fields
+from hashlib import blake2b
+from numbers import Integral, Real
+from typing import Any, ClassVar, TypeVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.types import InputError, Traverse
+
+_T = TypeVar("_T")
+
+
+def option(default: float, low: float, high: float = math.inf) -> Any:
+    """A field with its default, least and greatest value; it takes whole numbers where the default is one."""
+    return field(default=default, metadata={"span": (low, high)})
+
+
+class SimulatedRoute(Traverse):
+    """A route drawn by the computer, so that the true place of every frame is known.
+
+    A subclass is a dataclass whose fields are each an `option`, `seed` and `traverse` among them. It sets
+    `length` and `place` and draws frames in `_frames`, each from its number and the options alone.
+
+    Attributes:
+        kind: its name, as in `sim:KIND?seed=0`.
+    """
+
+    kind: ClassVar[str]
+    length: int
+    place: Tensor
+
+    def __post_init__(self) -> None:
+        """Refuse options out of their span, and name the route by those that differ from their defaults."""
+        address = []
+        for entry in fields(self):  # type: ignore[arg-type]  # a subclass is a dataclass
+            key, (low, high) = entry.name, entry.metadata["span"]
+            value, default = getattr(self, key), getattr(type(self), key)
+            whole = isinstance(default, int)
+            if not (isinstance(value, Integral if whole else Real) and low <= value <= high):
+                span = f"{low} <= {key} <= {high}" if high < math.inf else f"{key} >= {low}"
+                wanted = f"{span}, a whole number" if whole else span
+                raise InputError(f"sim:{self.kind} has {key}={value}; expected {wanted}")
+            value = type(default)(value)
+            setattr(self, key, value)
+            # frames=0 is the whole route; any other number of frames is part of the name
+            if key in ("seed", "traverse") or value != (0 if key == "frames" else default):
+                address.append(f"{key}={value}")
+        self.name = f"sim:{self.kind}?" + "&".join(address)
+
+    @abstractmethod
+    def _frames(self, at: Tensor) -> Tensor:
+        """Draw the frames with these numbers. Shape: (B,) int64 -> (B,3,H,W) float32 in [0,1]."""
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        """Yield the frames in order, at most `size` at a time. Shape: (B,3,H,W) float32 in [0,1]."""
+        if size < 1:
+            raise InputError(f"a batch holds {size} frames; expected at least 1")
+        yield from self.between(0, self.length, size)
+
+    def between(self, start: int, stop: int, size: int = 64) -> Iterator[Tensor]:
+        """Yield the frames [start, stop), at most `size` at a time; no frame before them is drawn."""
+        stop = min(stop, self.length)
+        for first in range(start, stop, size):
+            yield self._frames(torch.arange(first, min(first + size, stop)))
+
+
+class Random:
+    """Draws that depend on the key alone and never touch torch's global generator."""
+
+    def __init__(self, *key: object) -> None:
+        digest = blake2b(repr(key).encode(), digest_size=4).digest()
+        self.generator = torch.Generator().manual_seed(int.from_bytes(digest, "big"))
+
+    def uniform(self, low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=self.generator))
+
+    def pick(self, items: Sequence[_T]) -> _T:
+        return items[int(torch.randint(len(items), (), generator=self.generator))]
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.generator)
+
+    def texture(self, height: int, width: int, cell: float) -> Tensor:
+        """Smooth noise of unit variance: 4 octaves from `cell` pixels down, halved each. (height, width)."""
+        total = torch.zeros(height, width)
+        for k in range(4):
+            knots = self.normal(1, 1, *(2 + int(n * 2**k / cell) for n in (height, width)))
+            total += 0.6**k * F.interpolate(knots, (height, width), mode="bicubic")[0, 0]
+        return total / total.std()
+
+    def scattered(self, start: float, stop: float, gap: tuple[float, float]) -> Tensor:
+        """Increasing positions without a period, gaps drawn from this range, (n,) float64, at least one."""
+        found = [start + self.uniform(0, gap[1])]
+        while (after := found[-1] + self.uniform(*gap)) < stop:
+            found.append(after)
+        return torch.tensor(found, dtype=torch.float64)
+
+    def wander(self, frames: int) -> Tensor:
+        """A slow curve within [-1, 1], (frames,) float64."""
+        i, curve = torch.arange(frames, dtype=torch.float64), torch.zeros(frames, dtype=torch.float64)
+        for weight, period in ((0.2, 170.0), (0.35, 420.0), (0.45, 1100.0)):
+            turns = i / (period * self.uniform(0.7, 1.3)) + self.uniform(0, 1)
+            curve += weight * torch.sin(2 * math.pi * turns)
+        return curve
+
+
+def rgb(colour: str) -> Tensor:
+    """A colour rrggbb as (3,1,1) in [0,1]."""
+    return torch.tensor(list(bytes.fromhex(colour))).view(3, 1, 1) / 255
