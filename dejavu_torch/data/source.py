@@ -12,18 +12,12 @@ from urllib.parse import parse_qsl
 from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.folder import SUFFIXES, ImageFolder
 from dejavu_torch.data.frame_range import FrameRange
-from dejavu_torch.data.simulate.aerial import AerialRoad
-from dejavu_torch.data.simulate.railway import Outdoor, Underground
+from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.video import SUFFIXES as VIDEO_SUFFIXES
 from dejavu_torch.data.video import Video
 from dejavu_torch.types import InputError, Traverse
 
-SIMULATORS: dict[str, Callable[..., Traverse]] = {
-    "aerial": AerialRoad,
-    "outdoor": Outdoor,
-    "underground": Underground,
-}
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `FrameRange`
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, "
