@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dejavu_torch.data.ground_truth import position_truth
 from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.simulate.outdoor import Outdoor
 from dejavu_torch.data.simulate.route import SimulatedRoute, option
