@@ -154,9 +154,7 @@ class TrainCLI(LightningCLI):
         if 0 in (asked["max_steps"], asked["max_epochs"]):
             raise InputError("the training has no steps; expected trainer.max_steps above 0")
         if asked["overfit_batches"]:
-            raise InputError(
-                "trainer.overfit_batches needs a sampler of its own; expected limit_train_batches"
-            )
+            raise InputError("trainer.overfit_batches does not fit; expected trainer.limit_train_batches")
         root = Path(self.trainer.default_root_dir)
         make_output_folder(root)
         resumed = self.config[self.subcommand].get("ckpt_path")
@@ -181,8 +179,8 @@ class TrainCLI(LightningCLI):
         found = sorted(folder.glob("*.ckpt"), key=lambda path: path.stat().st_mtime)
         if not found:
             raise InputError(
-                f"there is no checkpoint in {folder}; expected --ckpt_path, or the trainer.default_root_dir of "
-                "a training"
+                f"there is no checkpoint in {folder}; expected --ckpt_path, or the "
+                "trainer.default_root_dir of a training"
             )
         self.config_init[self.subcommand]["ckpt_path"] = str(found[-1])
 

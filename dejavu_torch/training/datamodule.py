@@ -177,7 +177,8 @@ class RouteData(LightningDataModule):
         if values.shape[1:] != reference.shape[1:]:
             raise InputError(
                 f"{traverse.name} has frames of {tuple(values.shape[1:])}, the reference of "
-                f"{tuple(reference.shape[1:])}; expected the same channels, and one size, as data.resize makes"
+                f"{tuple(reference.shape[1:])}; expected the same channels, and one size, as data.resize "
+                "makes"
             )
         shown = None
         if isinstance(self.reference, ResampledTraverse):
@@ -187,7 +188,7 @@ class RouteData(LightningDataModule):
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
             raise InputError(
-                f"there is no ground truth for {traverse.name}: it has {len(values)} frames and the reference "
+                f"there is no ground truth for {traverse.name}: it has {len(values)} frames, the reference "
                 f"{len(reference)} places; expected {option}"
             )
         return StoredFrames([values], known)

@@ -1,4 +1,4 @@
-"""The place, and each layer's phase, as cross-entropies: scalars in float32 at least, 0 where nothing counts."""
+"""Cross-entropy of the place and of each layer's phase: float32 at least, 0 where nothing counts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dejavu_torch.types import InputError, Plan
 
 
 class PlaceLoss(NamedTuple):
-    """loss: scalar. left_out: queries without a right place that is covered, which the mean does not count."""
+    """loss: scalar. left_out: queries without a right place that is covered; the mean leaves them out."""
 
     loss: Tensor
     left_out: int
@@ -121,7 +121,7 @@ class Objective:
     phase: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (0 <= min(self.place, self.phase) and 0 < self.place + self.phase < math.inf):
+        if not (min(self.place, self.phase) >= 0 and 0 < self.place + self.phase < math.inf):
             raise InputError(
                 f"the losses count place={self.place}, phase={self.phase}; expected 0 or more, one above 0"
             )
@@ -138,7 +138,8 @@ class Objective:
         """The losses of a batch.
 
         Args:
-            distances: eq. 3 of each layer. scores: `log_posterior` of eq. 4. places: right ones, -1 as padding.
+            distances: eq. 3 of each layer. scores: `log_posterior` of eq. 4.
+            places: the right ones, -1 as padding.
 
         Shape: L tensors (B,P), (B,N), (B,R).
         """

@@ -1,4 +1,4 @@
-"""The stages of a training: a descriptor that tells places apart, its whitening, and the code of each place."""
+"""The stages of a training: a descriptor that tells places apart, its whitening, and each place's code."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class DescriptorStage(Stage):
         given = state.get(f"{prefix}proxies")
         if given is not None:  # however many there are
             self.proxies = nn.Parameter(torch.empty_like(given, device=self.proxies.device))
-        super()._load_from_state_dict(state, prefix, *args)  # type: ignore[arg-type]
+        super()._load_from_state_dict(state, prefix, *args)
 
 
 class WhiteningStage(Stage):

@@ -255,15 +255,15 @@ class PlaceRecognitionTask(pl.LightningModule):
             self._advance(self.global_step)
             self.trainer.strategy.setup_optimizers(self.trainer)
             if self.in_last_stage:
-                self.trainer.callbacks = self._callbacks  # type: ignore[attr-defined]
+                self.trainer.callbacks = self._callbacks
 
     def on_train_epoch_start(self) -> None:
         """Find the layers anew where it is time to."""
-        if self.refresh and self.in_last_stage and self.current_epoch:
-            if self.current_epoch % self.refresh == 0:
-                before = self.route
-                self.relearn()
-                replace(cast(Optimizer, self.optimizers(use_pl_optimizer=False)), before, self.route)
+        due = self.refresh and self.current_epoch and self.current_epoch % self.refresh == 0
+        if due and self.in_last_stage:
+            before = self.route
+            self.relearn()
+            replace(cast(Optimizer, self.optimizers(use_pl_optimizer=False)), before, self.route)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
@@ -302,7 +302,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """A map of the present features, where there is none yet."""
-        if not self.trainer.state.fn == "fit":
+        if self.trainer.state.fn != "fit":
             self.require_map()
         if self.in_last_stage and not self.route.places:
             with torch.inference_mode(False):  # its parameters may be trained later
