@@ -63,22 +63,32 @@ class StoredFrames(Dataset[Batch]):
         return Batch(as_frames(chosen), GroundTruth(*(part[index] for part in self.truth)))
 
 
-class Shuffled(Sampler[list[int]]):
-    """Batches of frames from all over the route, each frame at most once an epoch.
+class Clips(Sampler[list[int]]):
+    """Each frame about once an epoch, in clips of consecutive frames from all over the route.
 
     Args:
-        length: number of frames. batch_size: frames of a batch; an incomplete last batch is left out.
+        lengths: frames of each traverse; no clip crosses from one to the next.
+        batch_size: frames of a batch. clip: frames of a clip; a last clip that is shorter is left out.
     """
 
-    def __init__(self, length: int, batch_size: int) -> None:
-        self.length, self.batch_size = length, min(length, batch_size)
+    def __init__(self, lengths: list[int], batch_size: int, clip: int) -> None:
+        self.lengths, self.clip = lengths, clip
+        self.clips = min(batch_size // clip, sum(length // clip for length in lengths))
 
     def __len__(self) -> int:
-        return self.length // self.batch_size
+        return sum(length // self.clip for length in self.lengths) // self.clips
 
     def __iter__(self) -> Iterator[list[int]]:
-        for batch in torch.randperm(self.length).split(self.batch_size)[: len(self)]:
-            yield batch.tolist()
+        starts, first = [], 0
+        for length in self.lengths:
+            left_over = int(torch.randint(length % self.clip + 1, ()))
+            starts.append(first + left_over + torch.arange(length // self.clip) * self.clip)
+            first += length
+        order = torch.cat(starts)
+        order = order[torch.randperm(len(order))]
+        frames = order[:, None] + torch.arange(self.clip)
+        for batch in frames.split(self.clips)[: len(self)]:  # an incomplete batch is left out
+            yield batch.flatten().tolist()
 
 
 class RouteData(LightningDataModule):
@@ -96,6 +106,7 @@ class RouteData(LightningDataModule):
         query: the traverse that `test` localizes. truth: its places, see `find_truth`.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
+        clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
         resize: (height, width) in pixels that frames are stored in; None is the `frame_size` of the task that
             is trained, which is what its backbone resizes them to, and their own size where it has none.
         augmentation: of the training frames; None is `Augmentation` with its defaults.
@@ -119,15 +130,16 @@ class RouteData(LightningDataModule):
         truth: str | None = None,
         tolerance: int = 5,
         batch_size: int = 64,
+        clip: int = 1,
         resize: tuple[int, int] | None = None,
         augmentation: Augmentation | None = None,
         velocity: GroundOdometry | None = None,
     ) -> None:
         super().__init__()
-        if tolerance < 0 or batch_size < 2:
+        if tolerance < 0 or clip < 1 or batch_size < 2 or batch_size % clip:
             raise InputError(
-                f"tolerance is {tolerance}, batch_size {batch_size}; expected a tolerance of 0 or more, and "
-                "batches of at least 2 frames"
+                f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}; expected a tolerance of 0 "
+                "or more, and batches of at least 2 frames made of whole clips"
             )
         if resize is not None and (len(resize) != 2 or min(resize) < 1):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
@@ -139,7 +151,7 @@ class RouteData(LightningDataModule):
                     "Traverse, or a tensor of frames or features"
                 )
         self.truths = {"second": second_truth, "validation": validation_truth, "query": truth}
-        self.tolerance, self.batch_size = tolerance, batch_size
+        self.tolerance, self.batch_size, self.clip = tolerance, batch_size, clip
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
         self.velocity = velocity
@@ -206,12 +218,15 @@ class RouteData(LightningDataModule):
     def train_dataloader(self) -> DataLoader[Batch]:
         """Frames of the reference and of the second traverse, as they are stored."""
         sets = [self.sets[name] for name in ("reference", "second") if name in self.sets]
+        lengths = [len(part) for part in sets]
+        if max(lengths) < self.clip:
+            raise InputError(f"clip is {self.clip} and the route has {max(lengths)} frames; expected fewer")
         positives = [part.truth.positives for part in sets]
         width = max(part.shape[1] for part in positives)
         pad = torch.nn.functional.pad
         joined = torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives])
         frames = StoredFrames([part.values for part in sets], as_truth(joined))
-        return _loader(frames, Shuffled(len(frames), self.batch_size))
+        return _loader(frames, Clips(lengths, self.batch_size, self.clip))
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """The validation traverse, or the reference."""
@@ -225,14 +240,14 @@ class RouteData(LightningDataModule):
         frames = torch.arange(len(self.sets[name])).split(self.batch_size)
         return _loader(self.sets[name], [part.tolist() for part in frames])
 
-    def augmented(self, frames: Tensor) -> Tensor:
-        """Frames (B,C,H,W) as on another day; features (B,D) as they are."""
+    def augmented(self, frames: Tensor, clip: int) -> Tensor:
+        """Frames (B,C,H,W), clip after clip, as on another day; features (B,D) as they are."""
         if frames.ndim != 4:
             return frames
         self.augmentation.train()
         with torch.autocast(frames.device.type, enabled=False):
-            augmented: Tensor = self.augmentation(frames)
-        return augmented
+            augmented: Tensor = self.augmentation(frames.unflatten(0, (-1, clip)))
+        return augmented.flatten(0, 1)
 
     def validated(self, batch: Batch) -> Tensor:
         """The frames of a validation batch: the reference itself is augmented, in the same way each time."""
@@ -240,7 +255,7 @@ class RouteData(LightningDataModule):
             return batch.frames
         with torch.random.fork_rng():
             torch.manual_seed(int(batch.truth.positives[0, 0]))
-            return self.augmented(batch.frames)
+            return self.augmented(batch.frames, 1)
 
 
 def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:

@@ -88,7 +88,7 @@ class DescriptorStage(Stage):
         return [*_trainable(embedding_of(task).network), *self.parameters()]
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
-        frames, places = task.data.augmented(batch.frames), len(task.data.sets["reference"])
+        frames, places = task.data.augmented(batch.frames, task.data.clip), len(task.data.sets["reference"])
         descriptors = to_length(embedding_of(task).describe(task.dejavu.preprocess(frames)).float())
         noisy = descriptors + NOISE * torch.randn_like(descriptors)
         distances = phase_distances(noisy, self.proxies, "cosine")
@@ -138,7 +138,7 @@ class CodeStage(Stage):
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         if task.views is None:
-            frames, positives = task.data.augmented(batch.frames), batch.truth.positives
+            frames, positives = task.data.augmented(batch.frames, task.data.clip), batch.truth.positives
             features = features_of(frames, task.dejavu.describe, "the batch")
         else:
             n, device = len(task.views.descriptors), task.views.descriptors.device
@@ -193,7 +193,7 @@ def describe_views(task: PlaceRecognitionTask) -> Views:
             for batch in loader:
                 known = batch.truth.positives[:, 0] >= 0
                 if known.any():
-                    views = task.dejavu.preprocess(data.augmented(batch.frames.to(task.device))[known])
+                    views = task.dejavu.preprocess(data.augmented(batch.frames.to(task.device), data.clip)[known])
                     descriptors.append(embedding.describe(views).float())
                     positives.append(batch.truth.positives[known].to(task.device))
     return Views(torch.cat(descriptors), torch.cat(positives))

@@ -1,0 +1,44 @@
+"""Footage over a ground that repeats, at known speeds: what the tests of resampling share."""
+
+from __future__ import annotations
+
+import torch
+from helpers import Fixed
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from dejavu_torch import FrequencyLayer, GroundOdometry
+
+SIDE, STEP, CYCLE = 48, 6, 60  # pixels
+WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))  # the camera looks straight down
+
+
+def positions(*speeds: tuple[int, int]) -> Tensor:
+    """Pixels of ground at each frame, from (pixels per frame, frames)."""
+    steps = [speed for speed, frames in speeds for _ in range(frames)]
+    return torch.tensor([0, *steps]).cumsum(0)
+
+
+# both come 603 pixels far; each stands for a while, at another place
+REFERENCE = positions((4, 60), (0, 25), (9, 40), (3, 1))
+QUERY = positions((8, 45), (0, 10), (5, 48), (3, 1))
+
+
+def footage(where: Tensor, noise: float = 0.0) -> Tensor:
+    """(N,1,48,48) frames over a ground that repeats every 60 pixels and differs a little everywhere."""
+    random = torch.Generator().manual_seed(0)
+    cycle = torch.rand(1, 1, CYCLE // 4, SIDE // 4, generator=random).repeat(1, 1, 12, 1)
+    coarse = 0.5 * cycle + 0.5 * torch.rand(cycle.shape, generator=random)
+    ground = interpolate(coarse, scale_factor=4, mode="bicubic")[0, 0]
+    last = len(ground) - SIDE  # forward: the ground comes nearer, down the frame
+    frames = torch.stack([ground[last - p : last - p + SIDE] for p in where.tolist()])[:, None]
+    return (frames + noise * torch.randn(frames.shape, generator=random)).clamp(0, 1)
+
+
+def camera(**settings: object) -> GroundOdometry:
+    return GroundOdometry(WHOLE, (SIDE, SIDE), **{"step": float(STEP), **settings})
+
+
+def everything(places: int) -> Fixed:
+    """A layer that stores every place."""
+    return Fixed(FrequencyLayer(places, places, 0, places, tuple(range(900))))
