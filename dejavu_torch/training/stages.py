@@ -123,17 +123,17 @@ class CodeStage(Stage):
     """
 
     def begin(self, task: PlaceRecognitionTask) -> None:
-        features = task.dejavu.features
-        if isinstance(features, Embedding) and features.coder is not None:
-            if not any(module is features.network for module in task.frozen):
-                task.frozen.append(features.network.eval())
+        if has_descriptor(task.dejavu.features):
+            network = embedding_of(task).network
+            if not any(module is network for module in task.frozen):
+                task.frozen.append(network.eval())
             task.views = describe_views(task) if task.views is None else task.views
         if not task.dejavu.map.places:
             task.relearn()
 
     def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
         features = task.dejavu.features
-        learns = features if task.views is None else _coder(embedding_of(task))
+        learns = _coder(embedding_of(task)) if has_descriptor(features) else features
         return [task.log_temperature, *_trainable(learns), *task.route.parameters()]
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
@@ -167,6 +167,11 @@ def stages_of(backbone: nn.Module, descriptor: float) -> list[Stage]:
     return [DescriptorStage(descriptor, len(backbone.coder.mean)), WhiteningStage(), CodeStage()]
 
 
+def has_descriptor(backbone: nn.Module) -> bool:
+    """Whether a backbone is an `Embedding` whose code is learned from a whitened descriptor."""
+    return isinstance(backbone, Embedding) and backbone.coder is not None
+
+
 def embedding_of(task: PlaceRecognitionTask) -> Embedding:
     """The task's backbone, where its stages are of an `Embedding`."""
     return cast(Embedding, task.dejavu.features)
@@ -193,7 +198,9 @@ def describe_views(task: PlaceRecognitionTask) -> Views:
             for batch in loader:
                 known = batch.truth.positives[:, 0] >= 0
                 if known.any():
-                    views = task.dejavu.preprocess(data.augmented(batch.frames.to(task.device), data.clip)[known])
+                    views = task.dejavu.preprocess(
+                        data.augmented(batch.frames.to(task.device), data.clip)[known]
+                    )
                     descriptors.append(embedding.describe(views).float())
                     positives.append(batch.truth.positives[known].to(task.device))
     return Views(torch.cat(descriptors), torch.cat(positives))
