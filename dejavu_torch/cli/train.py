@@ -52,6 +52,7 @@ QUIET = (  # what Lightning warns of and needs no action
     "training batches",
     "isinstance.treespec",
     "exists and is not empty",
+    "your dataloader is not resumable",
     "not supported by the model summary",
     "in eval mode at the start of training",
 )

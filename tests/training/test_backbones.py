@@ -111,7 +111,6 @@ class Foreign(nn.Module):
         return features
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["foreign", "kornia"])
 def test_a_foreign_network_learns(tmp_path: Path, kind: str) -> None:
     def module() -> nn.Module:
