@@ -238,6 +238,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def _advance(self, step: int) -> None:
         self.stage.end(self)
+        self.zero_grad()
         self.index, self.began = self.index + 1, step
 
     def on_fit_start(self) -> None:

@@ -21,7 +21,7 @@ from dejavu_torch.features.whitening import learned_whitening
 
 
 class Maker(nn.Module):
-    """Gives what it is told to, for each frame."""
+    """Gives what a function makes of the frames."""
 
     def __init__(self, make: Callable[[Tensor], Any]) -> None:
         super().__init__()

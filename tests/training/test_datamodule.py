@@ -23,7 +23,7 @@ from dejavu_torch.types import GroundTruth
 
 
 def numbered(frames: int, first: int = 0, side: int = 8) -> ArrayTraverse:
-    """Frames that tell their number: all pixels of frame i are first + i."""
+    """Frames that show their number: all pixels of frame i are first + i."""
     numbers = torch.arange(first, first + frames, dtype=torch.uint8)
     return ArrayTraverse(numbers[:, None, None].expand(frames, side, side), f"from {first}")
 
@@ -36,7 +36,7 @@ def route(frames: int = 24, stage: str = "fit", **settings: Any) -> RouteData:
 
 
 def drawn(data: RouteData) -> dict[int, list[list[int]]]:
-    """For each frame number the right places it came with, once for each time it was drawn."""
+    """For each frame number its right places, once for each time it was drawn."""
     seen: dict[int, list[list[int]]] = {}
     for frames, truth in data.train_dataloader():
         assert frames.dtype == torch.float32

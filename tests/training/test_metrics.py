@@ -1,4 +1,4 @@
-"""The metric is `evaluate` over everything it saw, however that came."""
+"""The metric is `evaluate` over everything it saw, in whatever batches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.types import GroundTruth, Match
 
 INF = float("inf")
-# score, reported place, right places, known, soft places; few values, so that scores tie
+# score, reported place, right places, judged, ignored places; few values, so that scores tie
 QUERY = st.tuples(
     st.sampled_from([-1.5, 0.0, 0.5, 1.0, INF]),
     st.integers(-1, 6),
@@ -42,10 +42,10 @@ def table(rows: Sequence[list[int]]) -> Tensor:
 
 
 def batch_of(queries: list[Any]) -> tuple[Match, GroundTruth]:
-    score, index, right, known, soft = zip(*queries, strict=True) if queries else ((),) * 5
+    score, index, right, judged, ignored = zip(*queries, strict=True) if queries else ((),) * 5
     scores = torch.tensor(score, dtype=torch.float32)
     match = Match(torch.tensor(index, dtype=torch.int64), scores, scores < 1)
-    return match, GroundTruth(table(right), torch.tensor(known, dtype=torch.bool), table(soft))
+    return match, GroundTruth(table(right), torch.tensor(judged, dtype=torch.bool), table(ignored))
 
 
 def same(figures: dict[str, Tensor], scores: Scores) -> bool:
@@ -73,10 +73,10 @@ def test_it_is_evaluate_on_all_data_whatever_the_batches(batches: list[Any], tol
     match, truth = batch_of([query for queries in batches for query in queries])
     near = (match.index[:, None] - truth.positives).abs() <= tolerance
     right = (near & (truth.positives >= 0) & (match.index >= 0)[:, None]).any(1)
-    soft = ((match.index[:, None] == truth.ignored) & (truth.ignored >= 0)).any(1)
+    ignored = ((match.index[:, None] == truth.ignored) & (truth.ignored >= 0)).any(1)
     figures = metric.compute()
     assert isinstance(figures, dict)
-    if (truth.judged & (right | ~soft)).any():
+    if (truth.judged & (right | ~ignored)).any():
         assert same(figures, evaluate(match, truth, tolerance))
     else:
         assert set(figures) == set(Scores._fields)

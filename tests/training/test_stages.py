@@ -60,15 +60,15 @@ class Watch(Callback):
         self.states: list[dict[str, Tensor]] = []
         self.rates: list[float] = []
 
-    def look(self, task: Any) -> None:
+    def keep(self, task: Any) -> None:
         self.states.append({name: value.clone() for name, value in task.dejavu.features.state_dict().items()})
 
     def on_before_optimizer_step(self, trainer: Any, pl_module: Any, optimizer: Any) -> None:
-        self.look(pl_module)
+        self.keep(pl_module)
         self.rates.append(optimizer.param_groups[0]["lr"])
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
-        self.look(pl_module)
+        self.keep(pl_module)
 
 
 def changed(states: list[dict[str, Tensor]]) -> set[str]:

@@ -33,7 +33,7 @@ def figures(path: Path) -> dict[str, list[float]]:
     return {name: [float(row[name]) for row in rows if row[name]] for name in rows[0]}
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
+def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
     """The table of figures that a test or validation prints."""
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     return {row[0]: float(row[1]) for row in rows if row and row[0].startswith(("test/", "val/"))}
@@ -58,9 +58,9 @@ def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest
     train("test", "--data.query", "two.npy")
     match = DejaVu.load("run/map.safetensors").localize(ArrayTraverse(footage(0.1)))
     scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
-    assert told(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
+    assert printed(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
     train("validate", "--data.validation", "two.npy")
-    assert told(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
+    assert printed(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
 
 
 def test_a_built_in_route(folder: Path, tmp_path: Path) -> None:
