@@ -63,12 +63,17 @@ class MapTrainer(Trainer):
     """Lightning's trainer, which also writes the map of a checkpoint."""
 
     def export(
-        self, model: PlaceRecognitionTask, datamodule: RouteData, ckpt_path: str | None = None
+        self,
+        model: PlaceRecognitionTask,
+        datamodule: RouteData,
+        ckpt_path: str | None = None,
+        weights_only: bool | None = None,
     ) -> None:
         """Write the map of a checkpoint.
 
         Args:
             ckpt_path: the checkpoint; the last one of trainer.default_root_dir where it is not given.
+            weights_only: accepted, as the config of a fit has it; no code of a checkpoint is ever run.
         """
         assert ckpt_path is not None  # TrainCLI found one
         load_weights(model, ckpt_path)

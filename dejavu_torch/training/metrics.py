@@ -23,9 +23,9 @@ class PlaceRecognition(Metric):
     Shape: update(match of (Q,), truth (Q,R) int64 with -1 as padding, or a `GroundTruth`); R may differ from
         batch to batch. compute() -> float64 scalars, the fields of `Scores` by name.
 
-    Convention: a query that `evaluate` leaves out (not judged, or reporting an ignored place) is left out here.
-        Where none is left, before the first update for example, every figure is NaN: nothing was measured.
-        Three numbers are kept of each query, on the device of the metric.
+    Convention: a query that `evaluate` leaves out (not judged, or reporting an ignored place) is left out
+        here. Where none is left, before the first update for example, every figure is NaN: nothing was
+        measured. Three numbers are kept of each query, on the device of the metric.
 
     Raises:
         InputError: a negative tolerance, matches that are not an index and a score for each query, a NaN

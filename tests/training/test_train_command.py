@@ -211,6 +211,9 @@ def test_export_makes_a_map_of_a_checkpoint(
     assert written.trained is not None
     assert written.trained.steps == 4
     assert f"--map {tmp_path}/new/map.safetensors" in capsys.readouterr().out
+    config = str(folder / "run" / "lightning_logs" / "version_0" / "config.yaml")  # the one of the fit
+    train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "again", config=config)
+    assert (tmp_path / "again" / "map.safetensors").is_file()
 
 
 def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:
