@@ -100,7 +100,6 @@ def test_the_network_is_learned_first_and_its_code_behind_it(tmp_path: Path) -> 
     assert DejaVu.load(tmp_path / "map.safetensors").features.linear.whitened  # type: ignore[union-attr]
 
 
-@pytest.mark.slow
 def test_what_is_learned_finds_places_on_another_day(tmp_path: Path) -> None:
     settings = {"backbone": coded(hidden=64, noise=0.5), "descriptor": 0.2}
     mild = Augmentation(**STILL | {"noise": 0.1, "exposure": (0.1, 0.1)})  # type: ignore[arg-type]

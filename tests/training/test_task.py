@@ -82,7 +82,6 @@ def test_the_map_holds_how_it_was_trained_and_counts_the_backbone(
     assert again.trained.seed == 7
 
 
-@pytest.mark.slow
 def test_training_finds_places_that_the_untrained_start_does_not(tmp_path: Path) -> None:
     noisy = footage(0.15)
     given = {"limit_val_batches": 0}
