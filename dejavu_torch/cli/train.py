@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,33 +12,77 @@ from typing import Any, NoReturn
 
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning import Trainer
-from pytorch_lightning.callbacks import Callback, ModelCheckpoint
-from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
+from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
 from dejavu_torch.cli.parser import Parser, UsageError, refusal
 from dejavu_torch.data.files import make_output_folder
 from dejavu_torch.database.summary import describe
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import MapExport
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.export import LastCheckpoint, MapExport, load_weights
+from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask
 from dejavu_torch.types import InputError
 
-DEFAULTS = {
+EVERY = 500  # steps between two validations, and between two checkpoints
+TRAINER = {
+    "max_steps": 3000,
     "accelerator": "auto",
     "devices": 1,
     "gradient_clip_val": 5.0,
+    "check_val_every_n_epoch": None,
     "default_root_dir": "dejavu_train",
     "num_sanity_val_steps": 0,
     "log_every_n_steps": 10,
 }
-
-PARTS = {
-    "model.backbone": "dejavu_torch.features.cnn.SmallCNN",
-    "model.periods": "dejavu_torch.periods.imposed.ImposedPeriods",
-    "model.preprocess": "dejavu_torch.Preprocess",
-    "data.augmentation": "dejavu_torch.features.augmentation.Augmentation",
+# parts that are our own unless another class is named, so that their options can be given alone
+PARTS: dict[str, dict[str, Any]] = {
+    "model.backbone": {"class_path": "dejavu_torch.features.cnn.SmallCNN"},
+    "model.mapper": {
+        "class_path": "dejavu_torch.TemplateMapper",
+        "init_args": {"periods": {"class_path": "dejavu_torch.ImposedPeriods"}, "temperature": TEMPERATURE},
+    },
+    "model.preprocess": {"class_path": "dejavu_torch.Preprocess"},
+    "data.augmentation": {"class_path": "dejavu_torch.features.augmentation.Augmentation"},
 }
+EXPECTED = "expected one that `dejavu train fit` wrote"
+QUIET = (  # what Lightning warns of and needs no action
+    "args parameter is intended",
+    "num_workers",
+    "tensorboard",
+    "training batches",
+    "isinstance.treespec",
+    "exists and is not empty",
+    "your dataloader is not resumable",
+    "not supported by the model summary",
+    "in eval mode at the start of training",
+)
 log = logging.getLogger("dejavu_torch")
+
+
+class MapTrainer(Trainer):
+    """Lightning's trainer, which also writes the map of a checkpoint."""
+
+    def export(
+        self,
+        model: PlaceRecognitionTask,
+        datamodule: RouteData,
+        ckpt_path: str | None = None,
+        weights_only: bool | None = None,
+    ) -> None:
+        """Write the map of a checkpoint.
+
+        Args:
+            ckpt_path: the checkpoint; the last one of trainer.default_root_dir where it is not given.
+            weights_only: accepted, as the config of a fit has it; no code of a checkpoint is ever run.
+        """
+        assert ckpt_path is not None  # TrainCLI found one
+        load_weights(model, ckpt_path)
+        model.require_map()
+        model.dejavu.velocity = datamodule.velocity
+        folder, export = Path(self.default_root_dir), MapExport()
+        make_output_folder(folder)
+        export.write(model, folder)
+        print_written(export, datamodule)
 
 
 class TrainParser(Parser, LightningArgumentParser):
@@ -52,152 +97,166 @@ class TrainParser(Parser, LightningArgumentParser):
 
 
 class TrainCLI(LightningCLI):
-    """fit writes DIR/map.safetensors; validate and test judge a checkpoint."""
+    """fit writes DIR/map.safetensors; validate, test and export take a checkpoint."""
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
-        """Lightning's, without predict, which `dejavu localize` does."""
-        every = LightningCLI.subcommands()
-        return {name: every[name] for name in ("fit", "validate", "test")}
+        """Lightning's without predict, which `dejavu localize` does, and with export."""
+        every = LightningCLI.subcommands() | {"export": {"model", "datamodule"}}
+        return {name: every[name] for name in ("fit", "validate", "test", "export")}
 
     def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
         """A parser whose errors are one line."""
         parser = TrainParser(**kwargs)
         parser.add_argument(
-            "-c", "--config", action="config", help="YAML file; its keys are the options below"
+            "-c", "--config", action="config", help="YAML file or preset; its keys are the options below"
         )
         return parser
 
-    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """Settings that Lightning refuses are told in one line."""
+    def add_core_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Our options ahead of Lightning's."""
+        parser.add_lightning_class_args(PlaceRecognitionTask, "model")
+        parser.add_lightning_class_args(RouteData, "data")
+        parser.add_lightning_class_args(MapTrainer, "trainer")
+        parser.set_defaults({f"trainer.{name}": value for name, value in TRAINER.items()} | PARTS)
+
+    def before_instantiate_classes(self) -> None:
+        """Validation is by steps, unless it is asked for by epochs or otherwise."""
+        trainer = self.config[self.subcommand]["trainer"]
+        if trainer["check_val_every_n_epoch"] is None and trainer["val_check_interval"] is None:
+            steps = trainer["max_steps"]
+            trainer["val_check_interval"] = min(EVERY, steps) if steps > 0 else EVERY
+
+    def instantiate_classes(self) -> None:
+        """What a part's constructor refuses, in one line."""
         try:
-            return super().instantiate_trainer(**kwargs)
+            super().instantiate_classes()
+        except Exception as error:
+            raise refusal(error) from error
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """A trainer with our callbacks; what Lightning refuses, in one line."""
+        asked = self.config_init[self.subcommand]["trainer"]
+        own = asked["callbacks"] or []
+        own = [*own] if isinstance(own, list) else [own]
+        root = Path(asked["default_root_dir"])
+        for callback in own:
+            if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
+                callback.dirpath = str(root / "checkpoints")  # all files of a run lie in one folder
+        if self.subcommand == "fit" and not asked["fast_dev_run"]:  # a trial leaves an earlier run as it is
+            own.append(MapExport())
+            chosen = asked["enable_checkpointing"] is False or any(isinstance(c, Checkpoint) for c in own)
+            own += [] if chosen else [LastCheckpoint(EVERY)]
+        try:
+            return super().instantiate_trainer(callbacks=own, **kwargs)
         except (ImportError, ValueError) as error:
             raise InputError(str(error)) from error
 
-    def after_instantiate_classes(self) -> None:
-        """All files of a run lie in one folder."""
-        for callback in self.trainer.checkpoint_callbacks:
-            if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
-                callback.dirpath = str(self._checkpoints)
-
     def before_fit(self) -> None:
-        """What cannot work is told before the work."""
+        """Refuse ahead of the work what cannot work."""
         asked = self.config[self.subcommand]["trainer"]
         if asked["max_steps"] == -1 and asked["max_epochs"] in (None, -1) and not asked["fast_dev_run"]:
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
         if 0 in (asked["max_steps"], asked["max_epochs"]):
             raise InputError("the training has no steps; expected trainer.max_steps above 0")
         if asked["overfit_batches"]:
-            raise InputError("trainer.overfit_batches is not for clips; expected trainer.limit_train_batches")
+            raise InputError("trainer.overfit_batches does not fit; expected trainer.limit_train_batches")
         root = Path(self.trainer.default_root_dir)
         make_output_folder(root)
-        if asked["fast_dev_run"]:  # leaves an earlier run as it is
-            writers = (ModelCheckpoint, MapExport)
-            self._callbacks[:] = [one for one in self._callbacks if not isinstance(one, writers)]
-        elif (root / "map.safetensors").exists() and not self.config[self.subcommand].get("ckpt_path"):
+        resumed = self.config[self.subcommand].get("ckpt_path")
+        if not asked["fast_dev_run"] and (root / "map.safetensors").exists() and not resumed:
             log.warning("%s holds an earlier run, which this one replaces", root)
 
-    def after_fit(self) -> None:
-        """Tell of the map."""
-        for callback in self._callbacks:
-            if isinstance(callback, MapExport) and callback.written is not None:
-                path, certificate = callback.written
-                print(f"{describe(certificate)}\nwritten to {path}; `dejavu compare --map` judges it")
-
-    def instantiate_classes(self) -> None:
-        """What a part's constructor refuses is told in one line."""
+    def fit(self, **arguments: Any) -> None:
+        """Train, and print what was written, also where the user interrupts."""
         try:
-            super().instantiate_classes()
-        except Exception as error:
-            raise refusal(error) from error
-
-    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Parts that are our own unless another class is named, so that their options can be given alone."""
-        parser.set_defaults({name: {"class_path": path} for name, path in PARTS.items()})
-
-    @property
-    def _callbacks(self) -> list[Callback]:
-        found: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
-        return found
-
-    @property
-    def _checkpoints(self) -> Path:
-        return Path(self.trainer.default_root_dir) / "checkpoints"
+            self.trainer.fit(**arguments)
+        finally:
+            for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+                if isinstance(callback, MapExport):
+                    print_written(callback, self.datamodule)
 
     def before_validate(self) -> None:
-        """See `_find_checkpoint`."""
-        self._find_checkpoint()
-
-    def before_test(self) -> None:
-        """See `_find_checkpoint`."""
-        self._find_checkpoint()
-
-    def _find_checkpoint(self) -> None:
-        """Without --ckpt_path the last checkpoint of the folder is judged, never untrained weights."""
+        """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""
         chosen = self.config[self.subcommand]
         if chosen.get("ckpt_path"):
             return
-        last = self._checkpoints / "last.ckpt"
-        if not last.is_file():
+        folder = Path(self.trainer.default_root_dir) / "checkpoints"
+        found = sorted(folder.glob("*.ckpt"), key=lambda path: path.stat().st_mtime)
+        if not found:
             raise InputError(
-                f"there is no {last}; expected --ckpt_path, or the trainer.default_root_dir of a training"
+                f"there is no checkpoint in {folder}; expected --ckpt_path, or the "
+                "trainer.default_root_dir of a training"
             )
-        self.config_init[self.subcommand]["ckpt_path"] = str(last)
+        self.config_init[self.subcommand]["ckpt_path"] = str(found[-1])
+
+    before_test = before_export = before_validate
+
+
+def print_written(export: MapExport, data: RouteData) -> None:
+    """What was written, and what to do next."""
+    if export.written is not None:
+        path, summary = export.written
+        known = [data.sources[name] for name in ("validation", "query") if data.sources[name]]
+        reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], [*known, "SECOND"][0]))
+        print(f"{describe(summary)}\nwritten to {path}; only a second traverse shows what it is worth:")
+        print(f"dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")
+
+
+def preset_path(name_or_path: str) -> Path:
+    """The file of a preset such as `train_small`; a path as it is."""
+    folder = Path(__file__).parents[2] / "configs"
+    preset = folder / f"{name_or_path}.yaml"
+    return preset if preset.is_file() and not Path(name_or_path).exists() else Path(name_or_path)
+
+
+def configs_first(given: Sequence[str]) -> list[str]:
+    """The command line with its configs, presets as paths, ahead of the options, which have the last word."""
+    configs, others, words = [], [], iter(given[1:])
+    for word in words:
+        name, equals, value = word.partition("=")
+        if name in ("--config", "-c") and (equals or (value := next(words, ""))):
+            configs.append(f"--config={preset_path(value)}")
+        else:
+            others.append(word)
+    return [*given[:1], *configs, *others]
 
 
 def run_train(arguments: Sequence[str]) -> None:
     """Run `dejavu train ARGUMENTS`.
 
     Raises:
-        InputError: what the command line, the config or the data get wrong.
+        InputError: a mistake in the command line, the config or the data.
     """
     for name in ("pytorch_lightning", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    for told in (
-        "args parameter is intended",
-        "num_workers",
-        "tensorboard",
-        "training batches",
-        "isinstance.treespec",
-        "exists and is not empty",
-        "not supported by the model summary",
-        "in eval mode at the start of training",
-    ):
-        warnings.filterwarnings("ignore", f".*{told}.*")
-    last = ModelCheckpoint(
-        save_last=True, filename="{step}", enable_version_counter=False, save_on_train_epoch_end=True
-    )
+    for message in QUIET:
+        warnings.filterwarnings("ignore", f".*{message}.*")
     try:
         TrainCLI(
             PlaceRecognitionTask,
             RouteData,
-            args=list(arguments),
+            trainer_class=MapTrainer,
+            args=configs_first(arguments),
             parser_kwargs={"prog": "dejavu train", "description": "Train features that repeat, end to end."},
             seed_everything_default=0,
-            trainer_defaults=DEFAULTS | {"callbacks": [last, MapExport()]},
-            save_config_callback=SaveConfigCallback,
             save_config_kwargs={"overwrite": True},
         )
     except RuntimeError as error:
-        told = " ".join(str(error).split())[:300]
-        if "loading state_dict" in told:
-            told = f"the checkpoint is of another model than the config's: {told}"
-        elif "Early stopping conditioned" not in told:
+        problem = " ".join(str(error).split())[:300]
+        if "loading state_dict" in problem:
+            problem = f"the checkpoint is of another model than the config's: {problem}"
+        elif "Early stopping conditioned" not in problem:
             raise
-        raise InputError(told) from error
+        raise InputError(problem) from error
     except KeyError as error:
         if "pytorch-lightning_version" not in str(error):
             raise
-        raise InputError(
-            "the checkpoint is none of a training; expected one that `dejavu train fit` wrote"
-        ) from error
+        raise InputError(f"the checkpoint is none of a training; {EXPECTED}") from error
     except MisconfigurationException as error:
         raise InputError(str(error)) from error
     except UnpicklingError as error:
-        raise InputError(
-            "the checkpoint cannot be read; expected one that `dejavu train fit` wrote"
-        ) from error
+        raise InputError(f"the checkpoint cannot be read; {EXPECTED}") from error
     except SystemExit as error:
         if isinstance(error.__context__, KeyboardInterrupt):  # Lightning would have it be a failure
             raise KeyboardInterrupt from error

@@ -1,4 +1,4 @@
-"""What another day does to a frame, for learning features that do not mind it."""
+"""What another day does to a frame, for learning features that are robust to it."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class Augmentation(nn.Module):
             size = 2 * self.radius + 1
             apart = size > 3  # 3 x 3 in one go takes half the time of rows and columns apart
             steps.append(RandomGaussianBlur((size, size), (min(0.1, blur), float(blur)), separable=apart))
-        # in a tuple, which keeps kornia's buffers out of checkpoints: they hold strengths, nothing learnt
+        # in a tuple, which keeps kornia's buffers out of checkpoints: they hold strengths, nothing learned
         self._steps = (VideoSequential(*steps),)
 
     @property

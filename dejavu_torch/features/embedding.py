@@ -1,6 +1,8 @@
-"""Any network as a backbone."""
+"""Any network as a backbone: its descriptor, and the whitening and the code behind it."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from kornia.color import rgb_to_grayscale
@@ -8,12 +10,94 @@ from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
-from dejavu_torch.features.coder import Coder
+from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.types import InputError
 
 
+class Coder(nn.Module):
+    """Whitens a descriptor and maps it, by one hidden layer, to the code of its place.
+
+    The code of a place is arbitrary, so a descriptor that another day moved a little must still get the same
+    one. Training therefore adds noise to the whitened descriptor, in which no direction changes much more
+    than another: it stands in for the days that training does not see.
+
+    Args:
+        inputs: K, of a descriptor.
+        dimension: D, number of features, not standardised yet.
+        hidden: width of the hidden layer.
+        noise: its standard deviation beside components of about 1.
+        kept: number of components that whitening keeps; fewer where K is smaller.
+
+    Shape: (B,K) -> (B,D).
+
+    Convention: before `whiten` the first components are taken as they are. They are brought to length
+        sqrt(components) before the noise, and after it. Noise is for training mode alone.
+
+    Raises:
+        InputError: settings out of range.
+
+    Example:
+        >>> coder = Coder(inputs=8, dimension=4, hidden=16).eval()
+        >>> views, places = torch.randn(2, 32, 8)
+        >>> bool(coder.whitened), coder.whiten(views, places), bool(coder.whitened)
+        (False, None, True)
+        >>> coder(views).shape
+        torch.Size([32, 4])
+    """
+
+    mean: Tensor
+    projection: Tensor
+    whitened: Tensor
+
+    def __init__(
+        self, inputs: int, dimension: int, hidden: int = 400, noise: float = 1.0, kept: int = 128
+    ) -> None:
+        super().__init__()
+        if min(inputs, dimension, hidden, kept) < 1 or not 0 <= noise < math.inf:
+            raise InputError(
+                f"Coder got inputs={inputs}, dimension={dimension}, hidden={hidden}, kept={kept}, "
+                f"noise={noise}; expected at least 1 each, the noise 0 or more"
+            )
+        self.noise = noise
+        kept = min(kept, inputs)
+        self.register_buffer("mean", torch.zeros(inputs))
+        self.register_buffer("projection", torch.eye(inputs, kept))
+        self.register_buffer("whitened", torch.tensor(False))
+        norm = nn.BatchNorm1d(hidden)
+        # the scale of the units does not matter; with a small one AdamW reaches their thresholds sooner
+        nn.init.constant_(norm.weight, 0.1)
+        self.layers = nn.Sequential(
+            nn.Linear(kept, hidden, bias=False),
+            norm,
+            nn.ReLU(inplace=True),
+            nn.Linear(hidden, dimension),
+        )
+
+    def whiten(self, views: Tensor, places: Tensor) -> None:
+        """Take `learned_whitening` of (n,K) views and the (n,K) places that they show."""
+        mean, projection = learned_whitening(views, places, self.projection.shape[1])
+        self.mean.copy_(mean)
+        self.projection.copy_(projection)
+        self.whitened.fill_(True)
+
+    def forward(self, descriptors: Tensor) -> Tensor:
+        # bf16 is too coarse for the small differences that whitening enlarges
+        with torch.autocast(descriptors.device.type, enabled=False):
+            components = (descriptors.to(self.mean.dtype) - self.mean) @ self.projection
+            components = to_length(components)
+            if self.training and self.noise:
+                components = to_length(components + self.noise * torch.randn_like(components))
+        coded: Tensor = self.layers(components)
+        return coded
+
+
+def to_length(components: Tensor) -> Tensor:
+    """Each row to length sqrt(components)."""
+    return nn.functional.normalize(components, dim=1) * math.sqrt(components.shape[1])
+
+
 class Embedding(nn.Module):
-    """What a network makes of a frame, pooled to a coarse grid and projected to D standardised features.
+    """The output of a network, pooled to a coarse grid and projected to D standardised features.
 
     Args:
         network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K) or vectors (B,K), such as
@@ -23,13 +107,13 @@ class Embedding(nn.Module):
         resize: (height, width) in pixels that frames are brought to, antialiased.
         grid: cells along each side that maps are averaged over.
         cell: of `local_contrast` ahead of the network, pixels; 0 leaves the contrast as it is.
-        hidden: width of the hidden layer of a `Coder`, which stands for the linear layer then; 0 has none.
+        hidden: width of the hidden layer of a `Coder`, which replaces the linear layer; 0 has none.
         noise, kept: of the `Coder`.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
-    Convention: of tokens (B,T,K), as transformers give, the mean counts. The network's output shape is found
-        by running it once on a black frame, in eval mode.
+    Convention: tokens (B,T,K), as transformers give, are averaged. The network's output shape is found by
+        running it once on a black frame, in eval mode.
 
     Raises:
         InputError: settings out of range, a network that cannot take such frames or gives neither maps
@@ -75,7 +159,7 @@ class Embedding(nn.Module):
         try:
             with torch.no_grad():
                 output = network.eval()(black)
-        except Exception as error:  # whatever the network objects with
+        except Exception as error:  # a network may raise anything
             raise InputError(
                 f"{type(network).__name__} does not take frames {tuple(black.shape)}: "
                 f"{' '.join(str(error).split())}"
@@ -83,14 +167,14 @@ class Embedding(nn.Module):
         finally:
             for module, training in modes:
                 module.training = training
-        inputs = self._seen(output).shape[1]
+        inputs = self._pooled(output).shape[1]
         self.linear = (
             Coder(inputs, dimension, hidden, noise, kept) if hidden else nn.Linear(inputs, dimension)
         )
         self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
-    def _seen(self, output: object) -> Tensor:
-        """What the network made, one row a frame."""
+    def _pooled(self, output: object) -> Tensor:
+        """The network's output, one row per frame."""
         if isinstance(output, Tensor) and output.ndim == 4:
             return nn.functional.adaptive_avg_pool2d(output, self.grid).flatten(1)
         if isinstance(output, Tensor) and output.ndim == 3:
@@ -102,8 +186,13 @@ class Embedding(nn.Module):
             f"{type(self.network).__name__} made {seen}; expected maps (B,K,h,w) or vectors (B,K)"
         )
 
+    @property
+    def coder(self) -> Coder | None:
+        """The whitening and the code, where there is a hidden layer."""
+        return self.linear if isinstance(self.linear, Coder) else None
+
     def describe(self, frames: Tensor) -> Tensor:
-        """What the network makes of frames, one row each: (B,C,H,W) -> (B,K)."""
+        """Descriptors, the pooled output of the network: (B,C,H,W) -> (B,K)."""
         if frames.ndim != 4 or frames.shape[1] not in (1, 3):
             raise InputError(f"Embedding got frames {tuple(frames.shape)}; expected (B,1,H,W) or (B,3,H,W)")
         if self.channels == 1 and frames.shape[1] == 3:
@@ -113,10 +202,10 @@ class Embedding(nn.Module):
             frames = antialiased_resize(frames, self.resize, antialias=True)
         if self.cell:
             frames = local_contrast(frames, self.cell)
-        return self._seen(self.network(frames))
+        return self._pooled(self.network(frames))
 
     def code(self, descriptors: Tensor) -> Tensor:
-        """Features of what `describe` gives: (B,K) -> (B,D)."""
+        """Features of descriptors: (B,K) -> (B,D)."""
         features: Tensor = self.linear(descriptors)
         standardised: Tensor = self.standardise(features.float())
         return standardised

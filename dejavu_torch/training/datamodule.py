@@ -2,41 +2,113 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
+from kornia.geometry.transform import resize as antialiased_resize
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset, Sampler
 
+from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.truth import Shown, as_truth
 from dejavu_torch.data.truthfile import find_truth
 from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.training.frames import Batch, Clips, StoredFrames, store
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import GroundTruth, InputError, Traverse
+
+READ_AT_ONCE = 64  # frames
+
+
+class Batch(NamedTuple):
+    """frames: (B,C,H,W) or features (B,D). truth: their right places; rows of nothing known are -1."""
+
+    frames: Tensor
+    truth: GroundTruth
+
+
+class StoredFrames(Dataset[Batch]):
+    """Frames as bytes, which may lie in temporary files (see `concatenate`), with their right places.
+
+    Args:
+        parts: frames (n,C,H,W) uint8, or features (n,D) float, of one or several traverses.
+        truth: of all of them, one behind the other.
+    """
+
+    def __init__(self, parts: list[Tensor], truth: GroundTruth) -> None:
+        self.parts = parts
+        self.truth = truth._replace(positives=truth.positives.masked_fill(~truth.judged[:, None], -1))
+
+    @property
+    def values(self) -> Tensor:
+        """Frames or features of the first traverse."""
+        return self.parts[0]
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts)
+
+    def __getitem__(self, index: list[int]) -> Batch:
+        frames, first = torch.tensor(index), 0
+        chosen = self.values.new_empty(len(frames), *self.values.shape[1:])
+        for part in self.parts:  # which may lie in files: never joined
+            here = (frames >= first) & (frames < first + len(part))
+            chosen[here] = part[frames[here] - first]
+            first += len(part)
+        return Batch(as_frames(chosen), GroundTruth(*(part[index] for part in self.truth)))
+
+
+class Clips(Sampler[list[int]]):
+    """Each frame about once an epoch, in clips of consecutive frames from all over the route.
+
+    Args:
+        lengths: frames of each traverse; no clip crosses from one to the next.
+        batch_size: frames of a batch. clip: frames of a clip; a last clip that is shorter is left out.
+    """
+
+    def __init__(self, lengths: list[int], batch_size: int, clip: int) -> None:
+        self.lengths, self.clip = lengths, clip
+        self.clips = min(batch_size // clip, sum(length // clip for length in lengths))
+
+    def __len__(self) -> int:
+        return sum(length // self.clip for length in self.lengths) // self.clips
+
+    def __iter__(self) -> Iterator[list[int]]:
+        starts, first = [], 0
+        for length in self.lengths:
+            left_over = int(torch.randint(length % self.clip + 1, ()))
+            starts.append(first + left_over + torch.arange(length // self.clip) * self.clip)
+            first += length
+        order = torch.cat(starts)
+        order = order[torch.randperm(len(order))]
+        frames = order[:, None] + torch.arange(self.clip)
+        for batch in frames.split(self.clips)[: len(self)]:  # an incomplete batch is left out
+            yield batch.flatten().tolist()
 
 
 class RouteData(LightningDataModule):
-    """A reference traverse to train on, and what to train, validate and test with beside it.
+    """A reference traverse to train on, and further ones to train on, to validate and to test with.
 
     Args:
-        source: the reference, whose frames are the places of the map: what `open_source` reads, or a
-            Traverse.
+        source: the reference, whose frames are the places of the map: what `open_source` reads, a Traverse,
+            or a tensor of frames or features (see `ArrayTraverse`).
         second: another traverse of the same route to train on as well: its frames are positives of the
             places they show.
         second_truth: which places those are, see `find_truth`.
-        validation: a traverse to validate on during training. None: the reference itself under
-            augmentation, always the same, which needs no second traverse.
+        validation: a traverse to validate on during training. None: the reference itself under augmentation,
+            the same each time; its figures say what is learned, not how another traverse fares.
         validation_truth: see `find_truth`.
         query: the traverse that `test` localizes. truth: its places, see `find_truth`.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
-        resize: (height, width) in pixels that frames are kept in; None keeps their size.
+        resize: (height, width) in pixels that frames are stored in; None is the `frame_size` of the task that
+            is trained, which is what its backbone resizes them to, and their own size where it has none.
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
 
@@ -49,12 +121,12 @@ class RouteData(LightningDataModule):
 
     def __init__(
         self,
-        source: Any,
-        second: Any = None,
+        source: str | Any,
+        second: str | Any = None,
         second_truth: str | None = None,
-        validation: Any = None,
+        validation: str | Any = None,
         validation_truth: str | None = None,
-        query: Any = None,
+        query: str | Any = None,
         truth: str | None = None,
         tolerance: int = 5,
         batch_size: int = 64,
@@ -71,66 +143,70 @@ class RouteData(LightningDataModule):
             )
         if resize is not None and (len(resize) != 2 or min(resize) < 1):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
-        self.source = source
-        self.others = {
-            "second": (second, second_truth),
-            "validation": (validation, validation_truth),
-            "query": (query, truth),
-        }
-        self.tolerance = tolerance
-        self.batch_size = batch_size
-        self.clip = clip
+        self.sources = {"source": source, "second": second, "validation": validation, "query": query}
+        for name, given in self.sources.items():
+            if given is not None and not isinstance(given, (str, Path, Traverse, Tensor)):
+                raise InputError(
+                    f"{name} is of type {type(given).__name__}; expected a path or `sim:` address, a "
+                    "Traverse, or a tensor of frames or features"
+                )
+        self.truths = {"second": second_truth, "validation": validation_truth, "query": truth}
+        self.tolerance, self.batch_size, self.clip = tolerance, batch_size, clip
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
         self.velocity = velocity
-        self.augmenting = True  # the frames that are trained on
-        self.raw: Traverse  # the reference as it came
-        self.reference: Traverse  # the same, at even steps where asked for
+        self.raw: Traverse  # the reference as it is read
+        self.reference: Traverse  # the same at even steps, where there is `velocity`
         self.sets: dict[str, StoredFrames] = {}
+        self._size: tuple[int, int] | None = None  # of the stored frames
 
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
+        task = None if self.trainer is None else self.trainer.lightning_module
+        size = getattr(task, "frame_size", None) if self.resize is None else self.resize
+        if size != self._size:
+            self.sets.clear()
+            self._size = size
         if "reference" not in self.sets:
-            self.raw = _open(self.source)
-            self.reference = self._evenly(self.raw)
-            values = store(self.reference, self.resize)
+            self.raw = _open(self.sources["source"])
+            self.reference = self._resampled(self.raw)
+            values = store(self.reference, size)
             self._check_length(self.reference.name, len(values))
-            self.sets["reference"] = StoredFrames(values, as_truth(torch.arange(len(values))[:, None]))
+            self.sets["reference"] = StoredFrames([values], as_truth(torch.arange(len(values))[:, None]))
         needed = {"fit": ("second", "validation"), "validate": ("validation",), "test": ("query",)}
         for name in needed.get(stage, ()):
-            if self.others[name][0] is not None and name not in self.sets:
+            if self.sources[name] is not None and name not in self.sets:
                 self.sets[name] = self._read(name)
         if stage == "test" and "query" not in self.sets:
             raise InputError("there is nothing to test on; expected data.query, a second traverse")
 
     def _read(self, name: str) -> StoredFrames:
-        source, truth = self.others[name]
-        raw, reference = _open(source), self.sets["reference"]
+        raw, reference = _open(self.sources[name]), self.sets["reference"].values
         step = self.reference.step if isinstance(self.reference, ResampledTraverse) else None
-        traverse = self._evenly(raw, step)
-        values = store(traverse, self.resize)
+        traverse = self._resampled(raw, step)
+        values = store(traverse, self._size)
         self._check_length(traverse.name, len(values))
-        if values.shape[1:] != reference.values.shape[1:]:
+        if values.shape[1:] != reference.shape[1:]:
             raise InputError(
                 f"{traverse.name} has frames of {tuple(values.shape[1:])}, the reference of "
-                f"{tuple(reference.values.shape[1:])}; expected the same channels, and one size, "
-                "as data.resize makes"
+                f"{tuple(reference.shape[1:])}; expected the same channels, and one size, as data.resize "
+                "makes"
             )
         shown = None
         if isinstance(self.reference, ResampledTraverse):
             frame = traverse.frame if isinstance(traverse, ResampledTraverse) else None
             shown = Shown(frame, self.reference.frame, self.reference.place_of, raw.length)
-        known = find_truth(truth, self.raw, raw, len(reference), len(values), shown=shown)
+        known = find_truth(self.truths[name], self.raw, raw, len(reference), len(values), shown=shown)
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
             raise InputError(
-                f"nothing tells which of {len(reference)} places the {len(values)} frames of {traverse.name} "
-                f"show; expected {option}"
+                f"there is no ground truth for {traverse.name}: it has {len(values)} frames, the reference "
+                f"{len(reference)} places; expected {option}"
             )
-        return StoredFrames(values, known)
+        return StoredFrames([values], known)
 
-    def _evenly(self, traverse: Traverse, step: float | None = None) -> Traverse:
-        return DejaVu(velocity=self.velocity, batch_size=self.batch_size).evenly(traverse, step)
+    def _resampled(self, traverse: Traverse, step: float | None = None) -> Traverse:
+        return DejaVu(velocity=self.velocity, batch_size=self.batch_size).resample(traverse, step)
 
     def _check_length(self, name: str, frames: int) -> None:
         if frames <= max(1, self.tolerance):
@@ -140,56 +216,81 @@ class RouteData(LightningDataModule):
             )
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Frames of the reference and of the second traverse, augmented."""
-        parts = [self.sets[name] for name in ("reference", "second") if name in self.sets]
-        lengths = [len(part) for part in parts]
+        """Frames of the reference and of the second traverse, as they are stored."""
+        sets = [self.sets[name] for name in ("reference", "second") if name in self.sets]
+        lengths = [len(part) for part in sets]
         if max(lengths) < self.clip:
             raise InputError(f"clip is {self.clip} and the route has {max(lengths)} frames; expected fewer")
-        rights = [part.truth.positives for part in parts]
-        width = max(right.shape[1] for right in rights)
+        positives = [part.truth.positives for part in sets]
+        width = max(part.shape[1] for part in positives)
         pad = torch.nn.functional.pad
-        right = torch.cat([pad(right, (0, width - right.shape[1]), value=-1) for right in rights])
-        frames = StoredFrames(parts[0].values, as_truth(right), *(part.values for part in parts[1:]))
+        joined = torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives])
+        frames = StoredFrames([part.values for part in sets], as_truth(joined))
         return _loader(frames, Clips(lengths, self.batch_size, self.clip))
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """The validation traverse, or the reference under augmentations that are the same each time."""
+        """The validation traverse, or the reference."""
         return self._in_order("validation" if "validation" in self.sets else "reference")
 
     def test_dataloader(self) -> DataLoader[Batch]:
-        """The query traverse, as it is."""
+        """The query traverse."""
         return self._in_order("query")
 
     def _in_order(self, name: str) -> DataLoader[Batch]:
         frames = torch.arange(len(self.sets[name])).split(self.batch_size)
         return _loader(self.sets[name], [part.tolist() for part in frames])
 
-    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        """Augment where frames train, and where the reference stands in for a validation traverse."""
-        if batch.frames.ndim != 4 or self.trainer is None:
-            return batch
-        if self.trainer.training:
-            return (
-                batch._replace(frames=self.augmented(batch.frames, self.clip)) if self.augmenting else batch
-            )
-        if (self.trainer.validating or self.trainer.sanity_checking) and "validation" not in self.sets:
-            with torch.random.fork_rng():
-                torch.manual_seed(int(batch.truth.positives[0, 0]))
-                return batch._replace(frames=self.augmented(batch.frames, 1))
-        return batch
-
     def augmented(self, frames: Tensor, clip: int) -> Tensor:
-        """Frames (B,C,H,W), clip after clip, as on another day."""
+        """Frames (B,C,H,W), clip after clip, as on another day; features (B,D) as they are."""
+        if frames.ndim != 4:
+            return frames
         self.augmentation.train()
-        augmented: Tensor = self.augmentation(frames.unflatten(0, (-1, clip)))
+        with torch.autocast(frames.device.type, enabled=False):
+            augmented: Tensor = self.augmentation(frames.unflatten(0, (-1, clip)))
         return augmented.flatten(0, 1)
 
+    def validated(self, batch: Batch) -> Tensor:
+        """The frames of a validation batch: the reference itself is augmented, in the same way each time."""
+        if "validation" in self.sets:
+            return batch.frames
+        with torch.random.fork_rng():
+            torch.manual_seed(int(batch.truth.positives[0, 0]))
+            return self.augmented(batch.frames, 1)
 
-def _open(source: Any) -> Traverse:
-    return source if isinstance(source, Traverse) else open_source(source)
+
+def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
+    """All frames of a traverse as bytes: (N,C,H,W) uint8; ready features as they are, (N,D)."""
+    shape: tuple[int, ...] = ()
+
+    def rows() -> Iterator[Tensor]:
+        nonlocal shape
+        for batch in traverse.batches(READ_AT_ONCE):
+            if batch.ndim == 4 and resize is not None and tuple(batch.shape[-2:]) != resize:
+                batch = antialiased_resize(batch, resize, antialias=True)
+            if shape and tuple(batch.shape[1:]) != shape:
+                raise InputError(
+                    f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}; "
+                    "expected one size, as data.resize makes"
+                )
+            shape = tuple(batch.shape[1:])
+            if not batch.isfinite().all():
+                raise InputError(f"{traverse.name} holds NaN or infinite values; expected finite numbers")
+            yield (batch if batch.ndim == 2 else (batch * 255).round().clamp(0, 255).byte().flatten(1)).cpu()
+
+    values = concatenate(rows())
+    return values.view(len(values), *shape)
 
 
-def _loader(frames: StoredFrames, batches: Any) -> DataLoader[Batch]:
+def as_frames(values: Tensor) -> Tensor:
+    """Bytes as frames in [0, 1]; features as they are."""
+    return values.float() / 255 if values.dtype == torch.uint8 else values
+
+
+def _open(source: str | Path | Traverse | Tensor) -> Traverse:
+    return as_traverse(source) if isinstance(source, (Traverse, Tensor)) else open_source(source)
+
+
+def _loader(frames: StoredFrames, batches: Iterable[list[int]]) -> DataLoader[Batch]:
     # the sampler yields whole batches of indices, so that frames are read many at a time; a generator of its
     # own, so that a validation takes none of training's random numbers
     return DataLoader(frames, sampler=batches, batch_size=None, generator=torch.Generator())

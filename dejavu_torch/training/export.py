@@ -1,22 +1,36 @@
-"""From a training run to the map file that every other command reads."""
+"""What a training leaves: its last checkpoint, and the map file that every other command reads."""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from pytorch_lightning.callbacks import Callback, ModelCheckpoint
+from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
 
 
+def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
+    """Give a task what a checkpoint of it holds.
+
+    Raises:
+        InputError: a checkpoint of other settings.
+    """
+    checkpoint = torch.load(path, map_location=task.device, weights_only=True)
+    task.on_load_checkpoint(checkpoint)
+    task.load_state_dict(checkpoint["state_dict"])
+
+
 class MapExport(Callback):
-    """Writes the map when training ends: of the best checkpoint where one was watched for, else as it ended.
+    """Writes the map when training ends or is interrupted: of the best checkpoint where one is watched for,
+    else of the last step.
 
     Args:
         name: of the file, in the trainer's default_root_dir.
@@ -28,7 +42,7 @@ class MapExport(Callback):
         self.written: tuple[Path, MapSummary] | None = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """The step that a checkpoint brought."""
+        """Note the step that a checkpoint brought."""
         self.began = trainer.global_step
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -45,23 +59,69 @@ class MapExport(Callback):
         if best is not None and not Path(best).is_file():
             log.warning("%s is gone: the map is of the last step", best)
         elif best is not None:
-            checkpoint = torch.load(best, map_location=pl_module.device, weights_only=True)
             seconds = pl_module.seconds  # of the whole run, not up to there
-            pl_module.on_load_checkpoint(checkpoint)
-            pl_module.load_state_dict(checkpoint["state_dict"])
+            load_weights(pl_module, best)
             pl_module.seconds = seconds
-        folder = Path(trainer.default_root_dir)
+        self.write(pl_module, Path(trainer.default_root_dir))
+
+    def on_exception(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
+    ) -> None:
+        """Write the map of the last step where the user interrupts."""
+        if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit" and trainer.global_step:
+            assert isinstance(pl_module, PlaceRecognitionTask)
+            self.write(pl_module, Path(trainer.default_root_dir))
+
+    def write(self, task: PlaceRecognitionTask, folder: Path) -> None:
+        """Write the task's map; a warning where it has none yet."""
+        try:
+            model = task.deployed()
+        except InputError as error:
+            log.warning("no map is written: %s", error)
+            return
         folder.mkdir(parents=True, exist_ok=True)
-        model = pl_module.deployed()
         model.save(folder / self.name)
-        self.written = (folder / self.name, model.certificate)
+        self.written = (folder / self.name, model.summary())
+
+
+class LastCheckpoint(Checkpoint):
+    """Keeps `checkpoints/last.ckpt` in the trainer's default_root_dir, also where a training is interrupted.
+
+    Args:
+        every: steps between two.
+    """
+
+    def __init__(self, every: int = 500) -> None:
+        self.every = every
+        self.saved = 0
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        """Save where it is time to."""
+        if trainer.global_step % self.every == 0:
+            self._save(trainer)
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save the last step."""
+        self._save(trainer)
+
+    def on_exception(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
+    ) -> None:
+        """Save the last step where the user interrupts."""
+        if isinstance(exception, KeyboardInterrupt):
+            self._save(trainer)
+
+    def _save(self, trainer: pl.Trainer) -> None:
+        if trainer.state.fn == "fit" and trainer.global_step not in (0, self.saved):
+            trainer.save_checkpoint(Path(trainer.default_root_dir) / "checkpoints" / "last.ckpt")
+            self.saved = trainer.global_step
 
 
 def best_checkpoint(trainer: pl.Trainer) -> str | None:
     """The checkpoint that the watched figure was best at; None where none was watched."""
     for callback in trainer.checkpoint_callbacks:
-        if isinstance(callback, ModelCheckpoint) and callback.monitor and not callback.best_model_path:
+        if isinstance(callback, ModelCheckpoint) and callback.monitor:
+            if callback.best_model_path:
+                return callback.best_model_path
             log.warning("%s was never measured: the map is of the last step", callback.monitor)
-        if isinstance(callback, ModelCheckpoint) and callback.monitor and callback.best_model_path:
-            return callback.best_model_path
     return None

@@ -19,25 +19,23 @@ class PlaceRecognition(Metric):
 
     Args:
         tolerance: in the unit of the places (frames, or evenly spaced places), inclusive.
-        figure: the one figure to compute, a field of `Scores` such as "auc", as `trainer.log` wants it; None
-            computes all.
 
     Shape: update(match of (Q,), truth (Q,R) int64 with -1 as padding, or a `GroundTruth`); R may differ from
-        batch to batch. compute() -> float64 scalars: a dict, or the one of `figure`.
+        batch to batch. compute() -> float64 scalars, the fields of `Scores` by name.
 
-    Convention: a query that `evaluate` leaves out (nothing known, or a soft place reported) is left out here.
-        Where none is left, before the first update for example, every figure is NaN: nothing was measured.
-        Three numbers are kept of each query, on the device of the metric.
+    Convention: a query that `evaluate` leaves out (not judged, or reporting an ignored place) is left out
+        here. Where none is left, before the first update for example, every figure is NaN: nothing was
+        measured. Three numbers are kept of each query, on the device of the metric.
 
     Raises:
-        InputError: an unknown figure, a negative tolerance, matches that are no index and score a query,
-            a NaN score, or a truth that does not fit the matches.
+        InputError: a negative tolerance, matches that are not an index and a score for each query, a NaN
+            score, or a truth that does not fit the matches.
 
     Example:
-        >>> metric = PlaceRecognition(tolerance=0, figure="recall_at_1")
+        >>> metric = PlaceRecognition(tolerance=0)
         >>> found = Match(torch.tensor([0, 7]), torch.tensor([0.1, 0.2]), torch.tensor([True, True]))
         >>> metric.update(found, torch.tensor([[0], [1]]))
-        >>> metric.compute().item()
+        >>> metric.compute()["recall_at_1"].item()
         0.5
     """
 
@@ -51,14 +49,11 @@ class PlaceRecognition(Metric):
     found: list[Tensor]
     right: list[Tensor]
 
-    def __init__(self, tolerance: int, figure: str | None = None, **kwargs: Any) -> None:
+    def __init__(self, tolerance: int, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        if figure is not None and figure not in Scores._fields:
-            known = ", ".join(Scores._fields)
-            raise InputError(f"figure {figure!r} is unknown; expected None or one of {known}")
         if tolerance < 0:
             raise InputError(f"the tolerance is {tolerance}; expected at least 0")
-        self.tolerance, self.figure = tolerance, figure
+        self.tolerance = tolerance
         # one number a query in each, so that batches and processes join whatever their R; and all float64,
         # which is then also what a process that saw no query gives
         self.set_dtype(torch.float64)
@@ -80,8 +75,8 @@ class PlaceRecognition(Metric):
         for state, row in zip((self.score, self.found, self.right), rows[:, kept], strict=True):
             state.append(row.to(self.device))
 
-    def compute(self) -> Tensor | dict[str, Tensor]:
-        """The figure, or all of them by name."""
+    def compute(self) -> dict[str, Tensor]:
+        """The figures by name."""
         figures = Scores(*[float("nan")] * len(Scores._fields))
         score, found, right = (
             dim_zero_cat(state).cpu() if len(state) else torch.zeros(0)
@@ -91,8 +86,7 @@ class PlaceRecognition(Metric):
             match = Match(found.long(), score, found >= 0)
             figures = evaluate(match, right.long()[:, None], tolerance=0)
         values = torch.tensor(figures, dtype=torch.float64, device=self.device)
-        named = dict(zip(Scores._fields, values, strict=True))
-        return named if self.figure is None else named[self.figure]
+        return dict(zip(Scores._fields, values, strict=True))
 
 
 def _check_match(match: Match) -> None:

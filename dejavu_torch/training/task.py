@@ -7,77 +7,78 @@ import logging
 import math
 import os
 import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, Literal, cast
 
+import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
-from torch.optim import Optimizer
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
-from dejavu_torch.database.template_map import CompressedMap, Reduction, combine_layers, log_posterior
+from dejavu_torch.database.mapfile import read_map
+from dejavu_torch.database.template_map import TemplateMap, TemplateMapper, log_posterior
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
-from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
-from dejavu_torch.training.checkpoint import check_trained, stored_map
-from dejavu_torch.training.descriptor import DescriptorStage, start_over
-from dejavu_torch.training.frames import Batch
-from dejavu_torch.training.freeze import freeze as freeze_part
-from dejavu_torch.training.freeze import start_from
-from dejavu_torch.training.judged import Judged
+from dejavu_torch.recognition.select import best_match
+from dejavu_torch.training.datamodule import Batch, RouteData
+from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.training.objective import Objective
-from dejavu_torch.training.optimizer import adamw_of, replace
-from dejavu_torch.training.reference import in_mode, reference_features
-from dejavu_torch.types import InputError, Training
+from dejavu_torch.training.stages import CodeStage, Stage, Views, in_mode, stages_of, stored_features
+from dejavu_torch.types import InputError, Plan, Training
 
 log = logging.getLogger("dejavu_torch")
 
+TEMPERATURE = 0.03  # of `log_posterior` at the start
+MAP = "dejavu.map."  # ahead of the names of the map's tensors in a checkpoint
+CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
 
-class PlaceRecognitionTask(Judged):
+
+class PlaceRecognitionTask(pl.LightningModule):
     """A `DejaVu` model that is trained: its features are made to repeat with the periods of its layers.
 
     The map's templates start as the phase means of the untrained features (eq. 1) and are parameters from
     then on. Periods are exact numbers and never get a gradient: they are imposed, or found anew in the
-    features every few epochs.
+    features every few epochs. A training is a list of stages, see `stages_of`; most backbones have one.
 
     Args:
         backbone: nn.Module (B,C,H,W) -> (B,D); None is `SmallCNN` with its defaults.
-        periods: gives the layers; None is `ImposedPeriods` with its defaults.
-        preprocess, metric, reduction: as in `DejaVu`.
-        temperature: T of `log_posterior` at the start, in units of the scores; it is learnt.
-        train_templates: False leaves the templates phase means, taken anew every epoch and at the end.
+        mapper: makes the map; its temperature is where the trained one starts, 0.03 where it is None. None is
+            `TemplateMapper(ImposedPeriods(), temperature=0.03)`.
+        preprocess: as in `DejaVu`.
         feature_weights: learn what a difference in each feature counts, at least 0.
         descriptor: share of the steps in which the network of an `Embedding` with a hidden layer learns its
-            descriptor (`DescriptorStage`), ahead of the code.
+            descriptor, ahead of the code.
         start: a map file of the same backbone, whose weights to start from.
         freeze: parameters of the backbone whose names begin with one of these stay as they are, and
             so do the running statistics below; "" is all of it.
         batch_norm: "train" lets BatchNorm follow the batches, which hold frames from all over the route;
             "frozen" keeps its running statistics, as pretrained networks and few frames want.
-        refresh: epochs after which the layers are asked for anew, and templates start over from the
-            phase means; 0 never.
+        refresh: epochs after which the layers are found anew, and templates start over from the phase means;
+            0 never.
         losses: which losses count, and how much.
-        lr: highest learning rate of AdamW; it rises over the first tenth of the steps and falls to 0.
+        lr: highest learning rate of AdamW; it rises over the first tenth of a stage's steps and falls to 0.
         weight_decay: of weights that are multiplied with something, not of biases, templates and the like.
         batch_size: frames in memory at a time where features are made without gradients.
 
+    Convention: what watches a figure, `EarlyStopping` or a `ModelCheckpoint` with `monitor`, begins with the
+        last stage, and so does validation: figures of two stages do not compare.
+
     Raises:
         InputError: settings out of range; a backbone that gives no (B,D); a loss that is not finite; a
-            checkpoint of other layers.
+            checkpoint of other settings.
     """
 
     def __init__(
         self,
         backbone: nn.Module | None = None,
-        periods: PeriodFinder | None = None,
+        mapper: TemplateMapper | None = None,
         preprocess: Preprocess | None = None,
-        metric: str = "l1",
-        reduction: Reduction = "mean",
-        temperature: float = 0.03,
-        train_templates: bool = True,
         feature_weights: bool = False,
         descriptor: float = 0.4,
         start: str | None = None,
@@ -90,111 +91,184 @@ class PlaceRecognitionTask(Judged):
         batch_size: int = 64,
     ) -> None:
         super().__init__()
-        if not lr > 0 or not weight_decay >= 0 or refresh < 0 or not 0 < temperature < math.inf:
+        if not lr > 0 or not weight_decay >= 0 or refresh < 0:
             raise InputError(
-                f"lr is {lr}, temperature {temperature}, weight_decay {weight_decay}, refresh {refresh}; "
-                "expected the first two above 0, the others 0 or more"
+                f"lr is {lr}, weight_decay {weight_decay}, refresh {refresh}; expected an lr above 0, the "
+                "others 0 or more"
             )
         if not 0 <= descriptor < 1:
             raise InputError(f"descriptor is {descriptor}; expected a share of the steps, from 0 to below 1")
         backbone = SmallCNN() if backbone is None else backbone
-        periods = ImposedPeriods() if periods is None else periods
-        self.dejavu = DejaVu(
-            backbone, periods, metric, reduction, batch_size=batch_size, preprocess=preprocess
-        )
+        mapper = TemplateMapper(ImposedPeriods()) if mapper is None else mapper
+        if not isinstance(mapper, TemplateMapper):
+            raise InputError(f"the mapper is {type(mapper).__name__}; expected a TemplateMapper")
+        self.dejavu = DejaVu(backbone, mapper, batch_size=batch_size, preprocess=preprocess)
         if start is not None:
             start_from(backbone, start)
-        self.log_temperature = nn.Parameter(torch.tensor(math.log(temperature)))
-        self.train_templates, self.feature_weights = train_templates, feature_weights
-        self.frozen = [module.eval() for module in freeze_part(backbone, freeze or [], batch_norm)]
-        self.descriptor, self.share, self._first = DescriptorStage(backbone), descriptor, 0
-        self.refresh = refresh
+        self.frozen = [module.eval() for module in freeze_parts(backbone, freeze or [], batch_norm)]
+        self.log_temperature = nn.Parameter(torch.tensor(math.log(mapper.temperature or TEMPERATURE)))
+        self.feature_weights, self.refresh = feature_weights, refresh
         self.losses = Objective() if losses is None else losses
-        if self.losses.support and not train_templates:
-            raise InputError("the support loss is of trained templates; expected train_templates")
         self.lr, self.weight_decay = lr, weight_decay
-        self.seconds = 0.0
-        self._began: float | None = None
+        self.stages = nn.ModuleList(stages_of(backbone, descriptor))
+        self.index = 0  # of the stage
+        self.began = 0  # the step at which it began
+        self.views: Views | None = None  # what the code of a whitened descriptor is learned from
+        self.metric: PlaceRecognition | None = None  # `setup` makes it
+        self.steps, self.seconds = 0, 0.0  # of the training that a checkpoint comes from
+        self._clock: float | None = None
+        self._callbacks: list[pl.Callback] = []
+
+    @property
+    def data(self) -> RouteData:
+        """The data module that the trainer runs with."""
+        data = getattr(self.trainer, "datamodule", None)
+        if not isinstance(data, RouteData):
+            raise InputError(f"the trainer's data module is {type(data).__name__}; expected RouteData")
+        return data
+
+    @property
+    def route(self) -> TemplateMap:
+        """The map in training."""
+        return cast(TemplateMap, self.dejavu.map)
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that runs."""
+        return cast(Stage, self.stages[self.index])
+
+    @property
+    def in_last_stage(self) -> bool:
+        """Whether this is the stage that trains the map."""
+        return self.index == len(self.stages) - 1
+
+    @property
+    def frame_size(self) -> tuple[int, int] | None:
+        """(height, width) that frames may be stored in: what the backbone resizes them to anyway.
+
+        None where it does not, or where a contrast is evened ahead of it, at the frames' own size.
+        """
+        return None if self.dejavu.preprocess.contrast else getattr(self.dejavu.features, "resize", None)
 
     def setup(self, stage: str) -> None:
         """Get ready for a route; the first map is made later, where no checkpoint brings one."""
+        reference = self.data.sets["reference"]
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
         self._check_route(self.dejavu.map.places)
-        if self.data.sets["reference"].values.ndim == 2 and list(self.dejavu.features.parameters()):
+        if reference.values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")
             self.dejavu.features = HOG()  # has nothing to store
-            self.descriptor = DescriptorStage(self.dejavu.features)
-        self.data.augmenting = True
-        self.descriptor.prepare(len(self.data.sets["reference"]), self.data.tolerance)
+            self.stages, self.index = nn.ModuleList([CodeStage()]), 0
+        self.began, self.views = 0, None  # a further training describes its own frames
 
-    def _check_route(self, places: int) -> None:
-        """Refuse a map of another route than the data's."""
-        reference = self.data.sets["reference"]
-        if places not in (0, len(reference)):
-            raise InputError(
-                f"the map is of {places} places, {self.data.reference.name} has {len(reference)}; expected "
-                "the route that it was made of"
-            )
+    # the map
 
     def relearn(self) -> None:
-        """Layers and templates anew from the present features of the reference (section III-A)."""
-        weights, values = self.dejavu.map.weights, self.data.sets["reference"].values
-        self.dejavu.learn_features(self._reference_features(), self.data.reference)
-        self.dejavu.learnt_from = tuple(values.shape[1:])  # after data.resize
-        if not self.dejavu.map.plan:
+        """Layers and templates anew from the present features of the reference (section III-A).
+
+        The first features are made in training mode, so that running statistics are gathered.
+        """
+        first, weights = not self.route.places, self.route.weights
+        with in_mode(self, first):
+            features = stored_features(self, self.dejavu.describe, shuffled=first)
+        self.dejavu.learn_features(features, self.data.reference)
+        if self.data.resize is not None:
+            self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
+        if not self.route.plan:
             raise InputError(
                 f"nothing repeats in the features of {self.data.reference.name}; expected imposed periods"
             )
-        self.dejavu.map.trainable(self.train_templates, self.feature_weights, weights)
-
-    def retake_means(self) -> None:
-        """Templates that are not trained become the phase means of the present features (eq. 1)."""
-        route = self.dejavu.map
-        if not self.train_templates:
-            with torch.no_grad():
-                templates = self.dejavu.templates(route.weighted(self._reference_features()), route.plan)
-                route.templates = torch.cat([block.flatten() for block in templates])
-
-    def retake_map(self) -> None:
-        """What is judged are the templates of these features."""
-        if not self.dejavu.map.places:
-            self.relearn()
-        self.retake_means()
-
-    def _reference_features(self) -> Tensor:
-        """(N,D), as in training at its start, where running statistics are still to be gathered."""
-        values, first = self.data.sets["reference"].values, not self.dejavu.map.places
-        with in_mode(self, first):
-            pipeline, at_once, name = self.dejavu.pipeline, self.dejavu.batch_size, self.data.reference.name
-            return reference_features(pipeline, values, at_once, self.device, name, shuffled=first)
+        self.route.trainable(True, self.feature_weights, weights)
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scores of all places, the very ones that the exported map gives. (B,C,H,W) or (B,D) -> (B,N)."""
-        return self._scores(self._distances(features_of(frames, self.dejavu.pipeline, "the batch")))
+        return self.scores(self.route.distances(features_of(frames, self.dejavu.describe, "the batch")))
 
-    def _distances(self, features: Tensor) -> list[Tensor]:
-        return self.dejavu.matcher.distances(features, self.dejavu.map)
+    def scores(self, distances: Sequence[Tensor]) -> Tensor:
+        """Eq. 4 of the map with the temperature that is trained: L tensors (B,P) -> (B,N)."""
+        return log_posterior(self.route.combine(distances), self.log_temperature.exp())
 
-    def _scores(self, distances: list[Tensor]) -> Tensor:
-        matcher, route = self.dejavu.matcher, self.dejavu.map
-        scores = combine_layers(distances, route.plan, route.places, matcher.metric, matcher.reduction)
-        return log_posterior(scores, self.log_temperature.exp())
+    def deployed(self) -> DejaVu:
+        """The trained model by itself, whose `save` writes the map file.
+
+        Raises:
+            InputError: a training that has not reached its last stage.
+        """
+        self.require_map()
+        model = copy.deepcopy(self.dejavu).eval()
+        route, mapper = cast(TemplateMap, model.map), cast(TemplateMapper, model.mapper)
+        route.freeze()
+        route.temperature = mapper.temperature = float(self.log_temperature.detach().exp())
+        mapper.trainable = False
+        steps = self.steps if self._trainer is None else self.trainer.global_step
+        seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
+        model.trained = Training(steps, self._elapsed(), int(seed) if seed else None)
+        return model
+
+    def require_map(self) -> None:
+        """Refuse a training that is in a stage without a map.
+
+        Raises:
+            InputError: naming the stage.
+        """
+        if not self.in_last_stage:
+            raise InputError(
+                f"the training is in stage {self.index + 1} of {len(self.stages)}, "
+                f"{type(self.stage).__name__}, which has no map yet; expected one in its last stage"
+            )
+
+    # training
+
+    def configure_optimizers(self) -> Any:
+        """Begin the stage; stages without steps are over at once. The optimizer is of its parameters."""
+        steps = float(self.trainer.estimated_stepping_batches)
+        if not math.isfinite(steps):
+            raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
+        self.stage.begin(self)
+        while self._stop() <= self.began and not self.in_last_stage:
+            self._advance(self.began)
+            self.stage.begin(self)
+        return adamw_of(self.stage.trained(self), self.lr, self.weight_decay, self._stop() - self.began)
+
+    def _stop(self) -> int:
+        """The step that ends the stage."""
+        steps = int(self.trainer.estimated_stepping_batches)
+        return steps if self.in_last_stage else min(self.began + round(self.stage.share * steps), steps - 1)
+
+    def _advance(self, step: int) -> None:
+        self.stage.end(self)
+        self.zero_grad()
+        self.index, self.began = self.index + 1, step
+
+    def on_fit_start(self) -> None:
+        """Start the clock; callbacks that watch a figure wait for the last stage."""
+        self._clock = time.perf_counter()
+        self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
+        if not self.in_last_stage:
+            self.trainer.callbacks = [  # type: ignore[attr-defined]
+                callback for callback in self._callbacks if getattr(callback, "monitor", None) is None
+            ]
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Where the steps of a stage are over, the next one begins, with its own optimizer."""
+        if not self.in_last_stage and self.global_step >= self._stop():
+            self._advance(self.global_step)
+            self.trainer.strategy.setup_optimizers(self.trainer)
+            if self.in_last_stage:
+                self.trainer.callbacks = self._callbacks
+
+    def on_train_epoch_start(self) -> None:
+        """Find the layers anew where it is time to."""
+        due = self.refresh and self.current_epoch and self.current_epoch % self.refresh == 0
+        if due and self.in_last_stage:
+            before = self.route
+            self.relearn()
+            replace(cast(Optimizer, self.optimizers(use_pl_optimizer=False)), before, self.route)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
-        right, tolerance, route = batch.truth.positives, self.data.tolerance, self.dejavu.map
-        if self.descriptor.learning:
-            frames = self.dejavu.preprocess(batch.frames)
-            total, parts, left_out = self.descriptor.losses(frames, right, tolerance, route.places)
-        else:
-            if self.descriptor.settled is None:
-                features = features_of(batch.frames, self.dejavu.pipeline, "the batch")
-            else:
-                features, right = self.descriptor.draw()
-            distances = self._distances(features)
-            given = (right, route, self.dejavu.matcher, self.log_temperature.exp(), tolerance)
-            total, parts, left_out = self.losses(features, distances, self._scores(distances), *given)
+        total, parts, left_out = self.stage.losses(self, batch)
         if not total.isfinite():
             seen = ", ".join(f"{name} {float(part.detach()):g}" for name, part in parts.items())
             raise InputError(
@@ -213,87 +287,187 @@ class PlaceRecognitionTask(Judged):
             module.eval()
         return self
 
-    def on_fit_start(self) -> None:
-        """The clock of what `Training` tells."""
-        self._began = time.perf_counter()
-
     def on_train_end(self) -> None:
         """Stop the clock."""
-        self.seconds, self._began = self._elapsed(), None
+        self.seconds, self._clock = self._elapsed(), None
+
+    def teardown(self, stage: str) -> None:
+        """Give the trainer back its callbacks."""
+        if self._callbacks:
+            self.trainer.callbacks, self._callbacks = self._callbacks, []  # type: ignore[attr-defined]
 
     def _elapsed(self) -> float:
-        return self.seconds + (0.0 if self._began is None else time.perf_counter() - self._began)
+        return self.seconds + (0.0 if self._clock is None else time.perf_counter() - self._clock)
 
-    def on_train_epoch_start(self) -> None:
-        """Ask for the layers anew where it is time to."""
-        if not self.refresh or not self.current_epoch or self.current_epoch % self.refresh:
-            return self.retake_means()
-        self._ask_anew(self.dejavu.map)
+    # validation and test
 
-    def _ask_anew(self, before: CompressedMap) -> None:
-        self.relearn()
-        replace(cast(Optimizer, self.optimizers(use_pl_optimizer=False)), before, self.dejavu.map)
+    def on_validation_epoch_start(self) -> None:
+        """A map of the present features, where there is none yet."""
+        if self.trainer.state.fn != "fit":
+            self.require_map()
+        if self.in_last_stage and not self.route.places:
+            with torch.inference_mode(False):  # its parameters may be trained later
+                self.relearn()
 
-    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Where the descriptor's share of the steps is over, it is settled, and a code asked for."""
-        over, before = self.global_step >= self._first, self.dejavu.map
-        if self.descriptor.learning:
-            start_over(self.trainer, over)
-            if over:
-                self._settle()
-                self._ask_anew(before)
-        elif self.descriptor.settled is not None and self.descriptor.views is None:  # a resumed run
-            self.descriptor.look(self.dejavu.preprocess, self.data, self.dejavu.batch_size)
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Localize a batch, in the number type of the exported map whatever the training's."""
+        if self.in_last_stage:
+            assert self.metric is not None  # setup made it
+            frames = batch.frames if self.trainer.testing else self.data.validated(batch)
+            with torch.autocast(self.device.type, enabled=False):
+                self.metric.update(best_match(self(frames)), batch.truth)
 
-    def _settle(self) -> None:
-        """The descriptor as it is from now on; the code's map is still to be made."""
-        self.frozen += self.descriptor.settle(self.global_step)
-        self.descriptor.look(self.dejavu.preprocess, self.data, self.dejavu.batch_size)
-        self.train(self.training)
-        self.dejavu.map = CompressedMap().to(self.device)  # whose first features gather statistics anew
+    def on_validation_epoch_end(self) -> None:
+        """Log what `evaluate` says; the reference itself, under augmentation, is no validation traverse."""
+        if self.in_last_stage:
+            assert self.metric is not None
+            figures = self.metric.compute()
+            self.metric.reset()
+            stage = "test" if self.trainer.testing else "val"
+            suffix = "" if self.trainer.testing or "validation" in self.data.sets else "_augmented"
+            self.log_dict({f"{stage}/{name}{suffix}": value.float() for name, value in figures.items()})
 
-    def configure_optimizers(self) -> Any:
-        """For the parameters that there are once the first map is made."""
-        stage, steps = self.descriptor, float(self.trainer.estimated_stepping_batches)
-        if stage.present and not stage.learning and stage.settled is None:
-            self._settle()
-        if not self.dejavu.map.places:
-            self.relearn()
-        if math.isfinite(steps):
-            self._first = (
-                min(round(self.share * steps), int(steps) - 1) if stage.learning else stage.settled or 0
-            )
-        return adamw_of(self.parameters(), self.lr, self.weight_decay, steps, self._first, stage.held)
+    on_test_epoch_start, test_step = on_validation_epoch_start, validation_step
+    on_test_epoch_end = on_validation_epoch_end
+
+    # checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the clock, and what is trained."""
-        stage = self.descriptor.stored()
-        checkpoint |= {"seconds": self._elapsed(), "trained": self._trained(), "descriptor": stage}
+        """Keep the stage, the clock, and what is trained."""
+        stages = [type(stage).__name__ for stage in self.stages]
+        checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
+        checkpoint |= {"seconds": self._elapsed()}
 
     def _trained(self) -> list[str]:
-        held = {id(parameter) for parameter in self.descriptor.held}
-        return sorted(name for name, p in self.named_parameters() if p.requires_grad or id(p) in held)
+        trained = {id(parameter) for parameter in self.stage.trained(self)}
+        return sorted(name for name, parameter in self.named_parameters() if id(parameter) in trained)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take over the checkpoint's layers; refuse those of another route, or others than imposed."""
-        route = stored_map(checkpoint, self.dejavu.periods)
-        if self._trainer is not None:
-            self._check_route(route.places)
+        """Refuse what is not of these settings and this route; layers that were found are taken over."""
+        stages = [type(stage).__name__ for stage in self.stages]
+        if checkpoint.get("stages") != stages:
+            seen = checkpoint.get("stages", "no training")
+            raise InputError(f"the checkpoint is of {seen}; expected one of the stages {stages}")
+        state = checkpoint["state_dict"]
+        route = cast(TemplateMapper, self.dejavu.mapper).empty()
+        route.load_state_dict({n.removeprefix(MAP): t for n, t in state.items() if n.startswith(MAP)})
+        self._check_route(route.places)
+        periods = cast(TemplateMapper, self.dejavu.mapper).periods
+        if route.places and isinstance(periods, ImposedPeriods):
+            imposed = periods.plan(torch.zeros(1, 1).expand(route.places, route.dimension))
+            if imposed != route.plan:
+                raise InputError(
+                    f"the checkpoint holds layers of {_layers(route.plan)} frames, this run imposes "
+                    f"{_layers(imposed)}; expected a checkpoint of the same periods"
+                )
+        route.trainable(True, self.feature_weights)
         self.dejavu.map = route.to(self.device)
-        self.dejavu.map.trainable(self.train_templates, self.feature_weights)
-        if "descriptor" in checkpoint:
-            self.frozen += self.descriptor.restore(checkpoint["descriptor"], checkpoint["state_dict"])
-        check_trained(checkpoint, self._trained())
-        self.seconds = float(checkpoint.get("seconds", 0.0))
+        self.index, self.began = checkpoint["stage"], checkpoint["began"]
+        self.steps, self.seconds = checkpoint["global_step"], checkpoint["seconds"]
+        other = sorted(set(self._trained()) ^ set(checkpoint["trained"]))
+        if other:
+            raise InputError(
+                f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both; expected a "
+                "checkpoint of the same settings"
+            )
 
-    def deployed(self) -> DejaVu:
-        """The trained model by itself, whose `save` writes the map file."""
-        self.retake_means()
-        if self.descriptor.lacking:
-            log.warning("the map is of a step ahead of the code, of the descriptor's")
-        model = copy.deepcopy(self.dejavu).eval()
-        model.map.settle()
-        model.matcher.temperature = float(self.log_temperature.detach().exp())
-        seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
-        model.trained = Training(self.trainer.global_step, self._elapsed(), int(seed) if seed else None)
-        return model
+    def _check_route(self, places: int) -> None:
+        """Refuse a map of another route than the data's."""
+        if self._trainer is None or not places:
+            return
+        reference = self.data.sets["reference"]
+        if places != len(reference):
+            raise InputError(
+                f"the map is of {places} places, {self.data.reference.name} has {len(reference)}; expected "
+                "the route that it was made of"
+            )
+
+
+def _layers(plan: Plan) -> str:
+    return ", ".join(f"{layer.phases} in {layer.period}" for layer in plan) or "no"
+
+
+def start_from(backbone: nn.Module, path: str | Path) -> None:
+    """Give a backbone the weights that a map file holds.
+
+    Of a whitened descriptor its code is left out, which is of the other route, and of any dimension.
+
+    Raises:
+        InputError: no map file, or one of another backbone.
+    """
+    tensors, header = read_map(Path(path))
+    prefix = "features."
+    weights = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    if bool(weights.get("linear.whitened", False)):
+        own = {name: t for name, t in backbone.state_dict().items() if name.startswith(CODE)}
+        weights = {name: t for name, t in weights.items() if not name.startswith(CODE)} | own
+    try:
+        backbone.load_state_dict(weights)
+    except RuntimeError as error:
+        raise InputError(
+            f"{path} holds weights of {header['features']}; expected those of the same "
+            f"{type(backbone).__name__}"
+        ) from error
+
+
+def freeze_parts(
+    backbone: nn.Module, prefixes: Sequence[str], batch_norm: Literal["train", "frozen"]
+) -> list[nn.Module]:
+    """Take the gradient from parameters; return the modules whose running statistics have to stay.
+
+    Args:
+        prefixes: parameters whose names begin with one of these are frozen; "" is all of them.
+        batch_norm: "frozen" keeps the running statistics of all BatchNorm, "train" of those in frozen parts.
+
+    Raises:
+        InputError: a prefix that no parameter begins with.
+    """
+    for prefix in prefixes:
+        chosen = [p for name, p in backbone.named_parameters() if name.startswith(prefix)]
+        if not chosen:
+            known = sorted({name.partition(".")[0] for name, _ in backbone.named_parameters()})
+            raise InputError(
+                f"freeze names {prefix!r}, which no parameter of {type(backbone).__name__} begins with; "
+                f"expected one of {', '.join(known) or 'none, it has none'}"
+            )
+        for parameter in chosen:
+            parameter.requires_grad_(False)
+    return [
+        module
+        for name, module in backbone.named_modules()
+        if getattr(module, "running_mean", None) is not None  # follows the batches without any gradient
+        and (batch_norm == "frozen" or any(f"{name}.".startswith(prefix) for prefix in prefixes))
+    ]
+
+
+def adamw_of(parameters: Iterable[nn.Parameter], lr: float, weight_decay: float, steps: int) -> Any:
+    """AdamW, and a schedule: the learning rate rises over the first tenth of the steps, then falls along a
+    cosine to 0. Only what is multiplied with something decays: matrices and kernels.
+
+    Returns:
+        What Lightning's `configure_optimizers` gives.
+    """
+    trained = list(parameters)
+    groups = [
+        {"params": [p for p in trained if p.ndim > 1], "weight_decay": weight_decay},
+        {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    optimizer = AdamW([group for group in groups if group["params"]], lr=lr)
+    rise = max(1, round(steps / 10))
+
+    def height(step: int) -> float:
+        if step < rise:
+            return (step + 1) / rise
+        return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (step - rise) / max(1, steps - rise)))
+
+    schedule = {"scheduler": LambdaLR(optimizer, height), "interval": "step"}
+    return {"optimizer": optimizer, "lr_scheduler": schedule}
+
+
+def replace(optimizer: Optimizer, before: nn.Module, after: nn.Module) -> None:
+    """Train the parameters of `after` instead of those of `before`, with nothing remembered of the old."""
+    new = dict(after.named_parameters())
+    for name, old in before.named_parameters():
+        for group in optimizer.param_groups:
+            group["params"] = [new[name] if parameter is old else parameter for parameter in group["params"]]
+        optimizer.state.pop(old, None)

@@ -1,8 +1,10 @@
-"""Any network as a backbone: kornia's, our own, a plain convolution; and what cannot be one."""
+"""Any network as a backbone: kornia's, our own, a plain convolution; what cannot be one; and its code."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,12 +14,14 @@ from kornia.contrib import TinyViT
 from kornia.feature import HardNet
 from torch import Tensor, nn
 
+from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
 from dejavu_torch.features.cnn import SmallCNN, local_contrast
-from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.features.embedding import Coder, Embedding
+from dejavu_torch.features.whitening import learned_whitening
 
 
 class Maker(nn.Module):
-    """Gives what it is told to, for each frame."""
+    """Gives what a function makes of the frames."""
 
     def __init__(self, make: Callable[[Tensor], Any]) -> None:
         super().__init__()
@@ -192,3 +196,59 @@ def test_a_network_that_makes_neither_maps_nor_vectors_is_refused(
 def test_frames_neither_grey_nor_colour_are_refused(shape: tuple[int, ...]) -> None:
     with refused(str(shape), "(B,1,H,W) or (B,3,H,W)"):
         plain()(torch.rand(shape))
+
+
+# the code ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"inputs": 0}, {"dimension": 0}, {"hidden": 0}, {"kept": 0}, {"noise": -1.0}, {"noise": math.inf}],
+)
+def test_settings_out_of_range(settings: dict[str, float]) -> None:
+    with refused("Coder got", "expected at least 1 each, the noise 0 or more"):
+        Coder(**{"inputs": 6, "dimension": 3} | settings)  # type: ignore[arg-type]
+
+
+def test_components_are_whitened_and_of_one_length() -> None:
+    views, places = torch.randn(2, 200, 6)
+    coder = Coder(6, 3, hidden=5, kept=4).eval()
+    coder.whiten(views, places)
+    mean, projection = learned_whitening(views, places, 4)
+    components = (views - mean) @ projection
+    components = components * (2 / components.norm(dim=1, keepdim=True))
+    torch.testing.assert_close(coder(views), coder.layers(components))
+    torch.testing.assert_close(coder(mean + 7 * (views - mean)), coder(views), rtol=1e-4, atol=1e-4)
+
+
+def test_noise_is_for_training_alone() -> None:
+    views = torch.randn(200, 6)
+    coder = Coder(6, 3, hidden=5, noise=0.5)
+    coder.layers[1].momentum = 0.0  # its statistics stay
+    assert not torch.equal(coder(views), coder(views))
+    coder.noise = 0.0
+    assert torch.equal(coder(views), coder(views))
+    coder.noise = 0.5
+    coder.eval()
+    assert torch.equal(coder(views), coder(views))
+
+
+def test_gradients_reach_the_descriptor() -> None:
+    coder = Coder(4, 2, hidden=3, noise=0.0).double().eval()
+    views = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(coder, (views,))
+
+
+def test_a_map_brings_the_whitening_back(tmp_path: Path) -> None:
+    frames = torch.rand(12, 3, 16, 16)
+    net = Embedding(nn.Conv2d(3, 4, 3), dimension=5, resize=(16, 16), grid=2, hidden=6, noise=0.3, kept=7)
+    assert net.coder is not None
+    net.coder.whiten(*net.describe(torch.rand(40, 3, 16, 16)).detach().split(20))
+    net.eval()
+    model = DejaVu(net, TemplateMapper(ImposedPeriods([3], bin=1))).learn(frames)
+    model.save(tmp_path / "map.safetensors")
+    empty = Embedding(nn.Conv2d(3, 4, 3), dimension=5, resize=(16, 16), grid=2, hidden=6, noise=0.3, kept=7)
+    again = DejaVu.load(tmp_path / "map.safetensors", features=empty)
+    assert torch.equal(again(frames), model(frames))
+    assert empty.coder is not None
+    assert empty.coder.whitened

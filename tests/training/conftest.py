@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_task import footage
-from training_config import CONFIG, MINE, train
+from small_training import CONFIG, MINE, footage, train
 
 
 @pytest.fixture(scope="session")

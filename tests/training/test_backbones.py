@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers import refused
 from kornia.feature import TFeat
-from test_task import FRAMES, backbone, data_of, fit, footage, new_task, recall, trainer, warned
+from small_training import FRAMES, backbone, data_of, fit, footage, new_task, recall, trainer, warned
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu
@@ -17,8 +17,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.freeze import freeze, start_from
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.task import PlaceRecognitionTask, freeze_parts, start_from
 
 RUNNING = ("running_mean", "running_var", "num_batches_tracked")
 
@@ -64,9 +63,9 @@ def test_frozen_batch_norm_keeps_its_statistics_and_learns_its_weights(tmp_path:
 @pytest.mark.parametrize("norm", [nn.BatchNorm2d, nn.InstanceNorm2d], ids=lambda kind: kind.__name__)
 def test_all_running_statistics_can_be_frozen(norm: type[nn.Module]) -> None:
     net = nn.Sequential(nn.Conv2d(1, 2, 3), norm(2, affine=True, track_running_stats=True))
-    assert freeze(net, [], "train") == []
-    assert freeze(net, [], "frozen") == freeze(net, ["1"], "train") == [net[1]]
-    assert freeze(net, ["0"], "train") == []
+    assert freeze_parts(net, [], "train") == []
+    assert freeze_parts(net, [], "frozen") == freeze_parts(net, ["1"], "train") == [net[1]]
+    assert freeze_parts(net, ["0"], "train") == []
 
 
 def test_statistics_of_instances_stay_in_a_frozen_part(tmp_path: Path) -> None:
@@ -84,7 +83,7 @@ def test_a_prefix_of_nothing_is_refused() -> None:
     with refused("'nix'", "SmallCNN", "convolutions, linear"):
         new_task(freeze=["linear", "nix"])
     with refused("''", "HOG", "it has none"):
-        freeze(HOG(), [""], "train")
+        freeze_parts(HOG(), [""], "train")
 
 
 def test_a_map_gives_a_backbone_to_start_from(tmp_path: Path) -> None:
@@ -151,19 +150,19 @@ def test_ready_features_need_no_backbone(tmp_path: Path) -> None:
     task = new_task(backbone=nn.Identity())
     trainer(tmp_path).fit(task, data_of(features))
     model = DejaVu.load(tmp_path / "map.safetensors", nn.Identity())
-    assert model.learnt_from == (6,)
+    assert model.frame_shape == (6,)
     torch.testing.assert_close(model(features[:3]), task(features[:3]))
     assert model.localize(ArrayTraverse(features)).index.shape == (FRAMES,)
 
 
 def test_ready_features_leave_a_backbone_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    features, task = torch.randn(FRAMES, 6), new_task(train_templates=False)
+    features, task = torch.randn(FRAMES, 6), new_task()
     running = trainer(tmp_path)
     running.fit(task, data_of(features))
     model = DejaVu.load(tmp_path / "map.safetensors")  # by itself
     assert warned(caplog) == ["these are ready features: the backbone is left out"]
-    assert model.backbone_bytes == 0
-    assert model.map_bytes < sum(p.nbytes for p in backbone().parameters())
+    assert "backbone" not in model.summary().fixed
+    assert model.summary().map_bytes < sum(p.nbytes for p in backbone().parameters())
     torch.testing.assert_close(model(features[:3]), task(features[:3]))
     running.validate(task, data_of(features), verbose=False)
     assert len(warned(caplog)) == 1

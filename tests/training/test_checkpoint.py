@@ -9,20 +9,18 @@ import pytest
 import torch
 from helpers import refused
 from pytorch_lightning.callbacks import ModelCheckpoint
-from test_task import FRAMES, Later, data_of, fit, footage, new_task, phases, trainer
+from small_training import FRAMES, Later, data_of, fit, footage, mapper, new_task, trainer
+from test_stages import coded
 
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, ImposedPeriods
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.periods.imposed import ImposedPeriods
-
-KEPT = "last.ckpt"
 
 
 def train(folder: Path, **settings: Any) -> Path:
     """The last checkpoint of a training of two epochs."""
     kept = ModelCheckpoint(folder, save_last=True)
     trainer(folder, kept, max_epochs=2, max_steps=-1).fit(new_task(**settings), data_of())
-    return folder / KEPT
+    return folder / "last.ckpt"
 
 
 @pytest.fixture(scope="module")
@@ -42,34 +40,36 @@ def test_a_resumed_run_goes_on(tmp_path: Path, last: Path) -> None:
     assert trained[:2] == (6, again.seconds)
 
 
-@pytest.mark.parametrize("settings", [{}, {"feature_weights": True}, {"train_templates": False}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"feature_weights": True}], ids=str)
 def test_layers_that_were_found_are_taken_over(tmp_path: Path, settings: dict[str, Any]) -> None:
     """Whatever this run would find: it is not asked for them."""
-    first = train(tmp_path, periods=Later(), refresh=1, **settings)
+    first = train(tmp_path, mapper=mapper(Later()), refresh=1, **settings)
     state = torch.load(first, weights_only=True)["state_dict"]
-    again = new_task(periods=Later(), **settings)
+    again = new_task(mapper=mapper(Later()), **settings)
     with torch.no_grad():
         again.dejavu.features.linear.weight.fill_(7)
     resumed = trainer(tmp_path, max_epochs=3, max_steps=-1)
     resumed.fit(again, data_of(), ckpt_path=first)
     assert resumed.global_step == 3 * (FRAMES // 16)
-    assert again.dejavu.periods.asked == 0  # type: ignore[union-attr]
-    assert phases(again) == phases(DejaVu.load(tmp_path / "map.safetensors")) == [5, 7, 9]
+    assert again.dejavu.mapper.periods.asked == 0  # type: ignore[union-attr]
+    written = DejaVu.load(tmp_path / "map.safetensors").map
+    assert again.route.plan == written.plan
+    assert [layer.phases for layer in again.route.plan] == [5, 7, 9]
     assert not torch.equal(again.dejavu.features.linear.weight, state["dejavu.features.linear.weight"])
-    judged = new_task(periods=Later(), **settings)
-    trainer(tmp_path).validate(judged, data_of(), ckpt_path=first, verbose=False)
-    assert judged.dejavu.periods.asked == 0  # type: ignore[union-attr]
-    for name in ("dejavu.features.linear.weight", "log_temperature"):
-        assert torch.equal(judged.state_dict()[name], state[name])
+    evaluated = new_task(mapper=mapper(Later()), **settings)
+    trainer(tmp_path).validate(evaluated, data_of(), ckpt_path=first, verbose=False)
+    assert evaluated.dejavu.mapper.periods.asked == 0  # type: ignore[union-attr]
+    for name in ("dejavu.features.linear.weight", "dejavu.map.templates", "log_temperature"):
+        assert torch.equal(evaluated.state_dict()[name], state[name])
 
 
-def test_a_resumed_run_asks_for_layers_when_it_is_time_to(tmp_path: Path) -> None:
-    first = train(tmp_path, periods=Later())
-    again = new_task(periods=Later(), refresh=1)
-    again.dejavu.periods.asked = 1  # type: ignore[assignment]
+def test_a_resumed_run_finds_layers_anew_when_it_is_time_to(tmp_path: Path) -> None:
+    first = train(tmp_path, mapper=mapper(Later()))
+    again = new_task(mapper=mapper(Later()), refresh=1)
+    again.dejavu.mapper.periods.asked = 1  # type: ignore[union-attr]
     running = trainer(tmp_path, max_epochs=3, max_steps=-1)
     running.fit(again, data_of(), ckpt_path=first)
-    assert phases(again) == [5, 7, 9]
+    assert [layer.phases for layer in again.route.plan] == [5, 7, 9]
     optimised = {id(p) for group in running.optimizers[0].param_groups for p in group["params"]}
     assert optimised == {id(p) for p in again.parameters()}
 
@@ -78,14 +78,15 @@ def test_a_resumed_run_asks_for_layers_when_it_is_time_to(tmp_path: Path) -> Non
     ("settings", "words"),
     [
         (
-            {"periods": ImposedPeriods([3, 4, 7], bin=2)},
+            {"mapper": mapper(ImposedPeriods([3, 4, 7], bin=2))},
             ("3 in 6, 4 in 8, 5 in 10 frames", "imposes 3 in 6, 4 in 8, 7 in 14", "the same periods"),
         ),
-        ({"train_templates": False}, ("dejavu.map.templates", "not in both", "the same settings")),
-        ({"feature_weights": True}, ("dejavu.map.weights", "not in both")),
+        ({"mapper": mapper(metric="l2")}, ("metric is 'l1'", "expected 'l2'")),
+        ({"feature_weights": True}, ("dejavu.map.weights", "not in both", "the same settings")),
         ({"freeze": ["linear"]}, ("dejavu.features.linear.bias, dejavu.features.linear.weight:",)),
+        ({"backbone": coded()}, ("of ['CodeStage']", "['DescriptorStage', 'WhiteningStage', 'CodeStage']")),
     ],
-    ids=str,
+    ids=["periods", "metric", "weights", "freeze", "stages"],
 )
 @pytest.mark.parametrize("stage", ["fit", "validate"])
 def test_a_checkpoint_of_other_settings_is_refused(
@@ -95,16 +96,15 @@ def test_a_checkpoint_of_other_settings_is_refused(
         getattr(trainer(tmp_path), stage)(new_task(**settings), data_of(), ckpt_path=last)
 
 
-@pytest.mark.parametrize("periods", [None, Later()], ids=["imposed", "found"])
-def test_a_checkpoint_of_another_route_is_refused(tmp_path: Path, periods: Later | None) -> None:
-    given = {} if periods is None else {"periods": periods}
+@pytest.mark.parametrize("given", [{}, {"mapper": mapper(Later())}], ids=["imposed", "found"])
+def test_a_checkpoint_of_another_route_is_refused(tmp_path: Path, given: dict[str, Any]) -> None:
     first, shorter = train(tmp_path, **given), data_of(footage()[:30])
     with refused("the map is of 40 places", "has 30", "expected the route that it was made of"):
         trainer(tmp_path).fit(new_task(**given), shorter, ckpt_path=first)
 
 
-def test_a_checkpoint_without_a_map_is_refused() -> None:
-    with refused("holds no map", "PlaceRecognitionTask"):
+def test_a_checkpoint_of_another_task_is_refused() -> None:
+    with refused("the checkpoint is of no training", "['CodeStage']"):
         new_task().on_load_checkpoint({"state_dict": {"weight": torch.zeros(3)}})
 
 
@@ -116,7 +116,7 @@ def test_a_task_is_not_fitted_to_a_second_route(tmp_path: Path) -> None:
     with refused("the map is of 40 places", "the array has 30"):
         trainer(tmp_path).validate(task, data_of(footage()[:30]), verbose=False)
     # the same route once more goes on from its map
-    templates = task.dejavu.map.templates.detach().clone()
+    templates = task.route.templates.detach().clone()
     assert torch.equal(templates, model.map.templates)
     trainer(tmp_path, max_steps=1).fit(task, data_of(second=ArrayTraverse(footage(0.1))))
-    assert 0 < (task.dejavu.map.templates - templates).abs().max() < 0.02
+    assert 0 < (task.route.templates - templates).abs().max() < 0.02

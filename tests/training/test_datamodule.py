@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from footage import QUERY, REFERENCE, camera
+from footage import footage as ground
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from test_evenly import QUERY, REFERENCE, camera
-from test_evenly import footage as ground
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.truth import as_truth
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.frames import Clips, StoredFrames, as_frames, store
+from dejavu_torch.training.datamodule import Batch, Clips, RouteData, StoredFrames, as_frames, store
 from dejavu_torch.types import GroundTruth
 
 
 def numbered(frames: int, first: int = 0, side: int = 8) -> ArrayTraverse:
-    """Frames that tell their number: all pixels of frame i are first + i."""
+    """Frames that show their number: all pixels of frame i are first + i."""
     numbers = torch.arange(first, first + frames, dtype=torch.uint8)
     return ArrayTraverse(numbers[:, None, None].expand(frames, side, side), f"from {first}")
 
@@ -38,7 +36,7 @@ def route(frames: int = 24, stage: str = "fit", **settings: Any) -> RouteData:
 
 
 def drawn(data: RouteData) -> dict[int, list[list[int]]]:
-    """For each frame number the right places it came with, once for each time it was drawn."""
+    """For each frame number its right places, once for each time it was drawn."""
     seen: dict[int, list[list[int]]] = {}
     for frames, truth in data.train_dataloader():
         assert frames.dtype == torch.float32
@@ -67,7 +65,7 @@ def test_frames_of_unknown_place_are_there_without_one(tmp_path: Path) -> None:
     assert found == [[[5]], [[]], [[7, 9, 11]], [[]], [[]], [[]], [[]], [[]]]
 
 
-def test_what_is_known_and_soft_reaches_the_judge(tmp_path: Path) -> None:
+def test_what_is_judged_and_ignored_reaches_the_metric(tmp_path: Path) -> None:
     hard, soft = np.zeros((24, 6), bool), np.zeros((24, 6), bool)
     hard[[3, 4], 1] = soft[9, 2] = hard[8, 2] = True
     np.savez(tmp_path / "truth.npz", GThard=hard, GTsoft=soft)
@@ -101,7 +99,7 @@ def test_validation_and_query_come_in_order_as_they_are() -> None:
 
 def test_parts_are_as_one_behind_the_other() -> None:
     parts = [store(numbered(count, first)) for count, first in ((5, 0), (3, 50), (4, 90))]
-    frames = StoredFrames(parts[0], as_ground_truth(torch.arange(12)[:, None]), *parts[1:])
+    frames = StoredFrames(parts, as_truth(torch.arange(12)[:, None]))
     assert len(frames) == 12
     index = torch.randperm(12).repeat(2)
     batch = frames[index.tolist()]
@@ -109,7 +107,7 @@ def test_parts_are_as_one_behind_the_other() -> None:
     assert torch.equal(batch.truth.positives[:, 0], index)
     assert torch.equal(frames[[5]].frames, as_frames(parts[1][:1]))
     features = [torch.randn(4, 3, dtype=torch.float64) for _ in range(2)]
-    both = StoredFrames(features[0], as_ground_truth(torch.arange(8)[:, None]), features[1])
+    both = StoredFrames(features, as_truth(torch.arange(8)[:, None]))
     assert torch.equal(both[[7, 0]].frames, torch.stack([features[1][3], features[0][0]]))
 
 
@@ -175,44 +173,37 @@ def test_clips_differ_from_epoch_to_epoch_and_reach_every_frame() -> None:
 # augmentation --------------------------------------------------------------------------------------------
 
 
-def augmented(data: RouteData, stage: str, frames: Tensor, first: int = 0) -> Tensor:
-    data.trainer = SimpleNamespace(  # type: ignore[assignment]  # what the hook asks of it
-        training=stage == "fit", validating=stage == "validate", sanity_checking=False
-    )
-    batch = next(iter(data.val_dataloader()))
-    right = torch.arange(first, first + len(frames))[:, None]
-    return data.on_after_batch_transfer(
-        batch._replace(frames=frames, truth=batch.truth._replace(positives=right)), 0
-    )[0]
-
-
 def test_a_clip_gets_one_change_and_clips_differ() -> None:
-    data = route(clip=4, augmentation=Augmentation(noise=0.0))
-    clips = augmented(data, "fit", torch.rand(1, 1, 8, 8).expand(8, 1, 8, 8)).unflatten(0, (2, 4))
+    data, frames = route(augmentation=Augmentation(noise=0.0)), torch.rand(1, 1, 8, 8).expand(8, 1, 8, 8)
+    clips = data.augmented(frames, 4).unflatten(0, (2, 4))
     torch.testing.assert_close(clips, clips[:, :1].expand_as(clips))
     assert not torch.allclose(clips[0], clips[1], atol=1e-3)
+
+
+def validated(data: RouteData, frames: Tensor, first: int = 0) -> Tensor:
+    return data.validated(Batch(frames, as_truth(torch.arange(first, first + len(frames))[:, None])))
 
 
 def test_the_reference_is_validated_under_the_same_changes_each_time() -> None:
     data, frames = route(), torch.rand(8, 1, 8, 8)
     state = torch.get_rng_state()
-    one = augmented(data, "validate", frames)
+    one = validated(data, frames)
     assert torch.equal(torch.get_rng_state(), state)
     torch.rand(5)
-    assert torch.equal(augmented(data, "validate", frames), one)
-    assert not torch.allclose(augmented(data, "validate", frames, first=8), one, atol=1e-3)
+    assert torch.equal(validated(data, frames), one)
+    assert not torch.allclose(validated(data, frames, first=8), one, atol=1e-3)
     assert not torch.allclose(one, frames, atol=1e-3)
-    assert torch.equal(augmented(data, "test", frames), frames)
-    assert torch.equal(augmented(route(validation=numbered(24, 100)), "validate", frames), frames)
+    assert torch.equal(validated(route(validation=numbered(24, 100)), frames), frames)
 
 
 def test_ready_features_are_left_as_they_are() -> None:
     features = torch.randn(24, 5, dtype=torch.float64)
-    data = RouteData(ArrayTraverse(features), tolerance=2, batch_size=24)
+    data = RouteData(features, tolerance=2, batch_size=24)
     data.setup("fit")
     (batch,) = data.train_dataloader()
     assert torch.equal(batch.frames, features[batch.truth.positives[:, 0]])
-    assert torch.equal(augmented(data, "fit", features), features)
+    assert torch.equal(data.augmented(features, 1), features)
+    assert torch.equal(validated(data, features), features)
 
 
 # what is kept --------------------------------------------------------------------------------------------
@@ -240,7 +231,7 @@ def test_frames_are_kept_as_bytes_and_resized() -> None:
         ({"tolerance": 24}, ("from 0 has 24 frames", "tolerance is 24", "longer")),
         ({"frames": 1, "tolerance": 0}, ("from 0 has 1 frame and", "longer")),
         ({"validation": numbered(2, 100)}, ("from 100 has 2 frames", "tolerance is 2")),
-        ({"validation": numbered(20, 100)}, ("24 places", "20 frames of from 100", "data.validation_truth")),
+        ({"validation": numbered(20, 100)}, ("from 100", "20 frames", "24 places", "data.validation_truth")),
         ({"second": numbered(20, 100)}, ("expected data.second_truth",)),
         ({"stage": "test", "query": numbered(20, 100)}, ("expected data.truth",)),
         ({"stage": "test"}, ("nothing to test on", "data.query")),
@@ -259,6 +250,23 @@ def test_what_does_not_fit_is_refused(settings: dict[str, Any], words: tuple[str
 def test_a_clip_longer_than_the_route_is_refused() -> None:
     with refused("clip is 32", "24 frames"):
         route(clip=32, batch_size=32).train_dataloader()
+
+
+@pytest.mark.parametrize("given", [[1, 2], np.zeros((3, 4, 4)), 3.5], ids=["list", "array", "float"])
+@pytest.mark.parametrize("name", ["source", "second", "validation", "query"])
+def test_a_source_that_is_none_is_refused(name: str, given: object) -> None:
+    kind = type(given).__name__
+    with refused(f"{name} is of type {kind}", "a path", "a Traverse, or a tensor of frames or features"):
+        RouteData(**{"source": numbered(24)} | {name: given})  # type: ignore[arg-type]
+
+
+def test_a_tensor_of_frames_is_a_traverse() -> None:
+    frames = torch.rand(24, 3, 8, 8)
+    data = RouteData(frames, validation=frames, tolerance=2)
+    data.setup("fit")
+    assert data.sets["reference"].values.shape == data.sets["validation"].values.shape == (24, 3, 8, 8)
+    with refused("(24, 3, 8)", "expected frames"):
+        RouteData(frames[..., 0]).setup("fit")
 
 
 def test_values_that_are_no_frames_are_refused() -> None:

@@ -1,7 +1,8 @@
-"""The map that a training leaves: which step it is of, and what is said where it is not what one expects."""
+"""The map that a training leaves: which step it is of, and what is warned of."""
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +10,20 @@ import pytest
 import torch
 from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
-from test_task import data_of, footage, new_task, trainer, warned
+from small_training import Stop, data_of, footage, new_task, trainer, warned
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.training.export import LastCheckpoint, load_weights
 
 
 class Wreck(Callback):
-    """Spoils what was learnt, from the second epoch on."""
+    """Spoils what was learned, from the second epoch on."""
 
     @torch.no_grad()
     def on_train_epoch_end(self, trainer: Trainer, pl_module: Any) -> None:
         if trainer.current_epoch:
-            pl_module.dejavu.map.templates.fill_(trainer.current_epoch)
+            pl_module.route.templates.fill_(trainer.current_epoch)
 
 
 def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Path) -> None:
@@ -49,23 +51,23 @@ def test_without_a_step_there_is_no_map(tmp_path: Path, caplog: pytest.LogCaptur
     assert not (tmp_path / "map.safetensors").exists()
 
 
-def test_a_run_that_is_over_already_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_that_is_over_already_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     trainer(tmp_path, ModelCheckpoint(tmp_path, save_last=True)).fit(new_task(), data_of())
     assert warned(caplog) == []
     (tmp_path / "map.safetensors").rename(tmp_path / "before.safetensors")
     trainer(tmp_path).fit(new_task(), data_of(), ckpt_path=tmp_path / "last.ckpt")
-    (told,) = warned(caplog)
-    assert told.startswith("nothing was trained")
-    assert "step 4 is reached" in told
+    (line,) = warned(caplog)
+    assert line.startswith("nothing was trained")
+    assert "step 4 is reached" in line
     maps = [DejaVu.load(tmp_path / f"{name}.safetensors").map for name in ("before", "map")]
     assert torch.equal(maps[0].templates, maps[1].templates)
 
 
-def test_a_figure_that_was_never_measured_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    best, task = ModelCheckpoint(tmp_path, monitor="val/auc", mode="max"), new_task()
+def test_a_figure_that_was_never_measured_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    best, task = ModelCheckpoint(tmp_path, monitor="val/auc_augmented", mode="max"), new_task()
     trainer(tmp_path, best, check_val_every_n_epoch=9).fit(task, data_of())
-    assert warned(caplog) == ["val/auc was never measured: the map is of the last step"]
-    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.dejavu.map.templates)
+    assert warned(caplog) == ["val/auc_augmented was never measured: the map is of the last step"]
+    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)
 
 
 class Tidy(Callback):
@@ -75,16 +77,45 @@ class Tidy(Callback):
         Path(trainer.checkpoint_callbacks[0].best_model_path).unlink()  # type: ignore[attr-defined]
 
 
-def test_a_best_checkpoint_that_is_gone_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    best, task = ModelCheckpoint(tmp_path, monitor="val/auc", mode="max"), new_task()
+def test_a_best_checkpoint_that_is_gone_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    best, task = ModelCheckpoint(tmp_path, monitor="val/auc_augmented", mode="max"), new_task()
     trainer(tmp_path, best, Tidy()).fit(task, data_of())
     assert warned(caplog) == [f"{best.best_model_path} is gone: the map is of the last step"]
-    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.dejavu.map.templates)
+    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)
 
 
-def test_what_was_written_is_told(tmp_path: Path) -> None:
+def test_the_callback_knows_what_it_wrote(tmp_path: Path) -> None:
     running = trainer(tmp_path)
     running.fit(new_task(), data_of())
-    path, certificate = running.callbacks[0].written  # type: ignore[attr-defined]
+    path, summary = running.callbacks[0].written  # type: ignore[attr-defined]
     assert path == tmp_path / "map.safetensors"
-    assert certificate == DejaVu.load(path).certificate
+    assert summary == DejaVu.load(path).summary()
+
+
+def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_path: Path) -> None:
+    stop, handler = Stop(3, exception=KeyboardInterrupt()), signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit):
+            trainer(tmp_path, stop, LastCheckpoint(every=2), max_steps=9).fit(new_task(), data_of())
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    model, task = DejaVu.load(tmp_path / "map.safetensors"), new_task()
+    assert model.trained is not None
+    assert model.trained.steps == 3
+    load_weights(task, tmp_path / "checkpoints" / "last.ckpt")
+    assert torch.equal(task.route.templates, model.map.templates)
+    assert task.deployed().trained is not None
+    assert task.deployed().trained.steps == 3  # type: ignore[union-attr]
+
+
+def test_the_last_checkpoint_is_by_steps_and_of_the_end(tmp_path: Path) -> None:
+    saved: list[int] = []
+
+    class Counted(LastCheckpoint):
+        def _save(self, trainer: Trainer) -> None:
+            saved.append(trainer.global_step)
+            super()._save(trainer)
+
+    trainer(tmp_path, Counted(every=4), max_steps=9).fit(new_task(), data_of())
+    assert saved == [4, 8, 9]
+    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 9

@@ -1,4 +1,4 @@
-"""The metric is `evaluate` over everything it saw, however that came."""
+"""The metric is `evaluate` over everything it saw, in whatever batches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.types import GroundTruth, Match
 
 INF = float("inf")
-# score, reported place, right places, known, soft places; few values, so that scores tie
+# score, reported place, right places, judged, ignored places; few values, so that scores tie
 QUERY = st.tuples(
     st.sampled_from([-1.5, 0.0, 0.5, 1.0, INF]),
     st.integers(-1, 6),
@@ -42,10 +42,10 @@ def table(rows: Sequence[list[int]]) -> Tensor:
 
 
 def batch_of(queries: list[Any]) -> tuple[Match, GroundTruth]:
-    score, index, right, known, soft = zip(*queries, strict=True) if queries else ((),) * 5
+    score, index, right, judged, ignored = zip(*queries, strict=True) if queries else ((),) * 5
     scores = torch.tensor(score, dtype=torch.float32)
     match = Match(torch.tensor(index, dtype=torch.int64), scores, scores < 1)
-    return match, GroundTruth(table(right), torch.tensor(known, dtype=torch.bool), table(soft))
+    return match, GroundTruth(table(right), torch.tensor(judged, dtype=torch.bool), table(ignored))
 
 
 def same(figures: dict[str, Tensor], scores: Scores) -> bool:
@@ -66,17 +66,17 @@ def fed(*batches: tuple[Match, Tensor], **arguments: Any) -> PlaceRecognition:
 
 
 @given(BATCHES, st.integers(0, 2))
-def test_it_is_judge_on_all_data_whatever_the_batches(batches: list[Any], tolerance: int) -> None:
+def test_it_is_evaluate_on_all_data_whatever_the_batches(batches: list[Any], tolerance: int) -> None:
     metric = PlaceRecognition(tolerance)
     for queries in batches:
         metric.update(*batch_of(queries))
     match, truth = batch_of([query for queries in batches for query in queries])
     near = (match.index[:, None] - truth.positives).abs() <= tolerance
     right = (near & (truth.positives >= 0) & (match.index >= 0)[:, None]).any(1)
-    soft = ((match.index[:, None] == truth.ignored) & (truth.ignored >= 0)).any(1)
+    ignored = ((match.index[:, None] == truth.ignored) & (truth.ignored >= 0)).any(1)
     figures = metric.compute()
     assert isinstance(figures, dict)
-    if (truth.judged & (right | ~soft)).any():
+    if (truth.judged & (right | ~ignored)).any():
         assert same(figures, evaluate(match, truth, tolerance))
     else:
         assert set(figures) == set(Scores._fields)
@@ -118,7 +118,7 @@ def test_reset_forgets() -> None:
     assert same(metric.compute(), evaluate(*second, tolerance=1))
 
 
-def test_calling_it_judges_the_batch_and_adds_it() -> None:
+def test_calling_it_evaluates_the_batch_and_adds_it() -> None:
     first, second = some(), some()
     metric = fed(first)
     assert same(metric.compute(), evaluate(*first, tolerance=1))
@@ -185,29 +185,22 @@ def test_it_survives_a_pickle_a_copy_and_a_checkpoint() -> None:
 
 def test_in_a_collection_the_figures_stand_by_name() -> None:
     batch = some()
-    collection = MetricCollection({"near": PlaceRecognition(0, "auc"), "far": PlaceRecognition(2, "auc")})
-    collection.update(*batch)
-    near, far = evaluate(*batch, tolerance=0).auc, evaluate(*batch, tolerance=2).auc
-    assert {name: value.item() for name, value in collection.compute().items()} == {"near": near, "far": far}
-    assert near != far
     assert same(MetricCollection(PlaceRecognition(0))(*batch), evaluate(*batch, tolerance=0))
 
 
 class Validated(LightningModule):
-    """Logs as a task does: one figure as a metric, all of them as a dict."""
+    """Logs as a task does."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.one, self.every = PlaceRecognition(1, "auc"), PlaceRecognition(1)
+        self.metric = PlaceRecognition(1)
 
     def validation_step(self, batch: Any, index: int) -> None:
-        for metric in (self.one, self.every):
-            metric.update(*batch)
-        self.log("one", self.one)
+        self.metric.update(*batch)
 
     def on_validation_epoch_end(self) -> None:
-        self.log_dict(self.every.compute())
-        self.every.reset()
+        self.log_dict(self.metric.compute())
+        self.metric.reset()
 
 
 def test_a_trainer_logs_it() -> None:
@@ -215,7 +208,7 @@ def test_a_trainer_logs_it() -> None:
     trainer = Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
     logged = trainer.validate(Validated(), DataLoader(batches, batch_size=None), verbose=False)[0]
     scores = fed_scores(*batches)
-    assert logged == pytest.approx({"one": scores.auc, **scores._asdict()})
+    assert logged == pytest.approx(scores._asdict())
 
 
 def test_higher_is_better_and_gradients_stop() -> None:
@@ -228,8 +221,6 @@ def test_higher_is_better_and_gradients_stop() -> None:
 def test_errors() -> None:
     match, truth = some(queries=3)
     metric = PlaceRecognition(tolerance=1)
-    with refused("figure 'area'", "auc, auc_reported"):
-        PlaceRecognition(1, figure="area")
     with refused("tolerance is -1", "at least 0"):
         PlaceRecognition(-1)
     with refused("(3, 1) torch.int64", "(3,)", "expected (Q,) int64"):

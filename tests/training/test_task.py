@@ -2,75 +2,39 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
+import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from dejavu_torch.data.truthfile import read_truth
-from dejavu_torch.recognition.deploy import Localizer
-from helpers import Fixed
+from footage import QUERY, REFERENCE, STEP, camera
+from footage import footage as ground
+from helpers import Fixed, refused
 from pytorch_lightning import Callback, Trainer
-from test_evenly import QUERY, REFERENCE, STEP, camera
-from test_evenly import footage as ground
+from small_training import (
+    FRAMES,
+    Later,
+    assert_same_scores,
+    data_of,
+    fit,
+    footage,
+    mapper,
+    new_task,
+    recall,
+    trainer,
+)
 from torch import Tensor, nn
+from torch.optim import AdamW
 
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, Preprocess, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.truthfile import find_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import MapExport
-from dejavu_torch.training.objective import Objective
-from dejavu_torch.training.task import PlaceRecognitionTask
-from dejavu_torch.types import FrequencyLayer, Plan, Training
-
-FRAMES = 40
-
-
-def footage(noise: float = 0.0, frames: int = FRAMES, side: int = 16) -> Tensor:
-    """(N,side,side) uint8, a window slid along a smooth strip by 2 pixels a frame."""
-    random = torch.Generator().manual_seed(0)
-    strip = torch.rand(1, 1, 4, frames, generator=random)
-    strip = nn.functional.interpolate(strip, (side, 2 * frames + side), mode="bicubic")[0, 0]
-    windows = torch.stack([strip[:, 2 * i : 2 * i + side] for i in range(frames)])
-    noisy = windows + noise * torch.randn(windows.shape, generator=random)
-    return (255 * noisy.clamp(0, 1)).byte()
-
-
-def backbone(dimension: int = 8) -> SmallCNN:
-    return SmallCNN(dimension, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
-
-
-def new_task(**settings: Any) -> PlaceRecognitionTask:
-    given = {"backbone": backbone(), "periods": ImposedPeriods([3, 4, 5], bin=2)} | settings
-    return PlaceRecognitionTask(**given)
-
-
-def data_of(source: Tensor | None = None, **settings: Any) -> RouteData:
-    given = {"tolerance": 2, "batch_size": 16} | settings
-    return RouteData(ArrayTraverse(footage() if source is None else source), **given)
-
-
-def trainer(folder: Path, *callbacks: Callback, **settings: Any) -> Trainer:
-    given = {"max_steps": 4, "enable_checkpointing": bool(callbacks)} | settings
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    return Trainer(
-        accelerator="cpu", default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given
-    )
-
-
-def fit(folder: Path, task: PlaceRecognitionTask, data: RouteData, **settings: Any) -> DejaVu:
-    """The map that a training writes."""
-    trainer(folder, **settings).fit(task, data)
-    return DejaVu.load(folder / "map.safetensors")
-
-
-def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What the package told."""
-    return [record.getMessage() for record in caplog.records if record.name == "dejavu_torch"]
+from dejavu_torch.training.task import PlaceRecognitionTask, adamw_of, replace
+from dejavu_torch.types import FrequencyLayer, Training
 
 
 @pytest.mark.parametrize(
@@ -78,33 +42,29 @@ def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
     [
         {},
         {"feature_weights": True},
-        {"train_templates": False},
-        {"metric": "l2"},
+        {"mapper": mapper(metric="l2", reduction="sum", temperature=0.5)},
+        {"mapper": mapper(metric="cosine", trainable=True)},
         {"batch_size": 1},
-        {"losses": Objective(periodicity=0.1, decorrelation=0.1, support=0.1)},
     ],
     ids=str,
 )
 def test_task_map_and_exported_program_give_the_same_scores(tmp_path: Path, settings: dict[str, Any]) -> None:
     task = new_task(**settings)
-    assert_same_scores(task, fit(tmp_path, task, data_of(batch_size=20)))
+    model = fit(tmp_path, task, data_of(batch_size=20))
+    assert_same_scores(task, model)
+    assert isinstance(model.map, TemplateMap)
+    temperature = task.log_temperature.exp().item()
+    assert model.map.temperature == model.mapper.temperature == pytest.approx(temperature)
 
 
-def assert_same_scores(task: PlaceRecognitionTask, model: DejaVu) -> None:
-    """Of the task, of its map, and of what is exported."""
-    frames = footage(0.1)[:7, None] / 255
-    with torch.no_grad():
-        scores = task.eval()(frames)
-        torch.testing.assert_close(model(frames), scores, rtol=1e-5, atol=1e-5)
-        localizer = Localizer(model.pipeline, model.map, model.matcher).eval()
-        free = {"frames": {0: torch.export.Dim("batch")}}
-        program = torch.export.export(localizer, (frames[:2],), dynamic_shapes=free)
-        torch.testing.assert_close(program.module()(frames), scores, rtol=1e-5, atol=1e-5)
-    assert scores.shape == (7, FRAMES)
-    assert not list(model.map.parameters())
+def test_the_temperature_starts_at_the_mappers() -> None:
+    for given, start in ((None, 0.03), (0.5, 0.5)):
+        task = new_task(mapper=mapper(temperature=given))
+        assert task.log_temperature.exp().item() == pytest.approx(start)
+    assert PlaceRecognitionTask().log_temperature.exp().item() == pytest.approx(0.03)
 
 
-def test_the_map_tells_its_training_and_counts_the_backbone(
+def test_the_map_holds_how_it_was_trained_and_counts_the_backbone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("PL_GLOBAL_SEED", raising=False)
@@ -114,23 +74,19 @@ def test_the_map_tells_its_training_and_counts_the_backbone(
     assert not any(part.training for part in model.modules())
     assert task.seconds > 0
     weights = sum(tensor.nbytes for tensor in task.dejavu.features.state_dict().values())
-    assert model.backbone_bytes == weights > 0
-    assert model.map_bytes == (tmp_path / "map.safetensors").stat().st_size
+    assert model.summary().fixed["backbone"] == weights > 0
+    assert model.summary().map_bytes == (tmp_path / "map.safetensors").stat().st_size
     monkeypatch.setenv("PL_GLOBAL_SEED", "7")
     again = fit(tmp_path, new_task(), data_of())
     assert again.trained is not None
     assert again.trained.seed == 7
 
 
-def recall(model: DejaVu, query: Tensor) -> float:
-    truth = torch.arange(len(query))[:, None]
-    return evaluate(model.localize(ArrayTraverse(query)), truth, tolerance=2).recall_at_1
-
-
 def test_training_finds_places_that_the_untrained_start_does_not(tmp_path: Path) -> None:
     noisy = footage(0.15)
-    start = recall(fit(tmp_path, new_task(lr=1e-9), data_of(), max_steps=1), noisy)
-    trained = recall(fit(tmp_path, new_task(lr=1e-2), data_of(), max_steps=150), noisy)
+    given = {"limit_val_batches": 0}
+    start = recall(fit(tmp_path, new_task(lr=1e-9), data_of(), max_steps=1, **given), noisy)
+    trained = recall(fit(tmp_path, new_task(lr=1e-2), data_of(), max_steps=150, **given), noisy)
     assert trained > max(0.6, start + 0.2), (start, trained)
 
 
@@ -159,82 +115,101 @@ def test_bf16_trains_and_exports_float32(tmp_path: Path) -> None:
     assert kinds == {torch.float32}
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"lr": 0.0}, ("lr is 0.0", "above 0")),
+        ({"refresh": -1}, ("refresh -1",)),
+        ({"descriptor": -0.1}, ("descriptor is -0.1", "from 0 to below 1")),
+        ({"descriptor": 1.0}, ("descriptor is 1.0",)),
+        ({"mapper": nn.Identity()}, ("mapper is Identity", "TemplateMapper")),
+    ],
+    ids=str,
+)
+def test_settings_out_of_range(settings: dict[str, Any], words: tuple[str, ...]) -> None:
+    with refused(*words):
+        new_task(**settings)
+
+
 # templates, weights, layers ------------------------------------------------------------------------------
 
 
-def test_weights_are_learnt_and_written_with_their_signs_turned(tmp_path: Path) -> None:
+def test_weights_are_learned_and_written_with_their_signs_turned(tmp_path: Path) -> None:
     task = new_task(feature_weights=True, lr=2.0)
     model = fit(tmp_path, task, data_of())
-    weights, frames = task.dejavu.map.weights.detach(), footage(0.1)[:7, None] / 255
+    weights, frames = task.route.weights.detach(), footage(0.1)[:7, None] / 255
     assert weights.min() < 0  # so large a step, and nothing holds it back
     assert torch.equal(model.map.weights, weights.abs())
     with torch.no_grad():
         torch.testing.assert_close(model(frames), task.eval()(frames), rtol=1e-5, atol=1e-5)
 
 
-class Later(Fixed):
-    """Other layers whenever it is asked again."""
-
-    asked = 0
-
-    def plan(self, features: Tensor) -> Plan:
-        self.asked += 1
-        periods = (3, 4) if self.asked == 1 else (5, 7, 9)
-        return tuple(FrequencyLayer(Fraction(p), p, 0, len(features), tuple(range(8))) for p in periods)
-
-
-def phases(task: PlaceRecognitionTask | DejaVu) -> list[int]:
-    model = task if isinstance(task, DejaVu) else task.dejavu
-    return [layer.phases for layer in model.map.plan]
+def test_deploying_changes_nothing_that_is_trained(tmp_path: Path) -> None:
+    task, running = new_task(feature_weights=True), trainer(tmp_path)
+    running.fit(task, data_of())
+    before = {name: (p, p.detach().clone()) for name, p in task.named_parameters()}
+    model = task.deployed()
+    after = dict(task.named_parameters())
+    assert after.keys() == before.keys()
+    assert all(after[name] is p and torch.equal(p, value) for name, (p, value) in before.items())
+    optimised = {id(p) for group in running.optimizers[0].param_groups for p in group["params"]}
+    assert {id(task.route.weights), id(task.route.templates)} < optimised
+    assert not list(model.map.parameters())
 
 
-class Starts(Callback):
-    """Remembers the templates at the start of the last epoch."""
+def phases(task: PlaceRecognitionTask) -> list[int]:
+    return [layer.phases for layer in task.route.plan]
+
+
+class Watch(Callback):
+    """At the first step of each epoch: how often the layers were asked for, and the templates."""
+
+    def __init__(self) -> None:
+        self.times: list[int] = []
+        self.templates = torch.zeros(0)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
         if batch_idx == 0:
-            self.templates = pl_module.dejavu.map.templates.detach().clone()
+            self.times.append(pl_module.dejavu.mapper.periods.asked)
+            self.templates = pl_module.route.templates.detach().clone()
 
 
 @pytest.mark.parametrize("weights", [False, True])
 def test_layers_found_later_are_trained(tmp_path: Path, weights: bool) -> None:
-    task, seen = new_task(periods=Later(), refresh=1, feature_weights=weights), Starts()
+    task, seen = new_task(mapper=mapper(Later()), refresh=1, feature_weights=weights), Watch()
     running = trainer(tmp_path, seen, max_epochs=2, max_steps=-1, enable_checkpointing=False)
     running.fit(task, data_of())
     assert phases(task) == [5, 7, 9]
-    assert not torch.equal(seen.templates, task.dejavu.map.templates)
+    assert not torch.equal(seen.templates, task.route.templates)
     optimised = {id(p) for group in running.optimizers[0].param_groups for p in group["params"]}
     assert optimised == {id(p) for p in task.parameters()}
     assert {id(p) for p in running.optimizers[0].state} <= optimised
 
 
-class Asked(Callback):
-    """Remembers how often the layers were asked for by the first step of each epoch."""
-
-    def __init__(self) -> None:
-        self.times: list[int] = []
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
-        if batch_idx == 0:
-            self.times.append(pl_module.dejavu.periods.asked)
-
-
 @pytest.mark.parametrize(
     ("refresh", "times"), [(0, [1] * 5), (1, [1, 2, 3, 4, 5]), (2, [1, 1, 2, 2, 3]), (3, [1, 1, 1, 2, 2])]
 )
-def test_layers_are_asked_for_every_few_epochs(tmp_path: Path, refresh: int, times: list[int]) -> None:
-    asked, task = Asked(), new_task(periods=Later(), refresh=refresh)
-    trainer(tmp_path, asked, max_epochs=5, max_steps=-1, enable_checkpointing=False).fit(task, data_of())
-    assert asked.times == times
+def test_layers_are_found_anew_every_few_epochs(tmp_path: Path, refresh: int, times: list[int]) -> None:
+    watch, task = Watch(), new_task(mapper=mapper(Later()), refresh=refresh)
+    trainer(tmp_path, watch, max_epochs=5, max_steps=-1, enable_checkpointing=False).fit(task, data_of())
+    assert watch.times == times
 
 
 def test_places_without_a_layer_are_left_out(tmp_path: Path) -> None:
     gap = [FrequencyLayer(4, 4, start, start + 16, (0, 1, 2)) for start in (0, 24)]
-    running, task = trainer(tmp_path, max_epochs=1, max_steps=-1), new_task(periods=Fixed(*gap))
+    running, task = trainer(tmp_path, max_epochs=1, max_steps=-1), new_task(mapper=mapper(Fixed(*gap)))
     running.fit(task, data_of(batch_size=20))
     assert running.callback_metrics["train/left_out"] == 4  # 16 to 23, less 2 on each side within tolerance
     assert all(parameter.isfinite().all() for parameter in task.parameters())
     assert DejaVu.load(tmp_path / "map.safetensors").eval()(torch.rand(2, 1, 16, 16))[:, 16:24].isinf().all()
+
+
+def test_features_in_which_nothing_repeats_are_refused(tmp_path: Path) -> None:
+    with refused("nothing repeats in the features of the array", "imposed periods"):
+        fit(tmp_path, new_task(mapper=mapper(Fixed())), data_of())
+
+
+# frames --------------------------------------------------------------------------------------------------
 
 
 def test_even_steps_are_places(tmp_path: Path) -> None:
@@ -243,29 +218,44 @@ def test_even_steps_are_places(tmp_path: Path) -> None:
     model = fit(tmp_path, new_task(backbone=small), data)
     assert model.step == STEP
     assert model.map.places == 101
-    assert len(model.map.way) == len(REFERENCE)
+    assert len(model.map.positions) == len(REFERENCE)
     assert len(model.localize(ArrayTraverse(ground(QUERY))).index) == 101
 
 
-def test_frames_that_were_resized_are_what_the_map_expects(tmp_path: Path) -> None:
-    model = fit(tmp_path, new_task(), data_of(footage(side=24), resize=(16, 16)))
-    assert model.learnt_from == (1, 16, 16)
+@pytest.mark.parametrize(
+    ("settings", "resize", "stored", "shape"),
+    [
+        ({}, None, (1, 16, 16), (1, 24, 24)),  # once, to what the backbone would resize them to
+        ({}, (20, 20), (1, 20, 20), (1, 20, 20)),
+        ({"preprocess": Preprocess(contrast="patch")}, None, (1, 24, 24), (1, 24, 24)),  # of the whole frame
+        ({"backbone": nn.Sequential(nn.Flatten(), nn.Linear(576, 8))}, None, (1, 24, 24), (1, 24, 24)),
+    ],
+)
+def test_frames_are_resized_when_they_are_stored(
+    tmp_path: Path, settings: dict[str, Any], resize: Any, stored: tuple[int, ...], shape: tuple[int, ...]
+) -> None:
+    data, task = data_of(footage(side=24), resize=resize), new_task(**settings)
+    trainer(tmp_path).fit(task, data)
+    assert data.sets["reference"].values.shape == (FRAMES, *stored)
+    assert task.deployed().frame_shape == shape
 
 
-# figures ---------------------------------------------------------------------------------------------------
+# figures -------------------------------------------------------------------------------------------------
 
 
 def assert_figures(running: Trainer, task: PlaceRecognitionTask, noisy: Tensor, truth: str = "0") -> None:
-    """What a test tells is what `evaluate` says of the map in the trainer's folder."""
+    """The figures of a test are those of `evaluate` on the map in the trainer's folder."""
     data = data_of(query=ArrayTraverse(noisy), truth=truth)
     (figures,) = running.test(task, data, verbose=False)
     match = DejaVu.load(Path(running.default_root_dir) / "map.safetensors").localize(ArrayTraverse(noisy))
-    expected = evaluate(match, read_truth(truth, FRAMES, FRAMES), tolerance=2)._asdict()
+    known = find_truth(truth, None, None, FRAMES, FRAMES)
+    assert known is not None
+    expected = evaluate(match, known, tolerance=2)._asdict()
     assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
 
 
 @pytest.mark.parametrize("truth", ["0", "5", "csv"])
-def test_the_figures_are_those_of_judge_on_the_map(tmp_path: Path, truth: str) -> None:
+def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path, truth: str) -> None:
     """5 leaves the last queries without a right place; the csv also leaves some unknown."""
     if truth == "csv":
         truth = str(tmp_path / "truth.csv")
@@ -277,15 +267,87 @@ def test_the_figures_are_those_of_judge_on_the_map(tmp_path: Path, truth: str) -
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "32-true"])
-@pytest.mark.parametrize("settings", [{}, {"train_templates": False, "feature_weights": True}], ids=str)
-def test_figures_are_made_in_32_bits(tmp_path: Path, precision: Any, settings: dict[str, Any]) -> None:
-    running, task = trainer(tmp_path, precision=precision, max_steps=30), new_task(**settings)
+def test_figures_are_made_in_32_bits(tmp_path: Path, precision: Any) -> None:
+    running, task = trainer(tmp_path, precision=precision, max_steps=30), new_task(feature_weights=True)
     running.fit(task, data_of())
     assert_figures(running, task, footage(0.2))
 
 
-def test_without_training_the_phase_means_are_judged(tmp_path: Path) -> None:
+def test_without_training_the_phase_means_are_evaluated(tmp_path: Path) -> None:
     running, task = trainer(tmp_path), new_task()
     running.validate(task, data_of(validation=ArrayTraverse(footage(0.2))), verbose=False)
     task.deployed().save(tmp_path / "map.safetensors")
     assert_figures(running, task, footage(0.2))
+    trainer(tmp_path).fit(task, data_of())  # and it can be trained all the same
+
+
+def test_figures_of_the_augmented_reference_are_called_so(tmp_path: Path) -> None:
+    for given, suffix in (({}, "_augmented"), ({"validation": ArrayTraverse(footage(0.2))}, "")):
+        (figures,) = trainer(tmp_path).validate(new_task(), data_of(**given), verbose=False)
+        assert {f"val/auc{suffix}", f"val/recall_at_1{suffix}"} < set(figures)
+        assert all(name.endswith(suffix) and name.count("augmented") == bool(suffix) for name in figures)
+
+
+# the optimizer -------------------------------------------------------------------------------------------
+
+
+def rates(steps: int, taken: int) -> list[float]:
+    """The learning rate of each step, of at most 1, and of the one behind the last."""
+    made = adamw_of([nn.Parameter(torch.zeros(2))], 1.0, 0.0, steps)
+    optimizer, schedule = made["optimizer"], made["lr_scheduler"]
+    assert schedule["interval"] == "step"
+    seen = [optimizer.param_groups[0]["lr"]]
+    for _ in range(taken):
+        optimizer.step()
+        schedule["scheduler"].step()
+        seen.append(optimizer.param_groups[0]["lr"])
+    return seen
+
+
+def test_the_rate_rises_over_a_tenth_and_falls_to_0() -> None:
+    rise = [(k + 1) / 10 for k in range(10)]
+    fall = [0.5 + 0.5 * math.cos(math.pi * k / 90) for k in range(91)]
+    assert rates(100, 103) == pytest.approx([*rise, *fall, 0, 0, 0])
+    for steps in (1, 2, 4):  # a short run begins at the highest rate
+        seen = rates(steps, steps)
+        assert seen[0] == 1
+        assert all(0 < rate <= 1 for rate in seen[:-1])
+
+
+def test_a_training_ends_at_rate_0_and_needs_an_end(tmp_path: Path) -> None:
+    running = trainer(tmp_path, max_steps=7)
+    running.fit(new_task(), data_of())
+    assert [group["lr"] for group in running.optimizers[0].param_groups] == pytest.approx([0, 0], abs=1e-12)
+    with refused("no end", "trainer.max_steps"):
+        trainer(tmp_path, max_steps=-1, max_epochs=-1).fit(new_task(), data_of())
+
+
+def test_only_what_is_multiplied_decays() -> None:
+    net = nn.Sequential(nn.Conv2d(1, 2, 3), nn.BatchNorm2d(2), nn.Linear(2, 2))
+    optimizer = adamw_of(net.parameters(), 0.1, 0.3, 10)["optimizer"]
+    assert isinstance(optimizer, AdamW)
+    decays = {id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
+    assert decays == {id(p): 0.3 if p.ndim > 1 else 0 for p in net.parameters()}
+    assert len(adamw_of([net[0].bias], 0.1, 0.3, 10)["optimizer"].param_groups) == 1
+
+
+def test_parameters_are_replaced_with_nothing_remembered() -> None:
+    before, after, other = nn.Linear(3, 2), nn.Linear(3, 2), nn.Linear(2, 1)
+    optimizer = adamw_of([*before.parameters(), *other.parameters()], 0.1, 0.1, 10)["optimizer"]
+
+    def step(first: nn.Module) -> None:
+        optimizer.zero_grad()
+        other(first(torch.ones(4, 3))).sum().backward()
+        optimizer.step()
+
+    step(before)
+    kept = optimizer.state[other.weight]
+    replace(optimizer, before, after)
+    assert set(optimizer.state) == set(other.parameters())
+    assert optimizer.state[other.weight] is kept
+    old, new = before.weight.clone(), after.weight.clone()
+    step(after)
+    assert torch.equal(before.weight, old)
+    assert not torch.equal(after.weight, new)
+    assert float(optimizer.state[after.weight]["step"]) == 1
+    assert float(kept["step"]) == 2

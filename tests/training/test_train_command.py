@@ -7,18 +7,20 @@ import importlib.util
 import shutil
 import signal
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import yaml
-from test_task import FRAMES, footage, warned
+from pytorch_lightning import Trainer
+from small_training import CONFIG, FRAMES, MINE, footage, train, warned
 from torch import nn
-from training_config import CONFIG, MINE, train
 
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, RouteData, TemplateMap
 from dejavu_torch.cli import main
+from dejavu_torch.cli.train import configs_first, preset_path
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.mapfile import read_map
 from dejavu_torch.database.summary import describe
@@ -31,7 +33,7 @@ def figures(path: Path) -> dict[str, list[float]]:
     return {name: [float(row[name]) for row in rows if row[name]] for name in rows[0]}
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
+def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
     """The table of figures that a test or validation prints."""
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     return {row[0]: float(row[1]) for row in rows if row and row[0].startswith(("test/", "val/"))}
@@ -40,37 +42,49 @@ def told(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
 # what it does --------------------------------------------------------------------------------------------
 
 
-def test_a_fit_leaves_a_map_checkpoints_figures_and_its_config(folder: Path) -> None:
+def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder: Path) -> None:
     log = folder / "run" / "lightning_logs" / "version_0"
-    kept = sorted(path.name for path in (folder / "run" / "checkpoints").iterdir())
-    assert kept == ["last.ckpt", "step=4.ckpt"]
+    assert [path.name for path in (folder / "run" / "checkpoints").iterdir()] == ["last.ckpt"]
     assert (log / "config.yaml").is_file()
-    assert {"val/auc", "val/recall_at_1", "train/left_out"} <= set(figures(log / "metrics.csv"))
+    seen = figures(log / "metrics.csv")
+    assert {"val/auc_augmented", "val/recall_at_1_augmented", "train/left_out"} <= set(seen)
+    assert len(seen["val/auc_augmented"]) == 1  # at the last step, which is ahead of the first 500
     model = DejaVu.load(folder / "run" / "map.safetensors")
     assert model.trained is not None
     assert (model.trained.steps, model.trained.seed) == (4, 0)
 
 
-def test_its_map_is_localized_on(folder: Path, tmp_path: Path) -> None:
-    main(["localize", "run/map.safetensors", "two.npy", "--out", str(tmp_path / "m.csv")])
-    assert len((tmp_path / "m.csv").read_text().splitlines()) == 1 + FRAMES
-
-
-def test_test_and_validate_judge_the_last_checkpoint(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     train("test", "--data.query", "two.npy")
     match = DejaVu.load("run/map.safetensors").localize(ArrayTraverse(footage(0.1)))
     scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
-    assert told(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
+    assert printed(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
     train("validate", "--data.validation", "two.npy")
-    assert told(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
+    assert printed(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
 
 
 def test_a_built_in_route(folder: Path, tmp_path: Path) -> None:
     options = ["--data.source", "sim:aerial?frames=48", "--data.resize", "[16,16]"]
     train("fit", *options, "--model.backbone.channels", 3, "--trainer.default_root_dir", tmp_path)
-    assert DejaVu.load(tmp_path / "map.safetensors").learnt_from == (3, 16, 16)
+    assert DejaVu.load(tmp_path / "map.safetensors").frame_shape == (3, 16, 16)
+
+
+def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps, validations and checkpoints have defaults; here but a few steps are taken."""
+    monkeypatch.chdir(tmp_path)
+    np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 20, 24, 3), dtype=np.uint8))
+    seen: dict[str, object] = {}
+
+    def taken(self: Trainer, model: object, datamodule: RouteData) -> None:
+        seen.update(steps=self.max_steps, every=self.val_check_interval, epochs=self.check_val_every_n_epoch)
+        self.fit_loop.epoch_loop.max_steps = 2
+        Trainer.fit(self, model, datamodule=datamodule)  # type: ignore[arg-type]
+        assert datamodule.sets["reference"].values.shape == (12, 3, 96, 96)
+
+    monkeypatch.setattr("dejavu_torch.cli.train.MapTrainer.fit", taken)
+    main(["train", "fit", "--data.source", "photos.npy", "--trainer.accelerator", "cpu"])
+    assert seen == {"steps": 3000, "every": 500, "epochs": None}
+    assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 20, 24)
 
 
 def test_it_resumes(folder: Path, tmp_path: Path) -> None:
@@ -94,14 +108,12 @@ def test_a_seed_repeats_a_map(folder: Path, tmp_path: Path) -> None:
 
 
 def test_losses_and_a_users_backbone_by_name(folder: Path, tmp_path: Path) -> None:
-    losses = ("phase", "periodicity", "decorrelation", "support")
-    every = [f"--model.losses.{name}=0.5" for name in losses]
-    options = ["--model.backbone", "mine.Plain", "--trainer.default_root_dir", tmp_path]
-    train("fit", *every, *options, "--trainer.log_every_n_steps", 1)
+    options = ["--model.losses.phase=0.5", "--model.backbone", "mine.Plain"]
+    train("fit", *options, "--trainer.default_root_dir", tmp_path, "--trainer.log_every_n_steps", 1)
     seen = figures(tmp_path / "lightning_logs" / "version_0" / "metrics.csv")
-    others = sum(np.array(seen[f"train/{name}"]) for name in losses)
-    np.testing.assert_allclose(seen["train/loss"], np.array(seen["train/place"]) + 0.5 * others, rtol=1e-4)
-    main(["info", f"{tmp_path}/map.safetensors", "--features", "mine.Plain"])
+    expected = np.array(seen["train/place"]) + 0.5 * np.array(seen["train/phase"])
+    np.testing.assert_allclose(seen["train/loss"], expected, rtol=1e-4)
+    assert "mine.Plain" in str(read_map(tmp_path / "map.safetensors")[1]["features"])
 
 
 @pytest.mark.parametrize("backbone", ["torch.nn.Identity", None])
@@ -114,8 +126,7 @@ def test_ready_features(
     train("fit", *options, *(["--model.backbone", backbone] if backbone else []))
     assert warned(caplog) == ([] if backbone else ["these are ready features: the backbone is left out"])
     model = DejaVu.load(tmp_path / "map.safetensors", nn.Identity() if backbone else None)
-    assert (model.map.dimension, model.backbone_bytes) == (6, 0)
-    main(["info", f"{tmp_path}/map.safetensors", *(["--features", backbone] if backbone else [])])
+    assert (model.map.dimension, "backbone" in model.summary().fixed) == (6, False)
 
 
 def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Path) -> None:
@@ -124,12 +135,20 @@ def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Pat
         "data: {source: one.npy, batch_size: 20}\n"
         "trainer: {max_steps: 2, accelerator: cpu, enable_progress_bar: false}\n"
     )
-    options = ["--model.periods.periods", "[11,12,13,17]", "--data.augmentation.rotation", 0]
-    options += ["--model.preprocess.contrast", "patch", "--trainer.default_root_dir", tmp_path / "run"]
+    options = ["--model.mapper.periods.periods", "[11,12,13,17]", "--data.augmentation.rotation", 0]
+    options += [
+        "--model.mapper.reduction",
+        "sum",
+        "--model.preprocess.contrast",
+        "patch",
+        "--trainer.default_root_dir",
+        tmp_path / "run",
+    ]
     train("fit", *options, config=str(tmp_path / "short.yaml"))
     model = DejaVu.load(tmp_path / "run" / "map.safetensors")
     assert [layer.phases for layer in model.map.plan] == [11, 12, 13, 17]
-    assert model.preprocess.contrast == "patch"
+    assert isinstance(model.map, TemplateMap)
+    assert (model.map.reduction, model.preprocess.contrast) == ("sum", "patch")
     assert type(model.features) is SmallCNN
     (config,) = (tmp_path / "run").rglob("config.yaml")
     kept = yaml.safe_load(config.read_text())["data"]["augmentation"]
@@ -150,31 +169,73 @@ def test_a_class_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pyt
     assert "own_classes.Plain" in str(header["features"])
 
 
-def test_a_watched_figure_decides_which_checkpoint_is_the_map(folder: Path, tmp_path: Path) -> None:
+def test_a_users_own_checkpoints_decide_which_is_the_map(folder: Path, tmp_path: Path) -> None:
     text = CONFIG.partition("trainer:")[0]
     text += """
 trainer:
   max_epochs: 4
+  check_val_every_n_epoch: 1
   accelerator: cpu
   enable_progress_bar: false
   callbacks:
   - class_path: ModelCheckpoint
-    init_args: {monitor: val/auc, mode: max, filename: best}
+    init_args: {monitor: val/auc_augmented, mode: max, filename: best}
   - class_path: EarlyStopping
-    init_args: {monitor: val/auc, mode: max, stopping_threshold: 0.0}
+    init_args: {monitor: val/auc_augmented, mode: max, stopping_threshold: 0.0}
 """
     (tmp_path / "watch.yaml").write_text(text)
     train("fit", "--trainer.default_root_dir", tmp_path / "run", config=str(tmp_path / "watch.yaml"))
-    checkpoints = tmp_path / "run" / "checkpoints"
-    state = torch.load(checkpoints / "best.ckpt", weights_only=True)["state_dict"]
+    (best,) = (tmp_path / "run" / "checkpoints").iterdir()  # no other is written
+    checkpoint = torch.load(best, weights_only=True)
     templates = DejaVu.load(tmp_path / "run" / "map.safetensors").map.templates
-    assert torch.equal(templates, state["dejavu.map.templates"])
-    assert torch.load(checkpoints / "last.ckpt", weights_only=True)["epoch"] == 0  # stopped at the first
+    assert torch.equal(templates, checkpoint["state_dict"]["dejavu.map.templates"])
+    assert checkpoint["epoch"] == 0  # stopped at the first
+    train("validate", "--trainer.default_root_dir", tmp_path / "run", config=str(tmp_path / "watch.yaml"))
 
 
-def test_rare_validation_leaves_a_last_checkpoint_all_the_same(folder: Path, tmp_path: Path) -> None:
-    train("fit", "--trainer.check_val_every_n_epoch", 20, "--trainer.default_root_dir", tmp_path)
-    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 4
+def test_checkpoints_can_be_switched_off(folder: Path, tmp_path: Path) -> None:
+    train("fit", "--trainer.enable_checkpointing", "false", "--trainer.default_root_dir", tmp_path)
+    assert not list(tmp_path.rglob("*.ckpt"))
+    assert (tmp_path / "map.safetensors").is_file()
+
+
+def test_export_makes_a_map_of_a_checkpoint(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    last = folder / "run" / "checkpoints" / "last.ckpt"
+    train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "new")
+    written = DejaVu.load(tmp_path / "new" / "map.safetensors")
+    model = DejaVu.load(folder / "run" / "map.safetensors")
+    frames = torch.rand(2, 1, 16, 16)
+    assert torch.equal(written(frames), model(frames))
+    assert written.trained is not None
+    assert written.trained.steps == 4
+    assert f"--map {tmp_path}/new/map.safetensors" in capsys.readouterr().out
+    config = str(folder / "run" / "lightning_logs" / "version_0" / "config.yaml")  # the one of the fit
+    train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "again", config=config)
+    assert (tmp_path / "again" / "map.safetensors").is_file()
+
+
+def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:
+    assert preset_path("train_small").is_file()
+    assert preset_path("train.yaml") == Path("train.yaml")
+    given = ["fit", "--trainer.max_steps", "5", "--config=train_road", "-c", "mine.yaml", "--x=1"]
+    expected = ["fit", f"--config={preset_path('train_road')}", "--config=mine.yaml"]
+    assert configs_first(given) == [*expected, "--trainer.max_steps", "5", "--x=1"]
+    options = [
+        "--trainer.max_steps",
+        2,
+        "--data.source",
+        "sim:aerial?frames=40",
+        "--trainer.accelerator",
+        "cpu",
+    ]
+    options += ["--trainer.precision", "32-true", "--trainer.default_root_dir", tmp_path]
+    main(["train", "fit", *map(str, options), "--config", "train_small"])
+    model = DejaVu.load(tmp_path / "map.safetensors")
+    assert model.trained is not None
+    assert model.trained.steps == 2
+    assert model.features.resize == (64, 64)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("tensorboard") is None, reason="tensorboard is not installed")
@@ -184,21 +245,27 @@ def test_tensorboard_is_used_where_it_is(folder: Path, tmp_path: Path) -> None:
     assert list(tmp_path.rglob("events.out.tfevents*"))
 
 
-def test_help_names_the_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, words in ((["--help"], "{fit,validate,test}"), (["fit", "--help"], "--data.second_truth")):
+def test_help_has_our_options_first(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = (
+        ("{fit,validate,test,export}",),
+        ("--model.backbone", "--data.second_truth", "--trainer.max_steps"),
+    )
+    for arguments, expected in zip((["--help"], ["fit", "--help"]), words, strict=True):
         with pytest.raises(SystemExit) as stop:
             main(["train", *arguments])
         assert stop.value.code == 0
-        told = capsys.readouterr().out
-        assert told.startswith("usage: dejavu train ")
-        assert words in told
+        text = capsys.readouterr().out
+        assert text.startswith("usage: dejavu train ")
+        options = text.partition("options:")[2] if len(expected) > 1 else text
+        places = [options.index(word) for word in expected]
+        assert places == sorted(places)
 
 
 # what it says --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("options", [[], ["--trainer.precision=bf16-mixed"], ["--model.freeze=['']"]])
-def test_a_normal_run_tells_of_its_map_alone(
+def test_a_normal_run_prints_its_map_and_what_to_do_next(
     folder: Path,
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
@@ -212,9 +279,11 @@ def test_a_normal_run_tells_of_its_map_alone(
         assert warned(caplog) == expected
         said = capfd.readouterr()
         assert said.err == ""
-        plan = describe(DejaVu.load(tmp_path / "map.safetensors").certificate)
-        written = f"written to {tmp_path}/map.safetensors; `dejavu compare --map` judges it"
-        assert f"{plan}\n{written}\n" in said.out
+        plan, *rest = said.out.split("written to ")
+        assert plan.endswith(f"{describe(DejaVu.load(tmp_path / 'map.safetensors').summary())}\n")
+        assert "only a second traverse" in rest[0]
+        command = f"dejavu compare one.npy SECOND --map {tmp_path}/map.safetensors --out report"
+        assert rest[0].splitlines()[-1] == command
     # Python itself keeps deprecations to those who develop
     assert [str(w.message) for w in recwarn if not issubclass(w.category, DeprecationWarning)] == []
 
@@ -228,7 +297,7 @@ def test_a_trial_run_leaves_an_earlier_run_as_it_is(
     train("fit", *options, "--trainer.fast_dev_run", "true")
     assert contents(tmp_path / "run") == before
     assert "written to" not in capsys.readouterr().out
-    assert not [told for told in warned(caplog) if "earlier run" in told]
+    assert not [line for line in warned(caplog) if "earlier run" in line]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -244,13 +313,13 @@ def test_a_run_without_batches_leaves_no_map(
     assert not (tmp_path / "map.safetensors").exists()
 
 
-def test_a_run_that_is_over_is_told(folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_that_is_over_warns(folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     last = folder / "run" / "checkpoints" / "last.ckpt"
     train("fit", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path)
-    assert [told for told in warned(caplog) if told.startswith("nothing was trained")]
+    assert [line for line in warned(caplog) if line.startswith("nothing was trained")]
 
 
-def test_an_interrupt_is_one_line_and_130(
+def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     handler = signal.getsignal(signal.SIGINT)
@@ -260,4 +329,10 @@ def test_an_interrupt_is_one_line_and_130(
     finally:
         signal.signal(signal.SIGINT, handler)
     assert stop.value.code == 130
-    assert capsys.readouterr().err == "dejavu: interrupted\n"
+    said = capsys.readouterr()
+    assert said.err == "dejavu: interrupted\n"
+    assert "written to " in said.out
+    last = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
+    model = DejaVu.load(tmp_path / "map.safetensors", import_module("mine").Interrupted())
+    assert model.trained is not None
+    assert model.trained.steps == last["global_step"] == 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from training_config import CONFIG
+from small_training import CONFIG
 
 from dejavu_torch.cli import main
 
@@ -20,12 +20,22 @@ ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
         ("fit", ["--model.backbone", "mine.Late"], ["the loss is nan at step 1", "expected a finite number"]),
         ("fit", ["--model.lr", "1e30"], ["the loss is", "try a lower lr"]),
         ("fit", ["--model.lr", "-1"], ["lr is -1.0", "above 0"]),
-        ("fit", ["--model.losses.phase", "-1"], ["'phase': -1.0", "expected 0 or more"]),
+        ("fit", ["--model.losses.phase", "-1"], ["phase=-1.0", "expected 0 or more"]),
         ("fit", ["--model.freeze", "[nix]"], ["'nix'", "expected one of convolutions, linear"]),
-        ("fit", [*ANOTHER, "--model.periods.periods", "[3,4,7]"], ["5 in 10", "imposes 3 in 6", "7 in 14"]),
+        (
+            "fit",
+            [*ANOTHER, "--model.mapper.periods.periods", "[3,4,7]"],
+            ["5 in 10", "imposes 3 in 6", "7 in 14"],
+        ),
         ("fit", [*ANOTHER, "--model.backbone.dimension", "9"], ["another model", "linear.weight"]),
         ("fit", [*ANOTHER, "--model.backbone", "mine.Plain"], ["convolutions", "not in both"]),
-        ("fit", [*ANOTHER, "--model.train_templates", "false"], ["dejavu.map.templates", "same settings"]),
+        ("fit", [*ANOTHER, "--model.feature_weights", "true"], ["dejavu.map.weights", "same settings"]),
+        ("fit", [*ANOTHER, "--model.mapper.metric", "l2"], ["the map's metric is 'l1'", "expected 'l2'"]),
+        ("export", ["--ckpt_path", "gone.ckpt"], ["gone.ckpt"]),
+        ("export", ["--ckpt_path", "a_file"], ["checkpoint cannot be read"]),
+        ("export", ["--ckpt_path", "foreign.ckpt"], ["the checkpoint is of no training"]),
+        ("export", [*ANOTHER, "--model.backbone.dimension", "9"], ["another model", "linear.weight"]),
+        ("export", ["--trainer.default_root_dir", "never"], ["no checkpoint in never/checkpoints"]),
         ("fit", [*ANOTHER, "--data.source", "thirty.npy"], ["of 40 places", "thirty.npy has 30"]),
         ("fit", ["--ckpt_path", "gone.ckpt"], ["gone.ckpt"]),
         ("fit", ["--ckpt_path", "a_file"], ["checkpoint cannot be read"]),
@@ -39,13 +49,23 @@ ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
         ("fit", ["--trainer.max_epochs", "0"], ["no steps"]),
         ("fit", ["--trainer.overfit_batches", "2"], ["overfit_batches", "trainer.limit_train_batches"]),
         ("fit", ["--data.validation", "short.npy"], ["short.npy has 2 frames", "tolerance is 2", "longer"]),
-        ("fit", ["--data.validation", "thirty.npy"], ["30 frames of thirty.npy", "data.validation_truth"]),
-        ("test", ["--data.query", "large.npy"], ["(1, 24, 24)", "(1, 16, 16)", "data.resize"]),
+        (
+            "fit",
+            ["--data.validation", "thirty.npy"],
+            ["thirty.npy: it has 30 frames", "data.validation_truth"],
+        ),
+        ("test", ["--data.query", "colour.npy"], ["(3, 16, 16)", "(1, 16, 16)", "the same channels"]),
         ("test", [], ["nothing to test on", "data.query"]),
-        ("test", ["--trainer.default_root_dir", "never"], ["no never/checkpoints/last.ckpt", "--ckpt_path"]),
-        ("validate", ["--trainer.default_root_dir", "never"], ["no never/checkpoints/last.ckpt"]),
+        (
+            "test",
+            ["--trainer.default_root_dir", "never"],
+            ["no checkpoint in never/checkpoints", "--ckpt_path"],
+        ),
+        ("validate", ["--trainer.default_root_dir", "never"], ["no checkpoint in never/checkpoints"]),
         ("fit", ["--data.source", "gone.npy"], ["gone.npy is not there", "expected a folder"]),
         ("fit", ["--data.source", "empty"], ["empty holds no images"]),
+        ("fit", ["--data.source", "[1,2]"], ["source is of type list", "expected a path"]),
+        ("fit", ["--data.source", "2021"], ["2021 is not there", "expected a folder"]),
         ("fit", ["--data.source", "single.npy"], ["single.npy has 1 frame and", "longer"]),
         ("fit", ["--data.source", "single.npy", "--data.tolerance", "0"], ["single.npy has 1 frame and"]),
         ("fit", ["--trainer.default_root_dir", "a_file"], ["a_file cannot be made a folder"]),
@@ -59,6 +79,7 @@ ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
         ("fit", ["--model.backbone", "mine.Nothing"], ["--model.backbone", "no attribute 'Nothing'"]),
         ("fit", ["--clop", "3"], ["--clop"]),
         ("fit", ["--config", "gone.yaml"], ["gone.yaml", "does not exist"]),
+        ("fit", ["--config", "train_smal"], ["train_smal", "does not exist"]),
         ("predict", [], ["'predict'", "fit"]),
     ],
     ids=str,
@@ -78,7 +99,7 @@ def test_a_mistake_is_one_line(
         ("model:", "model:\n  clop: 3", ["'model.clop'"]),
         ("tolerance: 2", "tolerance: 2, augmentation: {clop: 3}", ["data.augmentation", "'clop'"]),
         ("source: one.npy, ", "", ["required: --data.source"]),
-        ("max_steps: 4, ", "", ["no end", "trainer.max_epochs"]),
+        ("max_steps: 4, ", "max_steps: -1, ", ["no end", "trainer.max_epochs"]),
         ("data: {", "data: [", ["parsing config"]),
     ],
     ids=str,

@@ -1,9 +1,8 @@
-"""Learned whitening in closed form, and the code behind it."""
+"""Learned whitening in closed form."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,10 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from dejavu_torch import DejaVu
-from dejavu_torch.features.coder import SHRINKAGE, Coder, learned_whitening
-from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.periods.imposed import ImposedPeriods
+from dejavu_torch.features.embedding import Coder
+from dejavu_torch.features.whitening import SHRINKAGE, learned_whitening
 
 
 def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -26,7 +23,7 @@ def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 @given(st.integers(0, 99), st.integers(1, 6))
-def test_what_changes_is_alike_in_all_directions(seed: int, kept: int) -> None:
+def test_changes_are_alike_in_all_directions(seed: int, kept: int) -> None:
     views, places = pairs(seed=seed)
     mean, projection = learned_whitening(views, places, kept)
     change = (views - places).double() / 2
@@ -86,56 +83,3 @@ def test_what_cannot_be_whitened(views: Tensor, places: Tensor, kept: int, words
             coder.whiten(views, places)
         assert not coder.whitened
         assert torch.equal(coder.projection, torch.eye(2))
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [{"inputs": 0}, {"dimension": 0}, {"hidden": 0}, {"kept": 0}, {"noise": -1.0}, {"noise": math.inf}],
-)
-def test_settings_out_of_range(settings: dict[str, float]) -> None:
-    with refused("Coder got", "expected at least 1 each, the noise 0 or more"):
-        Coder(**{"inputs": 6, "dimension": 3} | settings)  # type: ignore[arg-type]
-
-
-def test_components_are_whitened_and_of_one_length() -> None:
-    views, places = pairs()
-    coder = Coder(6, 3, hidden=5, kept=4).eval()
-    coder.whiten(views, places)
-    mean, projection = learned_whitening(views, places, 4)
-    components = (views - mean) @ projection
-    components = components * (2 / components.norm(dim=1, keepdim=True))
-    torch.testing.assert_close(coder(views), coder.layers(components))
-    torch.testing.assert_close(coder(mean + 7 * (views - mean)), coder(views), rtol=1e-4, atol=1e-4)
-
-
-def test_noise_is_for_training_alone() -> None:
-    views, _ = pairs()
-    coder = Coder(6, 3, hidden=5, noise=0.5)
-    coder.layers[1].momentum = 0.0  # its statistics stay
-    assert not torch.equal(coder(views), coder(views))
-    coder.noise = 0.0
-    assert torch.equal(coder(views), coder(views))
-    coder.noise = 0.5
-    coder.eval()
-    assert torch.equal(coder(views), coder(views))
-
-
-def test_gradients_reach_the_descriptor() -> None:
-    coder = Coder(4, 2, hidden=3, noise=0.0).double().eval()
-    views = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(coder, (views,))
-
-
-def test_a_map_brings_the_whitening_back(tmp_path: Path) -> None:
-    frames = torch.rand(12, 3, 16, 16)
-    net = Embedding(nn.Conv2d(3, 4, 3), dimension=5, resize=(16, 16), grid=2, hidden=6, noise=0.3, kept=7)
-    assert isinstance(net.linear, Coder)
-    net.linear.whiten(*net.describe(torch.rand(40, 3, 16, 16)).detach().split(20))
-    net.eval()
-    model = DejaVu(net, ImposedPeriods([3], bin=1)).learn(frames)
-    model.save(tmp_path / "map.safetensors")
-    empty = Embedding(nn.Conv2d(3, 4, 3), dimension=5, resize=(16, 16), grid=2, hidden=6, noise=0.3, kept=7)
-    again = DejaVu.load(tmp_path / "map.safetensors", features=empty)
-    assert torch.equal(again(frames), model(frames))
-    assert isinstance(empty.linear, Coder)
-    assert empty.linear.whitened

@@ -1,0 +1,254 @@
+"""The stages of a training: a descriptor that tells places apart, its whitening, and each place's code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.database.distance import phase_distances
+from dejavu_torch.features.embedding import Coder, Embedding, to_length
+from dejavu_torch.features.extract import features_of
+from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames
+from dejavu_torch.training.losses import Losses, place_cross_entropy
+from dejavu_torch.types import InputError
+
+if TYPE_CHECKING:
+    from dejavu_torch.training.task import PlaceRecognitionTask
+
+ROUNDS = 10  # views of each training frame, for whitening and code
+NUMBERS = 2**27  # of all views at most, but for one of each frame: half a gigabyte
+BATCH = 128  # views of a step: they cost little
+TEMPERATURE = 0.1  # of cosine distances, at the start
+NOISE = 0.5  # on descriptors in training, beside components of about 1
+
+
+class Views(NamedTuple):
+    """descriptors: (n,K) of augmented training frames. positives: (n,R) int64, the places that they show."""
+
+    descriptors: Tensor
+    positives: Tensor
+
+
+class Stage(nn.Module):
+    """One part of a training. The task runs them one behind the other, each with an optimizer of its own.
+
+    Args:
+        share: of the steps of the whole training; the last stage takes the steps that are left.
+    """
+
+    def __init__(self, share: float = 0.0) -> None:
+        super().__init__()
+        self.share = share
+
+    def begin(self, task: PlaceRecognitionTask) -> None:
+        """Make what the stage works with; called again where a training is resumed in it."""
+
+    def end(self, task: PlaceRecognitionTask) -> None:
+        """Leave what the next stage needs."""
+
+    def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
+        """The parameters that the stage trains."""
+        return []
+
+    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+        """The losses of a batch."""
+        raise NotImplementedError(f"{type(self).__name__} takes no steps")
+
+
+class DescriptorStage(Stage):
+    """The network of an `Embedding` learns to tell stretches of the route apart.
+
+    Place cross-entropy over the cosine distances of its descriptor to one proxy for each stretch, as long as
+    the tolerance.
+    """
+
+    every: Tensor
+
+    def __init__(self, share: float, inputs: int) -> None:
+        super().__init__(share)
+        self.proxies = nn.Parameter(torch.zeros(0, inputs))
+        self.log_temperature = nn.Parameter(torch.tensor(math.log(TEMPERATURE)))
+        self.register_buffer("every", torch.tensor(1))  # places of a stretch
+
+    def begin(self, task: PlaceRecognitionTask) -> None:
+        if not len(self.proxies):
+            self.every.fill_(max(1, task.data.tolerance))
+            count = -(-len(task.data.sets["reference"]) // int(self.every))
+            self.proxies = nn.Parameter(torch.randn(count, self.proxies.shape[1], device=task.device))
+
+    def end(self, task: PlaceRecognitionTask) -> None:
+        self.proxies = nn.Parameter(self.proxies.detach()[:0])  # no later checkpoint needs them
+
+    def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
+        return [*_trainable(embedding_of(task).network), *self.parameters()]
+
+    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+        frames, places = task.data.augmented(batch.frames, task.data.clip), len(task.data.sets["reference"])
+        descriptors = to_length(embedding_of(task).describe(task.dejavu.preprocess(frames)).float())
+        noisy = descriptors + NOISE * torch.randn_like(descriptors)
+        distances = phase_distances(noisy, self.proxies, "cosine")
+        stretch = torch.arange(places, device=distances.device) // self.every
+        scores, temperature = distances.index_select(1, stretch), self.log_temperature.exp()
+        found = place_cross_entropy(scores, batch.truth.positives, task.data.tolerance, temperature)
+        return Losses(found.loss, {"descriptor": found.loss}, found.left_out)
+
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
+        given = state.get(f"{prefix}proxies")
+        if given is not None:  # however many there are
+            self.proxies = nn.Parameter(torch.empty_like(given, device=self.proxies.device))
+        super()._load_from_state_dict(state, prefix, *args)
+
+
+class WhiteningStage(Stage):
+    """The descriptor is whitened by what the augmentation and a second traverse change in it; no steps."""
+
+    def end(self, task: PlaceRecognitionTask) -> None:
+        embedding = embedding_of(task)
+        task.views = describe_views(task)
+        with in_mode(embedding, False):
+            places = stored_features(task, lambda f: embedding.describe(task.dejavu.preprocess(f)))
+        _coder(embedding).whiten(task.views.descriptors, places[task.views.positives[:, 0]])
+
+
+class CodeStage(Stage):
+    """Features learn to repeat with the periods of the map's layers, together with its templates.
+
+    A whitened descriptor stays as it is: views of all training frames are described once, and the code behind
+    it is learned from them. Of any other backbone the whole is trained, on augmented frames.
+    """
+
+    def begin(self, task: PlaceRecognitionTask) -> None:
+        if has_descriptor(task.dejavu.features):
+            network = embedding_of(task).network
+            if not any(module is network for module in task.frozen):
+                task.frozen.append(network.eval())
+            task.views = describe_views(task) if task.views is None else task.views
+        if not task.dejavu.map.places:
+            task.relearn()
+
+    def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
+        features = task.dejavu.features
+        learns = _coder(embedding_of(task)) if has_descriptor(features) else features
+        return [task.log_temperature, *_trainable(learns), *task.route.parameters()]
+
+    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+        if task.views is None:
+            frames, positives = task.data.augmented(batch.frames, task.data.clip), batch.truth.positives
+            features = features_of(frames, task.dejavu.describe, "the batch")
+        else:
+            n, device = len(task.views.descriptors), task.views.descriptors.device
+            drawn = torch.randint(n, (BATCH,), device=device)
+            features = embedding_of(task).code(task.views.descriptors[drawn])
+            positives = task.views.positives[drawn]
+        distances = task.route.distances(features)
+        temperature, tolerance = task.log_temperature.exp(), task.data.tolerance
+        return task.losses(distances, task.scores(distances), positives, task.route, temperature, tolerance)
+
+
+def stages_of(backbone: nn.Module, descriptor: float) -> list[Stage]:
+    """The stages that a backbone needs.
+
+    An `Embedding` with a hidden layer learns its descriptor, which is whitened, and then its code. A network
+    without parameters to train, such as HOG, is whitened at once; a whitened one, as another map brings, is
+    left alone. Other backbones have the last stage only.
+
+    Args:
+        descriptor: share of the steps in which a descriptor is learned.
+    """
+    if not isinstance(backbone, Embedding) or backbone.coder is None or backbone.coder.whitened:
+        return [CodeStage()]
+    if not _trainable(backbone.network):
+        return [WhiteningStage(), CodeStage()]
+    return [DescriptorStage(descriptor, len(backbone.coder.mean)), WhiteningStage(), CodeStage()]
+
+
+def has_descriptor(backbone: nn.Module) -> bool:
+    """Whether a backbone is an `Embedding` whose code is learned from a whitened descriptor."""
+    return isinstance(backbone, Embedding) and backbone.coder is not None
+
+
+def embedding_of(task: PlaceRecognitionTask) -> Embedding:
+    """The task's backbone, where its stages are of an `Embedding`."""
+    return cast(Embedding, task.dejavu.features)
+
+
+def _coder(embedding: Embedding) -> Coder:
+    return cast(Coder, embedding.coder)
+
+
+def _trainable(module: nn.Module) -> list[nn.Parameter]:
+    return [parameter for parameter in module.parameters() if parameter.requires_grad]
+
+
+@torch.no_grad()
+def describe_views(task: PlaceRecognitionTask) -> Views:
+    """Descriptors of all training frames of known places, under several augmentations of each."""
+    data, embedding = task.data, embedding_of(task)
+    loader = data.train_dataloader()
+    frames = len(cast(StoredFrames, loader.dataset))
+    rounds = min(ROUNDS, NUMBERS // (len(_coder(embedding).mean) * frames)) if data.augmentation.acts else 1
+    descriptors, positives = [], []
+    with in_mode(embedding, False):
+        for _ in range(max(1, rounds)):
+            for batch in loader:
+                known = batch.truth.positives[:, 0] >= 0
+                if known.any():
+                    views = task.dejavu.preprocess(
+                        data.augmented(batch.frames.to(task.device), data.clip)[known]
+                    )
+                    descriptors.append(embedding.describe(views).float())
+                    positives.append(batch.truth.positives[known].to(task.device))
+    return Views(torch.cat(descriptors), torch.cat(positives))
+
+
+@torch.no_grad()
+def stored_features(
+    task: PlaceRecognitionTask, describe: Callable[[Tensor], Tensor], shuffled: bool = False
+) -> Tensor:
+    """Features of the stored reference frames, in 32 bits and in their order.
+
+    Args:
+        describe: makes features of frames.
+        shuffled: whether batches hold frames from all over the route, as those of training do, so that
+            running statistics can be gathered from them.
+
+    Shape: -> (N,D).
+
+    Raises:
+        InputError: a backbone that does not take the frames, or makes NaN.
+    """
+    values, maker = task.data.sets["reference"].values, type(task.dejavu.features).__name__
+    order = torch.randperm(len(values)) if shuffled else torch.arange(len(values))
+    count = min(-(-len(order) // task.dejavu.batch_size), len(order) // 2)  # none of a single frame
+    features = torch.zeros(0, device=task.device)
+    for batch in order.tensor_split(count):
+        try:
+            with torch.autocast(task.device.type, enabled=False):
+                part = features_of(as_frames(values[batch]).to(task.device), describe, "the batch")
+        except RuntimeError as error:
+            problem = " ".join(str(error).split())[:200]
+            raise InputError(f"{maker} does not take frames {tuple(values.shape[1:])}: {problem}") from error
+        if not len(features):
+            features = part.new_empty(len(values), part.shape[1])
+        features[batch.to(task.device)] = part
+    if not features.isfinite().all():
+        name = task.data.reference.name
+        raise InputError(f"{maker} makes NaN or infinite features of {name}; expected finite numbers")
+    return features
+
+
+@contextmanager
+def in_mode(module: nn.Module, training: bool) -> Iterator[None]:
+    """The module in training or eval mode; afterwards every part is in its own mode again."""
+    modes = [(part, part.training) for part in module.modules()]
+    module.train(training)
+    try:
+        yield
+    finally:
+        for part, before in modes:
+            part.training = before

@@ -1,0 +1,168 @@
+"""A training of seconds: footage, backbone, task and trainer; and the config and classes of a user."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import Fixed
+from pytorch_lightning import Callback, Trainer
+from torch import Tensor, nn
+
+from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
+from dejavu_torch.cli import main
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.export import MapExport
+from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.types import FrequencyLayer, Plan
+
+FRAMES = 40
+
+
+def footage(noise: float = 0.0, frames: int = FRAMES, side: int = 16) -> Tensor:
+    """(N,side,side) uint8, a window slid along a smooth strip by 2 pixels a frame."""
+    random = torch.Generator().manual_seed(0)
+    strip = torch.rand(1, 1, 4, frames, generator=random)
+    strip = nn.functional.interpolate(strip, (side, 2 * frames + side), mode="bicubic")[0, 0]
+    windows = torch.stack([strip[:, 2 * i : 2 * i + side] for i in range(frames)])
+    noisy = windows + noise * torch.randn(windows.shape, generator=random)
+    return (255 * noisy.clamp(0, 1)).byte()
+
+
+def backbone(dimension: int = 8) -> SmallCNN:
+    return SmallCNN(dimension, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
+
+
+def mapper(periods: PeriodFinder | None = None, **settings: Any) -> TemplateMapper:
+    return TemplateMapper(ImposedPeriods([3, 4, 5], bin=2) if periods is None else periods, **settings)
+
+
+def new_task(**settings: Any) -> PlaceRecognitionTask:
+    return PlaceRecognitionTask(**{"backbone": backbone(), "mapper": mapper()} | settings)
+
+
+def data_of(source: Tensor | None = None, **settings: Any) -> RouteData:
+    given = {"tolerance": 2, "batch_size": 16} | settings
+    return RouteData(ArrayTraverse(footage() if source is None else source), **given)
+
+
+def trainer(folder: Path, *callbacks: Callback, **settings: Any) -> Trainer:
+    given = {"max_steps": 4, "enable_checkpointing": bool(callbacks)} | settings
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    return Trainer(
+        accelerator="cpu", default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given
+    )
+
+
+def fit(folder: Path, task: PlaceRecognitionTask, data: RouteData, **settings: Any) -> DejaVu:
+    """The map that a training writes."""
+    trainer(folder, **settings).fit(task, data)
+    return DejaVu.load(folder / "map.safetensors")
+
+
+def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """The package's warnings."""
+    return [record.getMessage() for record in caplog.records if record.name == "dejavu_torch"]
+
+
+def recall(model: DejaVu, query: Tensor) -> float:
+    truth = torch.arange(len(query))[:, None]
+    return evaluate(model.localize(ArrayTraverse(query)), truth, tolerance=2).recall_at_1
+
+
+def assert_same_scores(task: PlaceRecognitionTask, model: DejaVu) -> None:
+    """Of the task, of its map, and of the exported program."""
+    frames = footage(0.1)[:7, None] / 255
+    with torch.no_grad():
+        scores = task.eval()(frames)
+        torch.testing.assert_close(model(frames), scores, rtol=1e-5, atol=1e-5)
+        program = torch.export.export(
+            model, (frames[:2],), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}}
+        )
+        torch.testing.assert_close(program.module()(frames), scores, rtol=1e-5, atol=1e-5)
+    assert scores.shape == (7, FRAMES)
+    assert not list(model.map.parameters())
+
+
+class Later(Fixed):
+    """Other layers whenever it is asked again."""
+
+    asked = 0
+
+    def plan(self, features: Tensor) -> Plan:
+        self.asked += 1
+        periods = (3, 4) if self.asked == 1 else (5, 7, 9)
+        return tuple(FrequencyLayer(Fraction(p), p, 0, len(features), tuple(range(8))) for p in periods)
+
+
+class Stop(Callback):
+    """Saves a checkpoint after some steps, and ends the training, by an exception where one is given."""
+
+    def __init__(self, steps: int, path: Path | None = None, exception: BaseException | None = None) -> None:
+        self.steps, self.path, self.exception = steps, path, exception
+
+    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+        if trainer.global_step == self.steps:
+            if self.path is not None:
+                trainer.save_checkpoint(self.path)
+            if self.exception is not None:
+                raise self.exception
+            trainer.should_stop = True
+
+
+CONFIG = """
+model:
+  backbone:
+    class_path: dejavu_torch.features.cnn.SmallCNN
+    init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
+  mapper:
+    class_path: dejavu_torch.TemplateMapper
+    init_args:
+      periods:
+        class_path: dejavu_torch.ImposedPeriods
+        init_args: {periods: [3, 4, 5], bin: 2}
+data: {source: one.npy, batch_size: 20, tolerance: 2}
+trainer: {max_steps: 4, accelerator: cpu, enable_progress_bar: false, default_root_dir: run}
+"""
+MINE = """
+import torch
+from torch import nn
+
+class Plain(nn.Module):
+    def __init__(self, dimension: int = 8) -> None:
+        super().__init__()
+        self.linear = nn.Linear(256, dimension)
+        self.calls = 0
+    def forward(self, frames):
+        self.calls += self.training
+        return self.linear(frames.flatten(1))
+
+class Deep(Plain):
+    def forward(self, frames):
+        return super().forward(frames)[..., None]
+
+class Broken(nn.Module):
+    def __init__(self) -> None:
+        raise RuntimeError("no weights\\nto be had")
+
+class Late(Plain):
+    def forward(self, frames):
+        return super().forward(frames) * (float("nan") if self.calls > 2 else 1.0)
+
+class Interrupted(Plain):
+    def forward(self, frames):
+        if self.calls > 3:
+            raise KeyboardInterrupt
+        return super().forward(frames)
+"""
+
+
+def train(command: str, *options: object, config: str = "train.yaml") -> None:
+    main(["train", command, "--config", config, *map(str, options)])
