@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
 from dejavu_torch.types import InputError
@@ -121,6 +120,8 @@ class SmallCNN(nn.Module):
                 f"as channels={self.channels} says"
             )
         if tuple(frames.shape[-2:]) != self.resize:
+            from kornia.geometry.transform import resize as antialiased_resize
+
             frames = antialiased_resize(frames, self.resize, antialias=True)
         if self.cell:
             frames = local_contrast(frames, self.cell)

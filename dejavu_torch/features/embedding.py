@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import torch
-from kornia.color import rgb_to_grayscale
-from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
@@ -107,9 +105,13 @@ class Embedding(nn.Module):
         if frames.ndim != 4 or frames.shape[1] not in (1, 3):
             raise InputError(f"Embedding got frames {tuple(frames.shape)}; expected (B,1,H,W) or (B,3,H,W)")
         if self.channels == 1 and frames.shape[1] == 3:
+            from kornia.color import rgb_to_grayscale
+
             frames = rgb_to_grayscale(frames)
         frames = frames.expand(-1, self.channels, -1, -1)
         if tuple(frames.shape[-2:]) != self.resize:
+            from kornia.geometry.transform import resize as antialiased_resize
+
             frames = antialiased_resize(frames, self.resize, antialias=True)
         if self.cell:
             frames = local_contrast(frames, self.cell)

@@ -6,8 +6,6 @@ import math
 from typing import Literal, get_args
 
 import torch
-from kornia.filters import spatial_gradient
-from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
 from dejavu_torch.types import InputError
@@ -38,6 +36,8 @@ def gradients(frames: Tensor, gradient: Gradient = "central") -> tuple[Tensor, T
     Shape: (B,C,H,W) -> two of (B,H,W).
     """
     if gradient == "sobel":
+        from kornia.filters import spatial_gradient
+
         columns, rows = spatial_gradient(frames, "sobel").unbind(2)  # kornia gives x, then y
     else:
         rows = torch.zeros_like(frames)
@@ -163,6 +163,8 @@ def hog(
 
     def features(part: Tensor) -> Tensor:
         if tuple(part.shape[-2:]) != (height, width):
+            from kornia.geometry.transform import resize as antialiased_resize
+
             part = antialiased_resize(part, (height, width), antialias=True)
         histograms = cell_histograms(*gradients(part, gradient), orientations, cell, bins)
         blocks = histograms.unfold(1, block, 1).unfold(2, block, 1)  # (B,by,bx,O,block,block)

@@ -6,8 +6,6 @@ import math
 from typing import Literal, get_args
 
 import torch
-from kornia.color import rgb_to_grayscale
-from kornia.enhance import equalize_clahe
 from torch import Tensor, nn
 
 from dejavu_torch.features.hog import parts
@@ -79,6 +77,8 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
     if count != 3:
         raise InputError(f"channel {name!r} of frames with {count} channels; expected the 3 of RGB")
     if name == "grey":
+        from kornia.color import rgb_to_grayscale
+
         grey: Tensor = rgb_to_grayscale(frames)
         return grey
     first, *second = (frames[:, COLOURS.index(colour), None] for colour in name.split("-"))
@@ -170,6 +170,8 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
             f"clahe got frames of {height} x {width} pixels for a grid of {rows} x {columns} tiles; "
             f"expected at least {rows + 1} x {columns + 1} pixels"
         )
+    from kornia.enhance import equalize_clahe
+
     fixed = frames.detach()
     if not ((fixed >= 0) & (fixed <= 1)).all():
         low, high = fixed.min().item(), fixed.max().item()

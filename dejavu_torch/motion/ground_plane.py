@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-from kornia.geometry.transform import get_perspective_transform, warp_perspective
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, pad
 
@@ -98,6 +97,8 @@ def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, 
     right, bottom = width - 1.0, height - 1.0
     above = grey.new_tensor([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
     # the other way round it fails where the frame's first pixel lies on the patch's horizon
+    from kornia.geometry.transform import get_perspective_transform, warp_perspective
+
     matrix = torch.linalg.inv(get_perspective_transform(above[None], seen[None]))
     patch: Tensor = warp_perspective(grey, matrix.expand(len(grey), 3, 3), (height, width))
     return patch
