@@ -111,8 +111,8 @@ def run_localize(
     elif model.threshold is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
     print(f"{total} queries, {accepted} accepted; written to {out}")
-    known = ["--map", map] if model.step is not None else []
-    _print_next("evaluate", out, "--truth", "TRUTH", *known, "--out", "scores")
+    table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
+    _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
 
 def run_compare(
@@ -191,9 +191,9 @@ def run_evaluate(
     from dejavu_torch.evaluation.report import write_report
     from dejavu_torch.experiments.evaluate import evaluate_file
 
-    sources = [None if source is None else open_source(source) for source in (reference, query)]
+    first, second = (None if source is None else open_source(source) for source in (reference, query))
     _make_report_folder(out, reference, query)
-    result = evaluate_file(matches, truth, tolerance, interpolate, *sources, map)
+    result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map)
     write_report(out, result.report, result.pictures, f"{matches} evaluated by {truth}", command)
     _print_scores(result.report, out)
 
