@@ -6,7 +6,7 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ from dejavu_torch.data.source import open_source
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report
@@ -41,7 +41,7 @@ def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, c
     print(f"learning {reference.name}, then finding {query.name} on it")
     result = compare(reference, query, model=model, progress=True)
     result.model.save(out / KEPT_MAP)
-    _publish(result, (reference, query), out, "dejavu demo: the built-in route", command)
+    _publish(result, out, "dejavu demo: the built-in route", command)
 
 
 def run_learn(source: str, *, map: Path, model: DejaVu) -> None:
@@ -82,8 +82,6 @@ def run_localize(
         as_is: take the frames as they are, though the map's are resampled
         features: class of the map's features, if not ours
     """
-    from dejavu_torch.evaluation.matches import write_matches
-
     check_output_file(out)
     model = DejaVu.load(map, features)
     if corners is not None:
@@ -95,17 +93,11 @@ def run_localize(
     if as_is:
         model.velocity = None
     model.threshold = model.threshold if threshold is None else threshold
-    reference = query = open_source(source)
+    query = open_source(source)
     if model.step is not None:
-        query = model.resample(reference, model.step, progress=True)
+        query = model.resample(query, model.step, progress=True)
         _print_steps(query)
-    total, accepted = write_matches(
-        out,
-        model.matches(query, "localizing"),
-        getattr(query, "frame", None),
-        model.map.frame_of,
-        reference.frame_name,
-    )
+    total, accepted = _write_matches(out, model.matches(query, "localizing"), query, model)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
     elif model.threshold is None:
@@ -161,7 +153,7 @@ def run_compare(
     )
     if map is None or map.resolve() != (out / KEPT_MAP).resolve():
         result.model.save(out / KEPT_MAP)
-    _publish(result, sources, out, f"{query} found on {reference}", command)
+    _publish(result, out, f"{query} found on {reference}", command)
 
 
 def run_evaluate(
@@ -230,7 +222,7 @@ def run_reproduce(
         make_output_folder(out / name)
         title, plan = f"dejavu reproduce: {name}", str(result.model.summary())
         write_report(out / name, result.report, result.pictures, title, command, plan)
-        _write_matches(out / name / "matches.csv", result, None)
+        _write_matches(out / name / "matches.csv", [result.match], result.query, result.model)
         reports[name] = result.report
     rows, notes = section_five(reports), [*route_lines(reports), *boundary_lines(reports), FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
@@ -329,27 +321,26 @@ def _print_next(*words: str | Path) -> None:
     print(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
 
-def _publish(
-    result: Comparison, sources: tuple[Traverse, Traverse], out: Path, title: str, command: str
-) -> None:
+def _publish(result: Comparison, out: Path, title: str, command: str) -> None:
     """Write matches and report of a comparison, and print its scores."""
     from dejavu_torch.evaluation.report import write_report
 
     _print_map(result.model)
     if result.report.ours.scores is None:
         print("nothing tells which places are right, see --truth: matches and pictures, no scores")
-    _write_matches(out / "matches.csv", result, sources)
+    _write_matches(out / "matches.csv", [result.match], result.query, result.model)
     write_report(out, result.report, result.pictures, title, command, str(result.model.summary()))
     _print_scores(result.report, out)
 
 
-def _write_matches(path: Path, result: Comparison, sources: tuple[Traverse, Traverse] | None) -> None:
+def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model: DejaVu) -> tuple[int, int]:
+    """Write the matches of a query that the map was asked for; returns how many (queries, accepted)."""
     from dejavu_torch.evaluation.matches import write_matches
 
-    names = [None, None] if sources is None else [source.frame_name for source in reversed(sources)]
-    write_matches(
-        path, [result.match], getattr(result.query, "frame", None), result.model.map.frame_of, *names
-    )
+    frames, source = None, query
+    if isinstance(query, ResampledTraverse):
+        frames, source = query.frame, query.traverse
+    return write_matches(path, matches, frames, model.map.frame_of, source.frame_name, model.frame_name)
 
 
 def _print_scores(report: Report, out: Path) -> None:
