@@ -33,6 +33,7 @@ def matches(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return folder / "matches.csv"
 
 
+@pytest.mark.slow
 def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(
     pair: tuple[Path, Path], matches: Path, tmp_path: Path
 ) -> None:
@@ -186,6 +187,7 @@ def test_a_reference_tells_evaluate_where_the_map_ends(
     assert report_of(tmp_path / "evaluate")["places"] is None
 
 
+@pytest.mark.slow
 def test_the_threshold_that_is_named_accepts_right_places_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -243,7 +245,7 @@ def test_frames_of_other_sizes_are_told_before_learning_and_in_one_line(
     error = fails(capsys, "localize", tmp_path / "map.safetensors", tmp_path / "large.npy", *options)
     assert "frames of 1 x 48 x 48 give 900 features; the map expects 324" in error
     run("info", tmp_path / "map.safetensors")
-    assert "learnt from frames of 1 x 32 x 32" in capsys.readouterr().out
+    assert "frames of 1 x 32 x 32" in capsys.readouterr().out
 
 
 def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 import docstring_parser
@@ -35,18 +35,19 @@ class UsageError(InputError):
     """A command line or config file that the commands do not understand."""
 
 
-def innermost(error: BaseException) -> BaseException:
-    """The exception that started a chain; what jsonargparse wraps around it says the same at more length."""
-    cause = error.__cause__ or error.__context__
-    return error if cause is None else innermost(cause)
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception and those that it was raised from; jsonargparse wraps each in one that says more."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def refusal(error: Exception) -> InputError:
     """What a part's constructor refused."""
-    cause = innermost(error)
-    if isinstance(cause, InputError):
-        return cause
-    return InputError(f"a part cannot be built: {one_line(cause)[:LONGEST]}")
+    *_, first = causes(error)
+    if isinstance(first, InputError):
+        return first
+    return InputError(f"a part cannot be built: {one_line(first)[:LONGEST]}")
 
 
 def one_line(text: object) -> str:
@@ -71,7 +72,9 @@ class Parser(jsonargparse.ArgumentParser):
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         told = one_line(message)
         if ex is not None and len(told) > LONGEST // 2:  # a complaint for every type that could be meant
-            told = one_line(f"{message.splitlines()[0]} {innermost(ex)}")
+            *_, first = causes(ex)
+            part = next((cause for cause in causes(ex) if isinstance(cause, UsageError)), first)
+            told = one_line(f"{message.splitlines()[0]} {part}")
         raise UsageError(told if len(told) < LONGEST else f"{told[:LONGEST]} ...") from ex
 
 
