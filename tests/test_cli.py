@@ -152,6 +152,18 @@ def test_features_of_another_package_are_named_again_to_localize(
     assert len((tmp_path / "m.csv").read_text().splitlines()) == 65
 
 
+def test_classes_of_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "my_network.py").write_text("import torch\nclass Net(torch.nn.Flatten):\n    pass\n")
+    np.save(tmp_path / "frames.npy", frames(64))
+    code = "from dejavu_torch.cli import main; main()"
+    words = ["learn", "frames.npy", "--map", "a.safetensors", "--features", "my_network.Net"]
+    # -P: as an installed command, which does not look there by itself
+    python = [sys.executable, "-P", "-c", code, *words]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    subprocess.run(python, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert (tmp_path / "a.safetensors").is_file()
+
+
 def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     noise = np.random.default_rng(0)
     for name in ("a", "b"):

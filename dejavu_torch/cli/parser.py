@@ -69,6 +69,13 @@ class Parser(jsonargparse.ArgumentParser):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, formatter_class=HelpFormatter, **kwargs)
 
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, *rest: Any, **settings: Any
+    ) -> Any:
+        # a null for a part of a part is handed to the parser of that part as None
+        words = args and [f"{word[:-4]}null" if word.endswith("=None") else word for word in args]
+        return super().parse_args(words, *rest, **settings)
+
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         told = one_line(message)
         if ex is not None and len(told) > LONGEST // 2:  # a complaint for every type that could be meant

@@ -1,0 +1,160 @@
+"""Resampling by distance, as a user of the commands meets it."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, report_of
+from footage import QUERY, REFERENCE, SIDE, STEP, camera, everything, footage
+from helpers import template_model
+
+from dejavu_torch import DejaVu
+from dejavu_torch.cli import main
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.experiments.compare import compare
+
+CORNERS = ["--velocity.corners", "[[0,0],[1,0],[1,1],[0,1]]", "--velocity.size", f"[{SIDE},{SIDE}]"]
+OPTIONS = [*CORNERS, "--velocity.step", str(STEP), "--mapper.periods.false_alarm", "null"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Footage of both traverses, their ground truth, a map and its matches."""
+    folder = tmp_path_factory.mktemp("resampled")
+    for name, where, noise in (("reference", REFERENCE, 0.0), ("query", QUERY, 0.02)):
+        np.save(folder / f"{name}.npy", (255 * footage(where, noise)[:, 0]).byte().numpy())
+    nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
+    rows = "".join(f"{q},{p}\n" for q, p in enumerate(nearest))
+    (folder / "truth.csv").write_text("query,place\n" + rows)
+    main(["learn", f"{folder}/reference.npy", "--map", f"{folder}/m.safetensors", *OPTIONS])
+    localize(folder, "matches.csv")
+    return folder
+
+
+def localize(folder: Path, name: str, *options: str) -> list[dict[str, str]]:
+    command = ["localize", f"{folder}/m.safetensors", f"{folder}/query.npy", "--out", f"{folder}/{name}"]
+    main([*command, *options])
+    return list(csv.DictReader((folder / name).open()))
+
+
+def evaluate_file(folder: Path, truth: str, out: Path, *options: str) -> dict:
+    main(["evaluate", f"{folder}/matches.csv", "--truth", f"{folder}/{truth}", "--out", str(out), *options])
+    return report_of(out)
+
+
+def test_convention_11_matches_count_frames_of_the_sources(folder: Path) -> None:
+    rows = localize(folder, "again.csv")
+    assert list(rows[0])[:4] == ["query", "place", "score", "accepted"]
+    assert len(rows) == 101
+    queries, places = (torch.tensor([int(row[name]) for row in rows]) for name in ("query", "place"))
+    assert (QUERY[queries] - STEP * torch.arange(101)).abs().max() <= 4
+    assert ((REFERENCE[places] - QUERY[queries]).abs() <= 2 * STEP).sum() > 95
+
+
+def test_compare_is_learn_localize_and_evaluate(folder: Path, tmp_path: Path) -> None:
+    pair, truth = [f"{folder}/reference.npy", f"{folder}/query.npy"], ["--truth", f"{folder}/truth.csv"]
+    main(["compare", *pair, *truth, "--out", f"{tmp_path}/c", *OPTIONS])
+    report = report_of(tmp_path / "c")
+    alone = evaluate_file(folder, "truth.csv", tmp_path / "e", "--map", f"{folder}/m.safetensors")
+    for key in ("auc", "recall_at_1", "recall_at_100_precision", "judged", "accepted_right"):
+        assert report[key] == pytest.approx(alone[key], rel=1e-6), key
+    assert report["unit"] == alone["unit"]
+    assert report["frames"] == report["queries"] == 101
+    for picture in ("velocity", "ground"):
+        assert (tmp_path / "c" / f"{picture}.png").stat().st_size > 1000
+    assert (tmp_path / "c" / "matches.csv").read_text() == (folder / "matches.csv").read_text()
+    assert "right within 5 places at even steps" in (tmp_path / "c" / "index.html").read_text()
+
+
+def test_compare_of_a_single_query_frame() -> None:
+    model = template_model(periods=everything(101), velocity=camera())
+    one = ArrayTraverse(footage(torch.tensor([300])))
+    there = int((REFERENCE - 300).abs().argmin())
+    result = compare(ArrayTraverse(footage(REFERENCE)), one, str(there), model)
+    assert result.match.index.tolist() == [50]
+    assert result.report.as_json()["recall_at_1"] == 1.0
+
+
+def test_learn_and_localize_tell_the_steps(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    localize(folder, "told.csv")
+    assert f"{len(QUERY)} frames make 101 even steps of 6 pixels of ground" in capsys.readouterr().out
+    main(["learn", f"{folder}/reference.npy", "--map", f"{folder}/told.safetensors", *OPTIONS])
+    assert f"{len(REFERENCE)} frames make 101 even steps of 6 pixels" in capsys.readouterr().out
+
+
+def test_info_tells_how_the_ground_was_measured(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["info", f"{folder}/m.safetensors"])
+    told = capsys.readouterr().out
+    assert "places are 6 pixels of ground apart" in told
+    assert "GroundOdometry: corners=((0.0, 0.0)" in told
+
+
+def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
+    # half of the ground fills the patch: it seems to move twice as fast
+    rows = localize(folder, "half.csv", "--corners", "[[0,0.5],[1,0.5],[1,1],[0,1]]")
+    assert len(rows) == pytest.approx(2 * 101, rel=0.05)
+    rows = localize(folder, "as_is.csv", "--as_is")
+    assert [int(row["query"]) for row in rows] == list(range(len(QUERY)))
+
+
+# bad input -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--velocity.corners", "[[0,0],[1,0],[1,1.5],[0,1]]"], "lie outside the frame"),
+        (["--velocity.corners", "[[0,0],[1,0],[1,1]]"], "3 corners; expected four"),
+        (["--velocity.corners", "[[1,1],[0,1],[0,0]]"], "3 corners"),
+        (["--velocity.size", "[8,8]"], "(8, 8)"),
+        (["--velocity.step", "-1"], "step is -1"),
+        (["--velocity.step", "4000", *CORNERS], "expected at least one step, 4000"),
+        (["--velocity", "true"], "velocity"),
+    ],
+)
+def test_ground_that_cannot_be_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
+) -> None:
+    assert words in fails(
+        capsys, "learn", folder / "reference.npy", "--map", tmp_path / "m.safetensors", *options
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_corners_of_another_camera_need_ground(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/plain.safetensors"])
+    rest = [folder / "query.npy", "--out", tmp_path / "m.csv", "--corners", "[[0,0],[1,0],[1,1],[0,1]]"]
+    assert "without --velocity" in fails(capsys, "localize", tmp_path / "plain.safetensors", *rest)
+    error = fails(capsys, "localize", folder / "m.safetensors", *rest, "--as_is")
+    assert "--as_is measures no ground" in error
+    error = fails(capsys, "localize", folder / "m.safetensors", *rest[:-1], "[[0,0],[1,0],[1,2],[0,1]]")
+    assert "lie outside the frame" in error
+    assert not (tmp_path / "m.csv").exists()
+
+
+def test_queries_that_stand_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "still.npy", np.load(folder / "query.npy")[[7] * 9])
+    still = tmp_path / "still.npy", "--out", tmp_path / "m.csv"
+    assert "stands still in all of its 9 frames" in fails(
+        capsys, "localize", folder / "m.safetensors", *still
+    )
+
+
+def test_a_bare_velocity_is_understood(folder: Path, tmp_path: Path) -> None:
+    command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors", "--velocity"]
+    main([*command, *OPTIONS])
+    assert DejaVu.load(tmp_path / "m.safetensors").step == STEP
+
+
+def test_a_part_of_a_part_can_be_null(folder: Path, tmp_path: Path) -> None:
+    command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors"]
+    main([*command, "--mapper.periods.hop", "50", "--mapper.periods.hop", "null"])
+    assert DejaVu.load(tmp_path / "m.safetensors").mapper.periods.hop is None
