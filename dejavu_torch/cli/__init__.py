@@ -38,8 +38,7 @@ def run(given: Sequence[str]) -> None:
 
     try:
         if not given or given[0] not in COMMANDS:
-            overview(COMMANDS).parse_args(given or ["--help"])
-            raise UsageError(f"{given[0]} stands where a command is expected")
+            overview(COMMANDS).parse_args(given or ["--help"])  # helps or refuses, and exits
         name, words = given[0], with_configs(given[1:])
         if name == "train":  # Lightning's own command line
             from dejavu_torch.cli.train import run_train
