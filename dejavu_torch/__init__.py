@@ -31,30 +31,29 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.source import open_source
-from dejavu_torch.data.strip import SlidingWindow
-from dejavu_torch.database.distance import phase_distances
-from dejavu_torch.database.place_map import PlaceMap
-from dejavu_torch.database.summary import MapSummary
-from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
-from dejavu_torch.database.templates import PhaseTemplates, phase_mask
-from dejavu_torch.evaluation.curves import evaluate, pr_curve
-from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.hog import HOG, hog
-from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.periods.imposed import ImposedPeriods
-from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import FrequencyLayer, InputError, Match, PRCurve, Traverse
-
 if TYPE_CHECKING:
+    from dejavu_torch.data.arrays import ArrayTraverse
+    from dejavu_torch.data.folder import ImageFolder
+    from dejavu_torch.data.source import open_source
+    from dejavu_torch.data.strip import SlidingWindow
+    from dejavu_torch.database.distance import phase_distances
+    from dejavu_torch.database.place_map import PlaceMap
+    from dejavu_torch.database.summary import MapSummary
+    from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
+    from dejavu_torch.database.templates import PhaseTemplates, phase_mask
+    from dejavu_torch.evaluation.curves import evaluate, pr_curve
     from dejavu_torch.experiments.compare import compare
+    from dejavu_torch.features.embedding import Embedding
+    from dejavu_torch.features.hog import HOG, hog
+    from dejavu_torch.features.preprocess import Preprocess
+    from dejavu_torch.model import DejaVu
+    from dejavu_torch.motion.odometry import GroundOdometry
+    from dejavu_torch.periods.imposed import ImposedPeriods
+    from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+    from dejavu_torch.recognition.select import best_match
     from dejavu_torch.training.datamodule import RouteData
     from dejavu_torch.training.task import PlaceRecognitionTask
+    from dejavu_torch.types import FrequencyLayer, InputError, Match, PRCurve, Traverse
 
 __version__ = "0.1.0"
 
@@ -91,18 +90,46 @@ __all__ = [
     "pr_curve",
 ]
 
-# what loads matplotlib or Lightning, loaded when it is first asked for
-_LAZY = {
-    "PlaceRecognitionTask": "dejavu_torch.training.task",
-    "RouteData": "dejavu_torch.training.datamodule",
-    "compare": "dejavu_torch.experiments.compare",
+# where each name lives: a room is imported when one of its names is first asked for
+_HOMES = {
+    "ArrayTraverse": "data.arrays",
+    "DejaVu": "model",
+    "Embedding": "features.embedding",
+    "FrequencyLayer": "types",
+    "GroundOdometry": "motion.odometry",
+    "HOG": "features.hog",
+    "ImageFolder": "data.folder",
+    "ImposedPeriods": "periods.imposed",
+    "InputError": "types",
+    "MapSummary": "database.summary",
+    "Match": "types",
+    "PRCurve": "types",
+    "PhaseTemplates": "database.templates",
+    "PlaceMap": "database.place_map",
+    "PlaceRecognitionTask": "training.task",
+    "Preprocess": "features.preprocess",
+    "RouteData": "training.datamodule",
+    "SlidingWindow": "data.strip",
+    "SpectrogramAnalysis": "periods.spectrogram",
+    "TemplateMap": "database.template_map",
+    "TemplateMapper": "database.template_map",
+    "Traverse": "types",
+    "best_match": "recognition.select",
+    "compare": "experiments.compare",
+    "evaluate": "evaluation.curves",
+    "hog": "features.hog",
+    "open_source": "data.source",
+    "phase_distances": "database.distance",
+    "phase_mask": "database.templates",
+    "pr_curve": "evaluation.curves",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_LAZY[name]), name)
+    value = globals()[name] = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return value
 
 
 def __dir__() -> list[str]:

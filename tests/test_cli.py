@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
-import json
+import inspect
+import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -11,47 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import fails, frames, report_of, run, write_images
 from PIL import Image
 
-from dejavu_torch import DejaVu, SpectrogramAnalysis, open_source
-from dejavu_torch.cli import COMMANDS, main
+from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
+from dejavu_torch.cli.commands import COMMANDS
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.types import Training
 
 SMALL = "sim:aerial?frames=256"
 QUERY = "sim:aerial?frames=256&traverse=1"
-
-
-def run(*arguments: str | Path) -> None:
-    main([str(argument) for argument in arguments])
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Run a command that must fail; its one line on stderr."""
-    with pytest.raises(SystemExit) as stop:
-        run(*arguments)
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert error.startswith("dejavu: ")
-    assert error.count("\n") == 1
-    assert error.endswith("\n")
-    assert "Traceback" not in error
-    return error
-
-
-def frames(count: int, seed: int = 0, size: int = 32) -> np.ndarray:
-    """Frames of a texture that slides past with period 16, with noise."""
-    noise = np.random.default_rng(seed)
-    texture = np.random.default_rng(99).integers(40, 215, (size, size))
-    rolled = [np.roll(texture, 2 * i, axis=1) for i in range(count)]
-    return np.clip(np.stack(rolled) + noise.normal(0, 8, (count, size, size)), 0, 255).astype(np.uint8)
-
-
-def write_images(folder: Path, images: np.ndarray) -> Path:
-    folder.mkdir()
-    for i, image in enumerate(images):
-        Image.fromarray(image).save(folder / f"{i}.png")
-    return folder
+MAPPER = "{class_path: dejavu_torch.TemplateMapper, init_args: {"
+WINDOW = "{class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: "
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +37,7 @@ def small_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # what works
 
 
-def test_learn_prints_plan_certificate_and_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_learn_prints_plan_summary_and_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("learn", SMALL, "--map", tmp_path / "a.safetensors")
     out = capsys.readouterr().out
     assert "periods" in out
@@ -78,7 +51,7 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
     model = DejaVu.load(small_map)
     match = model.localize(open_source(QUERY))
-    assert list(rows[0]) == ["query", "place", "score", "accepted"]
+    assert list(rows[0]) == ["query", "place", "score", "accepted", "query_name", "place_name"]
     assert [int(row["query"]) for row in rows] == list(range(256))
     assert [int(row["place"]) for row in rows] == match.index.tolist()
     assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-5)
@@ -107,7 +80,7 @@ def test_convention_4_threshold_option_then_map_then_all(
     assert accepted() == 0
 
 
-def test_info_tells_what_learn_told(small_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_says_what_learn_said(small_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("info", small_map)
     out = capsys.readouterr().out
     assert "places covered" in out
@@ -118,7 +91,7 @@ def test_folder_of_images_to_report(tmp_path: Path, capsys: pytest.CaptureFixtur
     first = write_images(tmp_path / "first", frames(128, seed=1))
     second = write_images(tmp_path / "second", frames(128, seed=2))
     run("compare", first, second, "--out", tmp_path / "report")
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    report = report_of(tmp_path / "report")
     assert report["frames"] == report["queries"] == 128
     assert 16 in report["periods"]
     assert {file.name for file in (tmp_path / "report").iterdir()} >= {
@@ -134,23 +107,24 @@ def test_folder_of_images_to_report(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_config_and_options(tmp_path: Path) -> None:
     config = tmp_path / "mine.yaml"
     config.write_text(
-        "periods: {class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: 128}}\nreduction: sum\n"
+        "mapper: {class_path: dejavu_torch.TemplateMapper, init_args: {reduction: sum, "
+        "periods: {class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: 128}}}}\n"
     )
     route = tmp_path / "a.safetensors"
     run("learn", SMALL, "--map", route, "--config", config, "--batch_size", "16")
     model = DejaVu.load(route)
-    assert model.periods.window == 128
-    assert model.matcher.reduction == "sum"
+    assert model.mapper.periods.window == 128
+    assert model.map.reduction == "sum"
     assert model.batch_size == 16
     assert {(layer.start, layer.stop) for layer in model.map.plan} == {(0, 128), (128, 256)}
 
 
 def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
-    run("learn", SMALL, "--map", route, "--periods.window", "128", "--features.cell", "16")
+    run("learn", SMALL, "--map", route, "--mapper.periods.window", "128", "--features.cell", "16")
     model = DejaVu.load(route)
-    assert (model.periods.window, model.features.cell) == (128, 16)
-    assert model.periods.peaks == "local"
+    assert (model.mapper.periods.window, model.features.cell) == (128, 16)
+    assert model.mapper.periods.peaks == "local"
 
 
 def test_features_by_class_path(tmp_path: Path) -> None:
@@ -178,6 +152,18 @@ def test_features_of_another_package_are_named_again_to_localize(
     assert len((tmp_path / "m.csv").read_text().splitlines()) == 65
 
 
+def test_classes_of_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "my_network.py").write_text("import torch\nclass Net(torch.nn.Flatten):\n    pass\n")
+    np.save(tmp_path / "frames.npy", frames(64))
+    code = "from dejavu_torch.cli import main; main()"
+    words = ["learn", "frames.npy", "--map", "a.safetensors", "--features", "my_network.Net"]
+    # -P: as an installed command, which does not look there by itself
+    python = [sys.executable, "-P", "-c", code, *words]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    subprocess.run(python, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert (tmp_path / "a.safetensors").is_file()
+
+
 def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     noise = np.random.default_rng(0)
     for name in ("a", "b"):
@@ -186,7 +172,7 @@ def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "this route does not repeat" in capsys.readouterr().out.splitlines()
     assert DejaVu.load(tmp_path / "a.safetensors").map.plan == ()
     run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--out", tmp_path / "report")
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    report = report_of(tmp_path / "report")
     assert report["recall_at_1"] == report["auc"] == 0
     assert report["accepted"] == 0
     assert report["periods"] == report["chunks"] == []
@@ -199,40 +185,93 @@ def test_compare_without_truth_gives_matches_and_no_scores(
     np.save(tmp_path / "b.npy", frames(64, seed=5))
     run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--out", tmp_path / "report")
     assert "no scores" in capsys.readouterr().out
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    report = report_of(tmp_path / "report")
     assert report["auc"] is None
     assert len((tmp_path / "report" / "matches.csv").read_text().splitlines()) == 65
     run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--truth", "16", "--out", tmp_path / "report")
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    report = report_of(tmp_path / "report")
     assert report["auc"] is not None
 
 
-def test_negative_offset_is_a_truth(tmp_path: Path) -> None:
+@pytest.mark.parametrize("offset", [["--truth=-3"], ["--truth", "-3"]])
+def test_negative_offset_is_a_truth(tmp_path: Path, offset: list[str]) -> None:
     np.save(tmp_path / "a.npy", frames(64))
-    run(
-        "compare",
-        tmp_path / "a.npy",
-        tmp_path / "a.npy",
-        "--truth=-3",
-        "--tolerance",
-        "0",
-        "--out",
-        tmp_path / "r",
-    )
-    assert json.loads((tmp_path / "r" / "report.json").read_text())["tolerance"] == 0
+    pair = tmp_path / "a.npy", tmp_path / "a.npy"
+    run("compare", *pair, *offset, "--tolerance", "0", "--out", tmp_path / "r")
+    report = report_of(tmp_path / "r")
+    assert report["tolerance"] == 0
+    assert report["with_answer"] == 61
 
 
-@pytest.mark.parametrize(
-    "command", ["demo", "learn", "localize", "compare", "evaluate", "reproduce", "bench", "info"]
-)
+def test_a_report_keeps_the_map_and_says_what_to_do_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("compare", SMALL, QUERY, "--out", tmp_path / "report")
+    assert capsys.readouterr().out.splitlines()[-1] == f"next: open {tmp_path / 'report' / 'index.html'}"
+    kept, again = tmp_path / "report" / "map.safetensors", ("--tolerance", "2", "--out", tmp_path / "report")
+    before = kept.read_bytes()
+    run("compare", SMALL, QUERY, "--map", kept, "--threshold", "0.01", *again)
+    assert kept.read_bytes() == before
+
+
+def test_what_learn_says_to_do_next_can_be_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run("learn", SMALL, "--map", tmp_path / "my map.safetensors")
+
+    def next_words() -> list[str]:
+        words = shlex.split(capsys.readouterr().out.splitlines()[-1])
+        assert words[:2] == ["next:", "dejavu"]
+        return words[2:]
+
+    run(*(QUERY if word == "QUERY" else word for word in next_words()))
+    assert (tmp_path / "matches.csv").is_file()
+    run(*("0" if word == "TRUTH" else word for word in next_words()))
+    assert (tmp_path / "scores" / "index.html").is_file()
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "train"])
 def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         run(command, "--help")
     out = capsys.readouterr().out
     assert stop.value.code == 0
     assert "known subclasses" not in out
+    assert "<class" not in out
     assert len(out.splitlines()) < 100
-    assert out.splitlines()[0].startswith("usage: dejavu")
+    assert out.splitlines()[0].startswith(f"usage: dejavu {command}")
+
+
+def test_help_loads_nothing_that_only_a_run_needs() -> None:
+    code = (
+        "import sys, dejavu_torch.cli as cli; assert 'torch' not in sys.modules\n"
+        f"for command in {[name for name in COMMANDS if name != 'train']}:\n"
+        "    try: cli.main([command, '--help'])\n"
+        "    except SystemExit: pass\n"
+        "heavy = 'kornia', 'matplotlib', 'pytorch_lightning', 'torchmetrics', 'av', 'numba', 'cv2', 'scipy'\n"
+        "print([name for name in heavy if name in sys.modules])"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (ran.stdout.splitlines()[-1], ran.stderr) == ("[]", "")
+
+
+def test_every_setting_of_a_model_is_an_option_and_a_key(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run("learn", "--help")
+    out = capsys.readouterr().out
+    for name in inspect.signature(DejaVu).parameters:
+        assert f"--{name} " in out
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="libgomp is the OpenMP of Linux builds")
+@pytest.mark.parametrize(("given", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "active"}, "ACTIVE")])
+def test_threads_do_not_spin_while_they_wait(given: dict[str, str], policy: str, small_map: Path) -> None:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
+    environment = {**kept, "OMP_DISPLAY_ENV": "true", **given}
+    command = [sys.executable, "-m", "dejavu_torch.cli", "info", str(small_map)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert f"OMP_WAIT_POLICY = '{policy}'" in done.stderr
 
 
 def test_quiet_where_not_a_terminal(tmp_path: Path) -> None:
@@ -249,17 +288,16 @@ def test_quiet_where_not_a_terminal(tmp_path: Path) -> None:
     assert [line for line in done.stderr.splitlines() if "window shrunk" not in line] == []
 
 
-def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_help_names_every_command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        run("--help")
+        run(*arguments)
     out = capsys.readouterr().out
     assert stop.value.code == 0
-    told = {line.split()[0] for line in out.splitlines() if line.startswith("    ") and line.split()}
-    assert told >= {*COMMANDS, "train"}
-    assert "dejavu train fit --help" in out
+    assert {line.split()[0] for line in out.splitlines() if line.strip()} >= set(COMMANDS)
 
 
-# a map that is judged as it is
+# a map that is evaluated as it is
 
 
 @pytest.fixture
@@ -268,7 +306,8 @@ def trained_map(tmp_path: Path) -> Path:
     np.save(tmp_path / "a.npy", frames(96, size=8))
     np.save(tmp_path / "b.npy", frames(96, seed=5, size=8))
     periods = SpectrogramAnalysis(window=96, strongest=1)
-    model = DejaVu(torch.nn.Flatten(), periods, "l2", temperature=0.2, threshold=2.5)
+    mapper = TemplateMapper(periods, metric="l2", temperature=0.2)
+    model = DejaVu(torch.nn.Flatten(), mapper, threshold=2.5)
     model.learn(open_source(str(tmp_path / "a.npy")))
     model.map.templates *= 0.9
     model.trained = Training(steps=30, seconds=1000.0, seed=3)
@@ -280,7 +319,7 @@ def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.Capt
     folder, before = trained_map.parent, trained_map.read_bytes()
     pair = folder / "a.npy", folder / "b.npy", "--truth", "0", "--features", "torch.nn.Flatten"
     run("compare", *pair, "--map", trained_map, "--out", folder / "r")
-    report = json.loads((folder / "r" / "report.json").read_text())
+    report = report_of(folder / "r")
     assert report["trained"] == {"steps": 30, "seconds": 1000.0, "seed": 3}
     assert report["seconds_learn"] > 1000
     assert report["map_bytes"] == len(before)
@@ -294,40 +333,40 @@ def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.Capt
     assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-4)
     assert report["accepted"] == int(match.accepted.sum())
     run("compare", *pair, "--map", trained_map, "--out", folder / "r", "--threshold", "0.5")
-    assert json.loads((folder / "r" / "report.json").read_text())["threshold"] == 0.5
+    assert report_of(folder / "r")["threshold"] == 0.5
 
 
 @pytest.mark.parametrize(
     "option",
-    [["--metric", "cosine"], ["--periods.window", "99"], ["--temperature=2"], ["--config", "c.yaml"]],
+    [["--mapper.metric", "cosine"], ["--batch_size", "9"], ["--velocity"], ["--config", "c.yaml"]],
 )
 def test_compare_with_a_map_takes_no_settings(
     trained_map: Path, option: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = trained_map.parent
-    (folder / "c.yaml").write_text("reduction: sum\n")
+    (folder / "c.yaml").write_text("batch_size: 9\n")
     option = [word.replace("c.yaml", str(folder / "c.yaml")) for word in option]
     pair = folder / "a.npy", folder / "b.npy"
-    told = fails(capsys, "compare", *pair, "--map", trained_map, "--out", folder / "r", *option)
-    assert f"{option[0].partition('=')[0]}: a --map has its own settings" in told
-    assert told.count("\n") == 1
+    error = fails(capsys, "compare", *pair, "--map", trained_map, "--out", folder / "r", *option)
+    named = {"--config": "--batch_size"}.get(option[0], option[0].partition(".")[0])
+    assert f"{named}: a --map has its own settings" in error
 
 
 def test_compare_builds_features_of_this_package_by_itself(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", frames(64, size=16))
     np.save(tmp_path / "b.npy", frames(64, seed=5, size=16))
     features = SmallCNN(dimension=8, channels=1, resize=(16, 16), widths=(4,), squeeze=2)
-    model = DejaVu(features, SpectrogramAnalysis(window=64, strongest=1))
+    model = DejaVu(features, TemplateMapper(SpectrogramAnalysis(window=64, strongest=1)))
     model.learn(open_source(str(tmp_path / "a.npy"))).save(tmp_path / "a.safetensors")
     pair = tmp_path / "a.npy", tmp_path / "b.npy"
     run("compare", *pair, "--map", tmp_path / "a.safetensors", "--out", tmp_path / "r")
-    report = json.loads((tmp_path / "r" / "report.json").read_text())
+    report = report_of(tmp_path / "r")
     assert report["trained"] is None
     assert report["map_bytes"] == (tmp_path / "a.safetensors").stat().st_size
     assert {"hog", "hog_stride_coarsest"} <= report.keys()
 
 
-def test_info_tells_how_a_map_was_trained(trained_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_says_how_a_map_was_trained(trained_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("info", trained_map, "--features", "torch.nn.Flatten")
     out = capsys.readouterr().out
     assert "trained for 30 steps in 1000 s, seed 3" in out
@@ -376,8 +415,7 @@ def test_too_few_frames(count: int, tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_paper_preset_refuses_less_than_its_window(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = Path(__file__).parents[1] / "configs" / "paper.yaml"
-    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", config)
+    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", "paper")
     assert "256" in error
     assert "1024" in error
 
@@ -428,8 +466,8 @@ def test_features_of_another_dimension(tmp_path: Path, capsys: pytest.CaptureFix
     error = fails(
         capsys, "localize", tmp_path / "a.safetensors", tmp_path / "two.npy", "--out", tmp_path / "m.csv"
     )
-    assert "2" in error
-    assert "(Q, 3)" in error
+    assert "2)" in error
+    assert "3)" in error
     assert not (tmp_path / "m.csv").exists()
 
 
@@ -443,21 +481,36 @@ def test_truncated_and_foreign_maps(
         assert name in fails(capsys, "localize", path, QUERY, "--out", tmp_path / "m.csv")
 
 
-def test_missing_config(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", "nowhere.yaml")
-    assert "nowhere.yaml" in error
+def test_a_folder_is_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = fails(capsys, "localize", tmp_path, tmp_path, "--out", tmp_path / "m.csv")
+    assert f"{tmp_path} is a folder; expected a map file" in error
+    (tmp_path / "no_map.safetensors").touch()
+    fails(capsys, "localize", tmp_path / "no_map.safetensors", QUERY, "--out", tmp_path / "m.csv")
+
+
+@pytest.mark.parametrize("name", ["nowhere.yaml", "no_preset"])
+@pytest.mark.parametrize("command", [["learn", SMALL, "--map", "a.safetensors"], ["train", "fit"]])
+def test_missing_config(
+    name: str, command: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    error = fails(capsys, *command, "--config", name)
+    assert name in error
+    for preset in ("default", "paper", "train_small", "train_road"):
+        assert preset in error
 
 
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         ("colour: red\n", "'colour'"),
-        ("periods: {class_path: nowhere.Finder}\n", "'nowhere'"),
-        ("periods: {class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: 3}}\n", "window=3"),
-        ("reduction: [\n", "bad.yaml"),
+        ("mapper: {class_path: nowhere.Mapper}\n", "'nowhere'"),
+        ("mapper: {class_path: dejavu_torch.HOG}\n", "HOG"),
+        (f"mapper: {MAPPER}periods: {{class_path: dejavu_torch.HOG}}}}}}\n", "HOG"),
+        (f"mapper: {MAPPER}periods: {WINDOW}3}}}}}}}}\n", "window=3"),
+        ("mapper: [\n", "bad.yaml"),
         ("batch_size: many\n", "many"),
         ("batch_size: 0\n", "batch_size is 0"),
-        ("metric: manhattan\n", "'manhattan'"),
+        (f"mapper: {MAPPER}metric: manhattan}}}}\n", "'manhattan'"),
     ],
 )
 def test_bad_config(text: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -515,6 +568,7 @@ def test_full_disk(
     assert out.read_text() == "old"
 
 
+@pytest.mark.slow
 def test_localize_memory_does_not_grow_with_the_queries(small_map: Path, tmp_path: Path) -> None:
     code = (
         "import resource, sys; from dejavu_torch.cli import main; main(sys.argv[1:]);"

@@ -1,65 +1,121 @@
+"""The presets: what they hold, and that they come with the package."""
+
 from __future__ import annotations
 
+import inspect
+import shutil
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
-from dejavu_torch import DejaVu
-from dejavu_torch.cli.parser import MODEL, build_parser
-from dejavu_torch.database.mapfile import recipe_of
+from dejavu_torch import DejaVu, InputError
+from dejavu_torch.cli.commands import COMMANDS
+from dejavu_torch.cli.parser import parse
+from dejavu_torch.cli.presets import find_config, preset_names, with_configs
+from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.experiments.reproduce import paper_model
+from dejavu_torch.model import PARTS, REGISTRY, SETTINGS
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+ROOT = Path(__file__).parents[1]
+PRESETS = ["default", "paper"]
 
 
 def model_of(name: str) -> DejaVu:
-    parser = build_parser()
-    parsed = parser.parse_args(["learn", "x", "--map", "y", "--config", str(CONFIGS / name)])
-    chosen = parser.instantiate(parsed)["learn"]
-    return DejaVu(**{name: chosen[name] for name in MODEL})
+    model = parse("learn", COMMANDS["learn"], with_configs(["x", "--map", "y", "--config", name]))["model"]
+    assert isinstance(model, DejaVu)
+    return model
 
 
-def settings(model: DejaVu) -> dict[str, object]:
-    return {
-        "features": recipe_of(model.features),
-        "periods": recipe_of(model.periods),
-        "matcher": (model.matcher.metric, model.matcher.reduction, model.matcher.temperature),
-        "threshold": model.threshold,
-        "batch_size": model.batch_size,
-    }
+def settings(model: DejaVu) -> dict[str, Any]:
+    parts = {name: getattr(model, name) for name in PARTS}
+    recipes = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
+    return recipes | {name: getattr(model, name) for name in SETTINGS}
+
+
+def written(name: str) -> dict[str, Any]:
+    """A preset as it is written, with classes by their names."""
+
+    def plain(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        names = {"class_path": value["class_path"].rpartition(".")[2]} if "class_path" in value else {}
+        return {key: plain(one) for key, one in value.items()} | names
+
+    found: dict[str, Any] = plain(yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text()))
+    return found
 
 
 def test_default_yaml_is_the_constructors_defaults() -> None:
-    assert settings(model_of("default.yaml")) == settings(DejaVu())
+    assert settings(model_of("default")) == settings(DejaVu())
 
 
-@pytest.mark.parametrize("name", ["default.yaml", "paper.yaml"])
+@pytest.mark.parametrize("name", PRESETS)
 def test_presets_spell_out_every_argument(name: str) -> None:
-    written = yaml.safe_load((CONFIGS / name).read_text())
-    model = model_of(name)
-    assert set(written) == set(MODEL)
-    for part in ("features", "periods"):
-        assert written[part]["init_args"] == recipe_of(getattr(model, part)).init_args
+    assert set(written(name)) == set(inspect.signature(DejaVu).parameters)
+    assert written(name) == settings(model_of(name))
 
 
 def test_convention_3_paper_yaml_is_the_letter() -> None:
-    model = model_of("paper.yaml")
-    letter = {
-        "window": 1024,
-        "hop": None,
-        "min_period": 8,
-        "strongest": 2,
-        "peaks": "bins",
-        "false_alarm": None,
-        "similar": 0.0,
-        "short": "refuse",
-    }
-    assert recipe_of(model.periods).init_args == letter
-    assert model.matcher.reduction == "sum"
-    assert model.matcher.metric == "l1"
-    assert model.matcher.temperature is None
+    mapper = written("paper")["mapper"]["init_args"]
+    letter = {"window": 1024, "hop": None, "min_period": 8, "strongest": 2, "peaks": "bins"}
+    letter |= {"false_alarm": None, "short": "refuse"}
+    found = mapper["periods"]["init_args"]
+    assert {name: found[name] for name in letter} == letter
+    assert (mapper["metric"], mapper["reduction"], mapper["temperature"]) == ("l1", "sum", None)
 
 
 def test_reproduce_uses_the_papers_letter() -> None:
-    assert settings(paper_model()) == settings(model_of("paper.yaml"))
+    assert settings(paper_model()) == settings(model_of("paper"))
+
+
+def test_a_preset_is_found_by_name_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = {path.stem for path in (ROOT / "configs").glob("*.yaml")}
+    assert set(preset_names()) > names
+    for name in preset_names():
+        assert find_config(name) == ROOT / "configs" / f"{name}.yaml"
+    (tmp_path / "paper").mkdir()  # such as a report of it
+    assert find_config("paper") == ROOT / "configs" / "paper.yaml"
+    (tmp_path / "mine.yaml").touch()
+    assert find_config("mine.yaml") == Path("mine.yaml")
+    with pytest.raises(InputError, match=r"mine is not there.*train_small"):
+        find_config("mine")
+
+
+def test_a_config_stands_in_its_place() -> None:
+    found = with_configs(
+        ["fit", "--config", "paper", "-c", "default", "--config=train_small", "--other", "paper"]
+    )
+    paths = [str(find_config(name)) for name in ("paper", "default", "train_small")]
+    assert found == ["fit", "--config", paths[0], "-c", paths[1], f"--config={paths[2]}", "--other", "paper"]
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_package_and_presets(tmp_path: Path) -> None:
+    """Built and unpacked without a network; then used from elsewhere."""
+    tree = tmp_path / "tree"
+    tree.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, tree)
+    for name in ("dejavu_torch", "configs"):
+        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+    build = "import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=tree, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "installed")
+    package = tmp_path / "installed" / "dejavu_torch"
+    found = (path for path in (ROOT / "dejavu_torch").rglob("*") if path.is_file())
+    files = {path.relative_to(ROOT) for path in found if "__pycache__" not in path.parts}
+    assert {path for path in files if not (tmp_path / "installed" / path).is_file()} == set()
+    presets = {path.relative_to(ROOT) for path in (ROOT / "configs").rglob("*.yaml")}
+    assert {path for path in presets if not (package / path).is_file()} == set()
+    code = "import dejavu_torch.cli.presets as p; print(p.find_config('train_small'))"
+    python = [sys.executable, "-P", "-c", f"import sys; sys.path.insert(0, {str(package.parent)!r}); {code}"]
+    ran = subprocess.run(python, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert Path(ran.stdout.strip()) == package / "configs" / "train_small.yaml"

@@ -12,7 +12,9 @@ import torch
 
 from dejavu_torch import DejaVu
 from dejavu_torch.cli import train
-from dejavu_torch.cli.parser import UsageError, build_parser
+from dejavu_torch.cli.commands import COMMANDS
+from dejavu_torch.cli.parser import UsageError, command_parser
+from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.periods.imposed import ImposedPeriods
 
@@ -58,15 +60,16 @@ class ParseOnly(train.TrainCLI):
 
 def understand(line: str) -> None:
     """Parse a command as it is shown, without running it."""
-    words = shlex.split(line, comments=True)[1:]
-    if words[0] != "train":
-        build_parser().parse_args(words)
-        return
+    _, name, *words = shlex.split(line, comments=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)  # where the configs lie
+        words = with_configs(words)
+        if name != "train":
+            command_parser(name, COMMANDS[name]).parse_args(words)
+            return
         patch.setattr(train, "TrainCLI", ParseOnly)
         with pytest.raises(Understood):
-            train.run_train(words[1:])
+            train.run_train(words)
 
 
 @pytest.mark.parametrize("text", [README, TRAINING], ids=["README", "training"])
@@ -119,5 +122,8 @@ def test_a_training_that_is_shown_would_be_understood() -> None:
 def test_ci_calls_the_readmes_test_command() -> None:
     commands = [line for line in README.splitlines() if line.endswith("python -m pytest")]
     assert len(commands) == 1
-    assert "python -m pytest$" in (ROOT / ".ci" / "run").read_text()
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert "python -m pytest$" in ci
     assert commands[0] in (ROOT / "CONTRIBUTING.md").read_text()
+    for linter in ("ruff check .", "ruff format --check .", "mypy"):
+        assert f"python -m {linter}" in ci

@@ -7,58 +7,49 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NoReturn
 
-from dejavu_torch.cli import commands
-from dejavu_torch.cli.parser import MODEL, UsageError, build_parser, refusal
-from dejavu_torch.model import DejaVu
-from dejavu_torch.types import InputError
-
-COMMANDS: dict[str, Callable[..., None]] = {
-    "demo": commands.run_demo,
-    "learn": commands.run_learn,
-    "localize": commands.run_localize,
-    "compare": commands.run_compare,
-    "evaluate": commands.run_evaluate,
-    "reproduce": commands.run_reproduce,
-    "bench": commands.run_bench,
-    "info": commands.run_info,
-}
-
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the `dejavu` command."""
+    """Entry point of the `dejavu` command.
+
+    Environment: OMP_NUM_THREADS, how many threads torch computes with. Unless OMP_WAIT_POLICY says otherwise
+        they sleep while they wait for each other: spinning, which is the default of most builds, takes the
+        cores from the work where other programs run too, and makes small operations many times slower.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
     logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
-    given = _spelt_out(list(sys.argv[1:] if arguments is None else arguments))
+    given = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:  # so that temporary files are removed
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # a user's own classes, as `python -m` finds them
-    parser = build_parser()
+    run(given)
+
+
+def run(given: Sequence[str]) -> None:
+    """Run a command line; what it gets wrong is one line on stderr and exit status 2."""
+    from dejavu_torch.cli.commands import COMMANDS
+    from dejavu_torch.cli.parser import COMMAND, UsageError, overview, parse
+    from dejavu_torch.cli.presets import with_configs
+    from dejavu_torch.types import InputError
+
     try:
-        if given[:1] == ["train"]:  # Lightning, which takes seconds to import, is loaded for it alone
+        if not given or given[0] not in COMMANDS:
+            overview(COMMANDS).parse_args(given or ["--help"])  # helps or refuses, and exits
+        name, words = given[0], with_configs(given[1:])
+        if name == "train":  # Lightning's own command line
             from dejavu_torch.cli.train import run_train
 
-            run_train(given[1:])
+            run_train(words)
             return
-        parsed = parser.parse_args(_config_first(given))
-        if parsed.command is None:
-            parser.print_help()
-            raise SystemExit(2)
-        try:
-            chosen = parser.instantiate(parsed)[parsed.command].as_dict()
-        except Exception as error:
-            raise refusal(error) from error
-        if chosen.get("map") and parsed.command == "compare":
-            _refuse_settings(given)
-        chosen.pop("config", None)
-        if parsed.command in ("demo", "learn", "compare"):
-            chosen["model"] = DejaVu(**{name: chosen.pop(name) for name in MODEL})
-        if parsed.command in ("demo", "compare", "evaluate", "reproduce"):
-            chosen["command"] = shlex.join(["dejavu", *given])
-        COMMANDS[parsed.command](**chosen)
+        function = COMMANDS[name]
+        chosen = parse(name, function, _config_first(_spelt_out(words)))
+        if COMMAND in function.__annotations__:
+            chosen[COMMAND] = shlex.join(["dejavu", *given])
+        function(**chosen)
     except UsageError as error:
         config = [value for name, value in pairwise(given) if name == "--config"]
         fail(f"{error} (with --config {' --config '.join(config)})" if config else f"{error} (see --help)")
@@ -69,35 +60,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(130) from None
 
 
-def _refuse_settings(given: list[str]) -> None:
-    """A map has its own settings; only its threshold and what made its features can be given."""
-    for word in given:
-        name = word.removeprefix("--").partition("=")[0].partition(".")[0]
-        if word.startswith("--") and name in (*MODEL, "config") and name not in ("features", "threshold"):
-            raise UsageError(f"{word.partition('=')[0]}: a --map has its own settings")
-
-
-def _spelt_out(given: list[str]) -> list[str]:
+def _spelt_out(words: Sequence[str]) -> list[str]:
     """The command line with a bare --velocity given the one value it can have."""
-    following = [*given[1:], "--"]
     return [
         "--velocity=GroundOdometry" if word == "--velocity" and after.startswith("--") else word
-        for word, after in zip(given, following, strict=True)
+        for word, after in pairwise([*words, "--"])
     ]
 
 
-def _config_first(given: list[str]) -> list[str]:
+def _config_first(words: Sequence[str]) -> list[str]:
     """The command line with its config files ahead of the options, which then have the last word."""
-    taken = {i for i, word in enumerate(given) if word.startswith("--config=")}
-    for i, word in enumerate(given[:-1]):
-        if word == "--config":
-            taken |= {i, i + 1}
-    config = [given[i] for i in sorted(taken)]
-    return (
-        given[:1] + config + [word for i, word in enumerate(given) if i and i not in taken]
-        if given
-        else given
-    )
+    config = [
+        word.startswith("--config=") or word == "--config" or before == "--config"
+        for before, word in pairwise(["", *words])
+    ]
+    first = [word for word, is_config in zip(words, config, strict=True) if is_config]
+    return first + [word for word, is_config in zip(words, config, strict=True) if not is_config]
 
 
 def fail(message: str) -> NoReturn:

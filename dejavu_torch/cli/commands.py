@@ -1,188 +1,298 @@
-"""What the commands do: each a thin skin over functions."""
+"""What the commands do: each a thin skin over functions, whose docstring is its help.
+
+Only what every command needs is imported above: the rest, such as matplotlib, when a command runs.
+"""
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
+
+from torch import nn
 
 from dejavu_torch.data.files import check_output_file, make_output_folder
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.truth import Shown
-from dejavu_torch.database.l1 import l1_backend
-from dejavu_torch.database.summary import describe
-from dejavu_torch.evaluation.matches import write_matches
-from dejavu_torch.evaluation.report import (
-    Report,
-    score_table,
-    summary,
-    text_table,
-    write_index,
-    write_report,
-)
-from dejavu_torch.experiments import bench
-from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.evaluate import evaluate_file
-from dejavu_torch.experiments.reproduce import reproduce
-from dejavu_torch.experiments.section_five import (
-    FOOTAGE,
-    PUBLISHED,
-    boundary_lines,
-    lengths_picture,
-    route_lines,
-    section_five,
-)
-from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.periods.stft import BACKEND
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
+
+if TYPE_CHECKING:
+    from dejavu_torch.evaluation.report import Report
+    from dejavu_torch.experiments.compare import Comparison
+
+KEPT_MAP = "map.safetensors"  # in the folder of a report
 
 
-def run_demo(out: Path, seed: int, model: DejaVu, command: str) -> None:
-    """The main job on the built-in route."""
+def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, command: str) -> None:
+    """The main job on the built-in route: learn, localize a second traverse, report.
+
+    Args:
+        out: folder for report and pictures
+        seed: which route
+    """
+    from dejavu_torch.experiments.compare import compare
+
     make_output_folder(out)
     reference = open_source(f"sim:aerial?seed={seed}")
     query = open_source(f"sim:aerial?seed={seed}&traverse=1")
     print(f"learning {reference.name}, then finding {query.name} on it")
     result = compare(reference, query, model=model, progress=True)
-    _publish(result, out, "dejavu demo: the built-in route", command, save_map=True)
+    result.model.save(out / KEPT_MAP)
+    _publish(result, out, "dejavu demo: the built-in route", command)
 
 
-def run_learn(source: str, map: Path, model: DejaVu) -> None:
-    """Learn a map and print its plan."""
+def run_learn(source: str, *, map: Path, model: DejaVu) -> None:
+    """Learn a map; print its plan, its summary and the bytes per place.
+
+    Args:
+        source: folder of images, video (clip.mp4?width=160), .npy of frames or features,
+            sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
+        map: map file to write (.safetensors)
+    """
     check_output_file(map)
-    traverse = model.evenly(open_source(source), progress=True)
-    _tell_spacing(traverse)
+    traverse = model.resample(open_source(source), progress=True)
+    _print_steps(traverse)
     model.learn(traverse, progress=True)
     model.save(map)
-    _print_plan(model)
+    _print_map(model)
+    _print_next("localize", map, "QUERY", "--out", "matches.csv")
 
 
 def run_localize(
     map: Path,
     source: str,
+    *,
     out: Path,
-    threshold: float | None,
-    features: Any,
-    corners: list[list[float]] | None,
-    as_is: bool,
+    threshold: float | None = None,
+    corners: list[list[float]] | None = None,
+    as_is: bool = False,
+    features: nn.Module | None = None,
 ) -> None:
-    """Find the frames of a source on a map; one csv row each."""
+    """Find the frames of a source on a map.
+
+    Args:
+        map: map file
+        source: as of `dejavu learn`
+        out: csv of query,place,score,accepted,query_name,place_name
+        threshold: accept a match whose score is below
+        corners: where this camera sees the ground that the map's saw in its --velocity.corners
+        as_is: take the frames as they are, though the map's are resampled
+        features: class of the map's features, if not ours
+    """
     check_output_file(out)
     model = DejaVu.load(map, features)
     if corners is not None:
         if as_is or model.velocity is None or model.step is None:
-            why = "--as_is measures no ground" if as_is else f"{map} was learnt without --velocity"
-            raise InputError(f"--corners {corners}: {why}; expected one that does")
+            why = "--as_is measures no ground" if as_is else f"{map} was learned without --velocity"
+            raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
         check_corners(corners)
         model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
-    model.velocity = None if as_is else model.velocity
+    if as_is:
+        model.velocity = None
     model.threshold = model.threshold if threshold is None else threshold
-    if model.threshold is None:
-        print("no threshold given or stored in the map: every query with a finite score is accepted")
-    if not model.map.plan:
-        print("the map holds no layers: no place can be reported")
-    traverse, shown = open_source(source), None
+    query = open_source(source)
     if model.step is not None:
-        traverse = model.evenly(traverse, model.step, progress=True)
-        _tell_spacing(traverse)
-        frame = traverse.frame if isinstance(traverse, ResampledTraverse) else None
-        shown = Shown(frame, model.map.frame)
-    queries, accepted = write_matches(out, model.matches(traverse, progress=True), shown)
-    print(f"{queries} queries, {accepted} accepted; written to {out}")
+        query = model.resample(query, model.step, progress=True)
+        _print_steps(query)
+    total, accepted = _write_matches(out, model.matches(query, "localizing"), query, model)
+    if not model.map.summary().covered:
+        print("the map holds no layers: no place can be reported")
+    elif model.threshold is None:
+        print("no threshold given or stored in the map: every query with a finite score is accepted")
+    print(f"{total} queries, {accepted} accepted; written to {out}")
+    table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
+    _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
 
 def run_compare(
     reference: str,
     query: str,
-    truth: str | None,
-    tolerance: int,
-    interpolate: bool,
-    leave_out: int | None,
-    map: Path | None,
+    *,
     out: Path,
+    truth: str | None = None,
+    tolerance: int = 5,
+    interpolate: bool = False,
+    leave_out: int | None = None,
+    map: Path | None = None,
     model: DejaVu,
     command: str,
 ) -> None:
-    """Learn, or take a map; localize and judge; report beside baselines and null control."""
-    if map is not None:  # features of this package build themselves
-        threshold = model.threshold
-        model = DejaVu.load(map, None if isinstance(model.features, HOG) else model.features)
-        model.threshold = model.threshold if threshold is None else threshold
-    pair = open_source(reference), open_source(query)
+    """Learn, localize and evaluate, beside baselines and null control.
+
+    Args:
+        reference: traverse to learn, a source as of `dejavu learn`
+        query: second traverse, likewise
+        out: folder for report, pictures, matches.csv and map.safetensors
+        truth: offset (place = query + offset), csv of query,place[,place...], npz with GThard, or utm:25 for
+            coordinates in image names
+        tolerance: right within this many places, inclusive
+        interpolate: fill in a csv that lists some queries only
+        leave_out: diagnostic, the reference on itself with this many frames to each side left out
+        map: evaluate this map of the reference, with its own settings, instead of learning one
+    """
+    from dejavu_torch.experiments.compare import compare
+    from dejavu_torch.features.hog import HOG
+
+    if map is not None:
+        given = model
+        model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
+        model.threshold = model.threshold if given.threshold is None else given.threshold
+    sources = open_source(reference), open_source(query)
     _make_report_folder(out, reference, query)
     result = compare(
-        *pair, truth, model, tolerance, leave_out, interpolate=interpolate, progress=True, learn=map is None
+        *sources,
+        truth,
+        model,
+        tolerance=tolerance,
+        leave_out=leave_out,
+        interpolate=interpolate,
+        progress=True,
     )
+    if map is None or map.resolve() != (out / KEPT_MAP).resolve():
+        result.model.save(out / KEPT_MAP)
     _publish(result, out, f"{query} found on {reference}", command)
 
 
 def run_evaluate(
     matches: Path,
+    *,
     truth: str,
-    tolerance: int,
-    interpolate: bool,
-    reference: str | None,
-    query: str | None,
-    map: Path | None,
     out: Path,
+    tolerance: int = 5,
+    interpolate: bool = False,
+    reference: str | None = None,
+    query: str | None = None,
+    map: Path | None = None,
     command: str,
 ) -> None:
-    """Judge the matches in a csv, whatever found them."""
-    one, other = (None if source is None else open_source(source) for source in (reference, query))
+    """Evaluate the matches in a csv, whatever found them: scores, curve, coverage.
+
+    Args:
+        matches: csv of query,place,score[,accepted]
+        truth: as of `dejavu compare`
+        out: folder for report and pictures
+        tolerance: right within this many places, inclusive
+        interpolate: fill in a csv that lists some queries only
+        reference: says how many frames there are, and has the coordinates for utm; as of `dejavu learn`
+        query: as --reference, of the queries
+        map: says how many frames there are, and which place each of them is where the map's are resampled
+    """
+    from dejavu_torch.evaluation.report import write_report
+    from dejavu_torch.experiments.evaluate import evaluate_file
+
+    first, second = (None if source is None else open_source(source) for source in (reference, query))
     _make_report_folder(out, reference, query)
-    result = evaluate_file(matches, truth, tolerance, interpolate, one, other, map)
-    write_report(out, result.report, result.pictures, f"{matches} judged by {truth}", command)
+    result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map)
+    write_report(out, result.report, result.pictures, f"{matches} evaluated by {truth}", command)
     _print_scores(result.report, out)
 
 
-def run_reproduce(dataset: str, out: Path, seed: int, tolerance: int, command: str) -> None:
-    """The paper's datasets, beside the paper's own numbers."""
-    make_output_folder(out)
+def run_reproduce(
+    dataset: str = "all", *, out: Path, seed: int = 0, tolerance: int = 5, command: str
+) -> None:
+    """The paper's datasets, simulated, beside the paper's own numbers.
+
+    Args:
+        dataset: aerial, outdoor, underground or all
+        out: folder for the reports
+        seed: which routes
+        tolerance: right within this many places, inclusive
+    """
+    from dejavu_torch.evaluation.report import text_table, write_index, write_report
+    from dejavu_torch.experiments.paper_tables import (
+        FOOTAGE,
+        PUBLISHED,
+        boundary_lines,
+        route_lines,
+        section_five,
+    )
+    from dejavu_torch.experiments.reproduce import lengths_picture, reproduce
+
     names = list(PUBLISHED) if dataset == "all" else [dataset]
+    make_output_folder(out)
     reports: dict[str, Report] = {}
     for name in names:
         print(f"{name}: a second traverse, the database itself, chunks of other lengths", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
         make_output_folder(out / name)
-        title, plan = f"dejavu reproduce: {name}", describe(result.model.certificate)
+        title, plan = f"dejavu reproduce: {name}", str(result.model.summary())
         write_report(out / name, result.report, result.pictures, title, command, plan)
-        write_matches(out / name / "matches.csv", [result.match], result.shown)
+        _write_matches(out / name / "matches.csv", [result.match], result.query, result.model)
         reports[name] = result.report
     rows, notes = section_five(reports), [*route_lines(reports), *boundary_lines(reports), FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
     write_index(out, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
     print("\n".join([text_table(rows), *notes]))
-    print(f"right within {tolerance} places; report: {out / 'index.html'}")
+    print(f"right within {tolerance} places; next: open {out / 'index.html'}")
 
 
-def run_info(map: Path, features: Any) -> None:
-    """Tell what is in a map."""
+def run_bench(what: str = "matcher", *, out: Path) -> None:
+    """Time this package beside what a user would pick instead.
+
+    Args:
+        what: matcher (HOG, L1 distances)
+        out: folder for bench.json and bench.png
+    """
+    from dejavu_torch.evaluation.report import text_table
+    from dejavu_torch.experiments import bench
+
+    rows = bench.run_bench(what, out)
+    print(text_table(bench.bench_table(rows)))
+    if any("No module" in (row.skipped or "") for row in rows):
+        print("what is skipped needs pip install '.[bench]'")
+    print(f"x ours: seconds / those of the fastest dejavu; next: open {out / 'bench.png'}")
+
+
+def run_info(map: Path, *, features: nn.Module | None = None) -> None:
+    """What is in a map, and its summary.
+
+    Args:
+        map: map file
+        features: class of the map's features, if not ours
+    """
+    from dejavu_torch.database.l1 import l1_backend
+    from dejavu_torch.periods.stft import BACKEND
+
     model = DejaVu.load(map, features)
-    _print_plan(model)
-    if model.learnt_from is not None:
-        kind = "frames of " if len(model.learnt_from) == 3 else "ready features, "
-        print(f"learnt from {kind}{' x '.join(str(n) for n in model.learnt_from)}")
-    parts = [model.preprocess, model.features, model.periods, model.matcher]
+    _print_map(model)
+    if model.frame_shape is not None:
+        kind = "frames of " if len(model.frame_shape) == 3 else "ready features, "
+        print(f"learned from {kind}{' x '.join(str(n) for n in model.frame_shape)}")
+    parts = [model.preprocess, model.features, model.mapper, *model.mapper.children()]
     if model.step is not None and model.velocity is not None:
         print(f"places are {model.step:.4g} pixels of ground apart")
         parts.append(model.velocity)
     for part in parts:
-        print(f"{type(part).__name__}: {part.extra_repr()}")
+        if part in parts[:3] or part.extra_repr():
+            print(f"{type(part).__name__}: {part.extra_repr()}")
     if model.trained is not None:
         steps, seconds, seed = model.trained
         print(f"trained for {steps} steps in {seconds:.0f} s, seed {seed}")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
+    _print_next("localize", map, "QUERY", "--out", "matches.csv")
 
 
-def run_bench(what: str, out: Path) -> None:
-    """Time this package beside what a user would pick instead."""
-    rows = bench.run_bench(what, out)
-    print(text_table(bench.bench_table(rows)))
-    if any("No module" in (row.skipped or "") for row in rows):
-        print("what is skipped comes with pip install '.[bench]'")
-    print(f"x ours: seconds / those of the fastest dejavu; written to {out / 'bench.json'}")
+def run_train(*arguments: str) -> None:
+    """Train features that repeat, end to end: fit, validate or test; see `dejavu train fit --help`."""
+    from dejavu_torch.cli import train  # Lightning, which takes seconds to import
+
+    train.run_train(arguments)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": run_demo,
+    "learn": run_learn,
+    "localize": run_localize,
+    "compare": run_compare,
+    "evaluate": run_evaluate,
+    "reproduce": run_reproduce,
+    "train": run_train,
+    "bench": run_bench,
+    "info": run_info,
+}
 
 
 def _make_report_folder(out: Path, *sources: str | None) -> None:
@@ -192,29 +302,48 @@ def _make_report_folder(out: Path, *sources: str | None) -> None:
     make_output_folder(out)
 
 
-def _tell_spacing(traverse: Traverse) -> None:
+def _print_steps(traverse: Traverse) -> None:
     if isinstance(traverse, ResampledTraverse):
-        frames, steps = len(traverse.way), f"even steps of {traverse.step:.4g} pixels of ground"
-        print(f"{frames} frames make {traverse.length} {steps}")
+        steps = f"even steps of {traverse.step:.4g} pixels of ground"
+        print(f"{len(traverse.positions)} frames make {traverse.length} {steps}")
 
 
-def _print_plan(model: DejaVu) -> None:
-    if not model.map.plan:
+def _print_map(model: DejaVu) -> None:
+    summary = model.summary()
+    if not summary.covered:
         print("this route does not repeat")
-    print(describe(model.certificate))
+    print(summary)
 
 
-def _publish(result: Comparison, out: Path, title: str, command: str, save_map: bool = False) -> None:
-    _print_plan(result.model)
+def _print_next(*words: str | Path) -> None:
+    print(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
+
+
+def _publish(result: Comparison, out: Path, title: str, command: str) -> None:
+    """Write matches and report of a comparison, and print its scores."""
+    from dejavu_torch.evaluation.report import write_report
+
+    _print_map(result.model)
     if result.report.ours.scores is None:
         print("nothing tells which places are right, see --truth: matches and pictures, no scores")
-    write_matches(out / "matches.csv", [result.match], result.shown)
-    if save_map:
-        result.model.save(out / "map.safetensors")
-    write_report(out, result.report, result.pictures, title, command, describe(result.model.certificate))
+    _write_matches(out / "matches.csv", [result.match], result.query, result.model)
+    write_report(out, result.report, result.pictures, title, command, str(result.model.summary()))
     _print_scores(result.report, out)
 
 
+def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model: DejaVu) -> tuple[int, int]:
+    """Write the matches of a query that the map was asked for; returns how many (queries, accepted)."""
+    from dejavu_torch.evaluation.matches import write_matches
+
+    frames, source = None, query
+    if isinstance(query, ResampledTraverse):
+        frames, source = query.frame, query.traverse
+    return write_matches(path, matches, frames, model.map.frame_of, source.frame_name, model.frame_name)
+
+
 def _print_scores(report: Report, out: Path) -> None:
+    from dejavu_torch.evaluation.report import score_table, summary, text_table
+
     print(text_table(score_table(report)))
-    print(f"{summary(report)} Report: {out / 'index.html'}")
+    print(summary(report))
+    print(f"next: open {out / 'index.html'}")

@@ -60,6 +60,8 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         InputError: missing, truncated, foreign, or of another format.
     """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected a map file written by `dejavu learn`")
     if not path.is_file():
         raise InputError(f"{path} is not there; expected a map file written by `dejavu learn`")
     try:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import torch
-from kornia.color import rgb_to_grayscale
-from kornia.geometry.transform import resize as antialiased_resize
 from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
+from dejavu_torch.features.preprocess import select_channel
 from dejavu_torch.features.whitening import learned_whitening
+from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError
 
 
@@ -195,11 +195,10 @@ class Embedding(nn.Module):
         """Descriptors, the pooled output of the network: (B,C,H,W) -> (B,K)."""
         if frames.ndim != 4 or frames.shape[1] not in (1, 3):
             raise InputError(f"Embedding got frames {tuple(frames.shape)}; expected (B,1,H,W) or (B,3,H,W)")
-        if self.channels == 1 and frames.shape[1] == 3:
-            frames = rgb_to_grayscale(frames)
+        if self.channels == 1:
+            frames = select_channel(frames, "grey")
         frames = frames.expand(-1, self.channels, -1, -1)
-        if tuple(frames.shape[-2:]) != self.resize:
-            frames = antialiased_resize(frames, self.resize, antialias=True)
+        frames = resize_frames(frames, self.resize)
         if self.cell:
             frames = local_contrast(frames, self.cell)
         return self._pooled(self.network(frames))

@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-from kornia.color import rgb_to_grayscale
-from kornia.geometry.transform import get_perspective_transform, warp_perspective
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
@@ -93,6 +91,9 @@ def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, 
         )
     if min(frames.shape[-2:]) < 2:
         raise InputError(f"frames of {frames.shape[-2]} x {frames.shape[-1]} pixels; expected at least 2 x 2")
+    from kornia.color import rgb_to_grayscale  # loading kornia takes a third of a second
+    from kornia.geometry.transform import get_perspective_transform, warp_perspective
+
     grey = frames if frames.shape[1] == 1 else rgb_to_grayscale(frames)
     grey = conv2d(pad(grey, (0, 0, 1, 1), mode="replicate"), grey.new_tensor([1, 2, 1]).view(1, 1, 3, 1) / 4)
     scale = grey.new_tensor([grey.shape[-1] - 1, grey.shape[-2] - 1])

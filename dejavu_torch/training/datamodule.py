@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from kornia.geometry.transform import resize as antialiased_resize
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
@@ -21,6 +20,7 @@ from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 READ_AT_ONCE = 64  # frames
@@ -265,8 +265,8 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
     def rows() -> Iterator[Tensor]:
         nonlocal shape
         for batch in traverse.batches(READ_AT_ONCE):
-            if batch.ndim == 4 and resize is not None and tuple(batch.shape[-2:]) != resize:
-                batch = antialiased_resize(batch, resize, antialias=True)
+            if batch.ndim == 4:
+                batch = resize_frames(batch, resize)
             if shape and tuple(batch.shape[1:]) != shape:
                 raise InputError(
                     f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}; "

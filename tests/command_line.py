@@ -1,0 +1,50 @@
+"""The commands as a user calls them, for several test files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dejavu_torch.cli import main
+
+
+def run(*arguments: str | Path) -> None:
+    main([str(argument) for argument in arguments])
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Run a command that must fail; its one line on stderr."""
+    with pytest.raises(SystemExit) as stop:
+        run(*arguments)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("dejavu: ")
+    assert error.count("\n") == 1
+    assert error.endswith("\n")
+    assert "Traceback" not in error
+    return error
+
+
+def frames(count: int, seed: int = 0, size: int = 32) -> np.ndarray:
+    """Frames of a texture that slides past with period 16, with noise."""
+    noise = np.random.default_rng(seed)
+    texture = np.random.default_rng(99).integers(40, 215, (size, size))
+    rolled = [np.roll(texture, 2 * i, axis=1) for i in range(count)]
+    return np.clip(np.stack(rolled) + noise.normal(0, 8, (count, size, size)), 0, 255).astype(np.uint8)
+
+
+def write_images(folder: Path, images: np.ndarray) -> Path:
+    folder.mkdir()
+    for i, image in enumerate(images):
+        Image.fromarray(image).save(folder / f"{i}.png")
+    return folder
+
+
+def report_of(folder: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    return report
