@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from dejavu_torch.data.truth import as_truth
 from footage import QUERY, REFERENCE, camera
 from footage import footage as ground
 from helpers import refused
@@ -16,7 +17,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truth import as_truth
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.training.datamodule import Batch, Clips, RouteData, StoredFrames, as_frames, store
 from dejavu_torch.types import GroundTruth

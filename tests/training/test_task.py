@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from dejavu_torch.data.truthfile import find_truth
 from footage import QUERY, REFERENCE, STEP, camera
 from footage import footage as ground
 from helpers import Fixed, refused
@@ -29,7 +30,6 @@ from torch.optim import AdamW
 
 from dejavu_torch import DejaVu, Preprocess, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.truthfile import find_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.training.datamodule import RouteData
