@@ -131,9 +131,9 @@ def summary(report: Report) -> str:
     right = f"right within {facts['tolerance']} {facts.get('unit', 'frames')}"
     right += f" of the truth ({facts['truth']})" if facts.get("truth") else ""
     lines = [f"{facts['queries']} queries{places}; {right if report.ours.scores else 'nothing is scored'}"]
-    if "spacing" in facts:
+    if "resampling" in facts:
         step, reference, query = (
-            facts["spacing"][key] for key in ("step", "reference_frames", "query_frames")
+            facts["resampling"][key] for key in ("step", "reference_frames", "query_frames")
         )
         both = f"of the reference and {query} of the query" if query else "of the reference"
         lines.append(f"{reference} frames {both} were resampled to even steps of {step:.4g} pixels of ground")

@@ -17,7 +17,6 @@ from dejavu_torch.data.ground_truth import (
     as_ground_truth,
     check_ground_truth,
     describe_ground_truth,
-    find_ground_truth,
     ground_truth_in_places,
 )
 from dejavu_torch.database.l1 import l1_backend
@@ -36,7 +35,7 @@ from dejavu_torch.evaluation.report import Report
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
@@ -97,7 +96,7 @@ def compare(
     model = DejaVu() if model is None else model
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
     _check_sizes(model, reference, query)
-    clock, sources, has_map = Clock(), (reference, query), model.map.places > 0
+    clock, has_map = Clock(), model.map.places > 0
     with clock("learn"):
         reference = model.resample(reference, model.step if has_map else None, progress)
     with clock("localize"):
@@ -105,7 +104,7 @@ def compare(
     known = None
     early = reference.length is not None and query.length is not None
     if early:  # a ground truth that does not fit is refused before the long work
-        known = _ground_truth(truth, sources, reference, query, interpolate)
+        known = ground_truth_of(truth, reference, query, interpolate=interpolate)
     if reference.name == query.name:
         log.warning(
             "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
@@ -118,7 +117,7 @@ def compare(
         match = model.localize(query_features)
     if not early:
         lengths = len(reference_features), len(query_features)
-        known = _ground_truth(truth, sources, reference, query, interpolate, lengths)
+        known = ground_truth_of(truth, reference, query, *lengths, interpolate)
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
     match = of_shown_frames(match, model.map)
@@ -126,7 +125,7 @@ def compare(
     contenders = _contenders(run, seed, leave_out, progress)
     facts = _facts(run, clock)
     if known is not None:
-        positions = all(source.place is not None for source in sources)
+        positions = all(source_of(one).place is not None for one in (reference, query))
         facts |= count_queries(match, known, tolerance)
         facts["truth"] = describe_ground_truth(truth, interpolate, positions)
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
@@ -171,23 +170,6 @@ def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
             for traverse, count in zip((reference, query), counts, strict=True)
         )
         raise InputError(f"{seen}; expected as many, as frames of one size give")
-
-
-def _ground_truth(
-    truth: str | None,
-    sources: tuple[Traverse, Traverse],
-    reference: Traverse,
-    query: Traverse,
-    interpolate: bool,
-    lengths: tuple[int, int] | None = None,
-) -> GroundTruth | None:
-    """The ground truth of the queries, in frames of the reference's source."""
-    resampled = isinstance(reference, ResampledTraverse)
-    places, queries = (reference.length, query.length) if lengths is None else lengths
-    frames = len(reference.positions) if isinstance(reference, ResampledTraverse) else places
-    numbers = query.frame if isinstance(query, ResampledTraverse) else queries
-    assert numbers is not None
-    return find_ground_truth(truth, *sources, frames, numbers, interpolate, resampled)
 
 
 def _learn(model: DejaVu, reference: Traverse, has_map: bool, tolerance: int, progress: bool) -> Tensor:

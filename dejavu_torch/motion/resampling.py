@@ -8,9 +8,10 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.positions import NEAR, first_reached, look_up, nearest_places, shown_frames
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -127,3 +128,31 @@ def _warn_doubtful(moved: Tensor, name: str) -> None:
             "%s: %d of %d steps go forward and %d backwards: do the corners show ground that comes nearer?",
             *(name, forward, len(moved), back),
         )
+
+
+def source_of(traverse: Traverse) -> Traverse:
+    """The traverse whose frames a user counts: the inner one of a resampled traverse."""
+    return traverse.traverse if isinstance(traverse, ResampledTraverse) else traverse
+
+
+def ground_truth_of(
+    truth: str | None,
+    reference: Traverse,
+    query: Traverse,
+    places: int | None = None,
+    queries: int | None = None,
+    interpolate: bool = False,
+) -> GroundTruth | None:
+    """`find_ground_truth` of traverses that may be resampled, in frames of the reference's source.
+
+    Args:
+        places, queries: how many frames the traverses gave, needed where they do not know their lengths.
+    """
+    frames = source_of(reference).length if places is None else places
+    if isinstance(reference, ResampledTraverse):
+        frames = len(reference.positions)
+    numbers = query.frame if isinstance(query, ResampledTraverse) else queries or query.length
+    if numbers is None:
+        raise InputError(f"{query.name} does not know how many frames it has; expected their number")
+    sources = source_of(reference), source_of(query)
+    return find_ground_truth(truth, *sources, frames, numbers, interpolate, reference is not sources[0])

@@ -12,14 +12,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.truth import Shown, as_truth
-from dejavu_torch.data.truthfile import find_truth
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
@@ -99,11 +98,11 @@ class RouteData(LightningDataModule):
             or a tensor of frames or features (see `ArrayTraverse`).
         second: another traverse of the same route to train on as well: its frames are positives of the
             places they show.
-        second_truth: which places those are, see `find_truth`.
+        second_truth: which places those are, see `find_ground_truth`.
         validation: a traverse to validate on during training. None: the reference itself under augmentation,
             the same each time; its figures say what is learned, not how another traverse fares.
-        validation_truth: see `find_truth`.
-        query: the traverse that `test` localizes. truth: its places, see `find_truth`.
+        validation_truth: see `find_ground_truth`.
+        query: the traverse that `test` localizes. truth: its places, see `find_ground_truth`.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
@@ -155,8 +154,7 @@ class RouteData(LightningDataModule):
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
         self.velocity = velocity
-        self.raw: Traverse  # the reference as it is read
-        self.reference: Traverse  # the same at even steps, where there is `velocity`
+        self.reference: Traverse  # at even steps, where there is `velocity`
         self.sets: dict[str, StoredFrames] = {}
         self._size: tuple[int, int] | None = None  # of the stored frames
 
@@ -168,11 +166,12 @@ class RouteData(LightningDataModule):
             self.sets.clear()
             self._size = size
         if "reference" not in self.sets:
-            self.raw = _open(self.sources["source"])
-            self.reference = self._resampled(self.raw)
+            self.reference = self._resampled(_open(self.sources["source"]))
             values = store(self.reference, size)
             self._check_length(self.reference.name, len(values))
-            self.sets["reference"] = StoredFrames([values], as_truth(torch.arange(len(values))[:, None]))
+            self.sets["reference"] = StoredFrames(
+                [values], as_ground_truth(torch.arange(len(values))[:, None])
+            )
         needed = {"fit": ("second", "validation"), "validate": ("validation",), "test": ("query",)}
         for name in needed.get(stage, ()):
             if self.sources[name] is not None and name not in self.sets:
@@ -181,9 +180,9 @@ class RouteData(LightningDataModule):
             raise InputError("there is nothing to test on; expected data.query, a second traverse")
 
     def _read(self, name: str) -> StoredFrames:
-        raw, reference = _open(self.sources[name]), self.sets["reference"].values
+        reference = self.sets["reference"].values
         step = self.reference.step if isinstance(self.reference, ResampledTraverse) else None
-        traverse = self._resampled(raw, step)
+        traverse = self._resampled(_open(self.sources[name]), step)
         values = store(traverse, self._size)
         self._check_length(traverse.name, len(values))
         if values.shape[1:] != reference.shape[1:]:
@@ -192,17 +191,15 @@ class RouteData(LightningDataModule):
                 f"{tuple(reference.shape[1:])}; expected the same channels, and one size, as data.resize "
                 "makes"
             )
-        shown = None
-        if isinstance(self.reference, ResampledTraverse):
-            frame = traverse.frame if isinstance(traverse, ResampledTraverse) else None
-            shown = Shown(frame, self.reference.frame, self.reference.place_of, raw.length)
-        known = find_truth(self.truths[name], self.raw, raw, len(reference), len(values), shown=shown)
+        known = ground_truth_of(self.truths[name], self.reference, traverse, len(reference), len(values))
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
             raise InputError(
                 f"there is no ground truth for {traverse.name}: it has {len(values)} frames, the reference "
                 f"{len(reference)} places; expected {option}"
             )
+        if isinstance(self.reference, ResampledTraverse):
+            known = ground_truth_in_places(known, self.reference.place_of)
         return StoredFrames([values], known)
 
     def _resampled(self, traverse: Traverse, step: float | None = None) -> Traverse:
@@ -225,7 +222,7 @@ class RouteData(LightningDataModule):
         width = max(part.shape[1] for part in positives)
         pad = torch.nn.functional.pad
         joined = torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives])
-        frames = StoredFrames([part.values for part in sets], as_truth(joined))
+        frames = StoredFrames([part.values for part in sets], as_ground_truth(joined))
         return _loader(frames, Clips(lengths, self.batch_size, self.clip))
 
     def val_dataloader(self) -> DataLoader[Batch]:

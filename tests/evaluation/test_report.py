@@ -123,7 +123,7 @@ def test_the_summary_tells_what_was_scored() -> None:
         "accepted": 9,
         "accepted_right": 8,
         "threshold_of_full_precision": 0.25,
-        "spacing": {"step": 2.5, "reference_frames": 40, "query_frames": None},
+        "resampling": {"step": 2.5, "reference_frames": 40, "query_frames": None},
         "seconds_learn": 1.25,
         "seconds_localize": 2.0,
     }
@@ -140,7 +140,7 @@ def test_the_summary_tells_what_was_scored() -> None:
         assert words in text
     short = summary(report())
     assert short == "20 queries; right within 3 frames."
-    facts["spacing"]["query_frames"] = 30  # type: ignore[index]
+    facts["resampling"]["query_frames"] = 30  # type: ignore[index]
     assert "40 frames of the reference and 30 of the query were resampled" in summary(report(facts))
 
 

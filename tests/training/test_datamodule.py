@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from dejavu_torch.data.truth import as_truth
 from footage import QUERY, REFERENCE, camera
 from footage import footage as ground
 from helpers import refused
@@ -17,6 +16,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.training.datamodule import Batch, Clips, RouteData, StoredFrames, as_frames, store
 from dejavu_torch.types import GroundTruth
@@ -99,7 +99,7 @@ def test_validation_and_query_come_in_order_as_they_are() -> None:
 
 def test_parts_are_as_one_behind_the_other() -> None:
     parts = [store(numbered(count, first)) for count, first in ((5, 0), (3, 50), (4, 90))]
-    frames = StoredFrames(parts, as_truth(torch.arange(12)[:, None]))
+    frames = StoredFrames(parts, as_ground_truth(torch.arange(12)[:, None]))
     assert len(frames) == 12
     index = torch.randperm(12).repeat(2)
     batch = frames[index.tolist()]
@@ -107,7 +107,7 @@ def test_parts_are_as_one_behind_the_other() -> None:
     assert torch.equal(batch.truth.positives[:, 0], index)
     assert torch.equal(frames[[5]].frames, as_frames(parts[1][:1]))
     features = [torch.randn(4, 3, dtype=torch.float64) for _ in range(2)]
-    both = StoredFrames(features, as_truth(torch.arange(8)[:, None]))
+    both = StoredFrames(features, as_ground_truth(torch.arange(8)[:, None]))
     assert torch.equal(both[[7, 0]].frames, torch.stack([features[1][3], features[0][0]]))
 
 
@@ -116,7 +116,7 @@ def test_other_traverses_come_at_the_reference_s_steps(tmp_path: Path, stage: st
     """Of their own they would take twice as large ones, and their truth tells frames."""
     nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
     rows = "".join(f"{q},{p}\n" for q, p in enumerate(nearest))
-    (tmp_path / "truth.csv").write_text(f"query_frame,place_frame\n{rows}")
+    (tmp_path / "truth.csv").write_text(f"query,place\n{rows}")
     other, truth = ArrayTraverse(ground(QUERY)), str(tmp_path / "truth.csv")
     given: dict[str, Any] = {"query": other, "truth": truth}
     if stage == "fit":
@@ -181,7 +181,7 @@ def test_a_clip_gets_one_change_and_clips_differ() -> None:
 
 
 def validated(data: RouteData, frames: Tensor, first: int = 0) -> Tensor:
-    return data.validated(Batch(frames, as_truth(torch.arange(first, first + len(frames))[:, None])))
+    return data.validated(Batch(frames, as_ground_truth(torch.arange(first, first + len(frames))[:, None])))
 
 
 def test_the_reference_is_validated_under_the_same_changes_each_time() -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from dejavu_torch.data.truthfile import find_truth
 from footage import QUERY, REFERENCE, STEP, camera
 from footage import footage as ground
 from helpers import Fixed, refused
@@ -248,7 +247,7 @@ def assert_figures(running: Trainer, task: PlaceRecognitionTask, noisy: Tensor, 
     data = data_of(query=ArrayTraverse(noisy), truth=truth)
     (figures,) = running.test(task, data, verbose=False)
     match = DejaVu.load(Path(running.default_root_dir) / "map.safetensors").localize(ArrayTraverse(noisy))
-    known = find_truth(truth, None, None, FRAMES, FRAMES)
+    known = find_ground_truth(truth, None, None, FRAMES, FRAMES)
     assert known is not None
     expected = evaluate(match, known, tolerance=2)._asdict()
     assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
