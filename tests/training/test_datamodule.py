@@ -240,7 +240,7 @@ def test_frames_are_kept_as_bytes_and_resized() -> None:
         ({"second": numbered(24, 100), "second_truth": "24"}, ("no query has a right answer",)),
         ({"second": "nowhere"}, ("nowhere is not there",)),
     ],
-    ids=str,
+    ids=lambda value: " ".join(value),
 )
 def test_what_does_not_fit_is_refused(settings: dict[str, Any], words: tuple[str, ...]) -> None:
     with refused(*words):

@@ -29,6 +29,7 @@ from torch.optim import AdamW
 
 from dejavu_torch import DejaVu, Preprocess, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.training.datamodule import RouteData
