@@ -72,7 +72,7 @@ def test_a_built_in_route(folder: Path, tmp_path: Path) -> None:
 def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, validations and checkpoints have defaults; here but a few steps are taken."""
     monkeypatch.chdir(tmp_path)
-    np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 20, 24, 3), dtype=np.uint8))
+    np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 120, 160, 3), dtype=np.uint8))
     seen: dict[str, object] = {}
 
     def taken(self: Trainer, model: object, datamodule: RouteData) -> None:
@@ -84,7 +84,7 @@ def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("dejavu_torch.cli.train.MapTrainer.fit", taken)
     main(["train", "fit", "--data.source", "photos.npy", "--trainer.accelerator", "cpu"])
     assert seen == {"steps": 3000, "every": 500, "epochs": None}
-    assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 20, 24)
+    assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 120, 160)
 
 
 def test_it_resumes(folder: Path, tmp_path: Path) -> None:
