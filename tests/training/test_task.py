@@ -29,6 +29,7 @@ from torch.optim import AdamW
 
 from dejavu_torch import DejaVu, Preprocess, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.training.datamodule import RouteData
@@ -226,6 +227,7 @@ def test_even_steps_are_places(tmp_path: Path) -> None:
     [
         ({}, None, (1, 16, 16), (1, 24, 24)),  # once, to what the backbone would resize them to
         ({}, (20, 20), (1, 20, 20), (1, 20, 20)),
+        ({"backbone": SmallCNN(8, 1, (32, 32), (4,))}, None, (1, 24, 24), (1, 24, 24)),  # never larger
         ({"preprocess": Preprocess(contrast="patch")}, None, (1, 24, 24), (1, 24, 24)),  # of the whole frame
         ({"backbone": nn.Sequential(nn.Flatten(), nn.Linear(576, 8))}, None, (1, 24, 24), (1, 24, 24)),
     ],
