@@ -43,7 +43,7 @@ def run(given: Sequence[str]) -> None:
         if name == "train":  # Lightning's own command line
             from dejavu_torch.cli.train import run_train
 
-            run_train(words)
+            run_train([*words[:1], *_config_first(words[1:])])
             return
         function = COMMANDS[name]
         chosen = parse(name, function, _config_first(_spelt_out(words)))

@@ -203,25 +203,6 @@ def print_written(export: MapExport, data: RouteData) -> None:
         print(f"dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")
 
 
-def preset_path(name_or_path: str) -> Path:
-    """The file of a preset such as `train_small`; a path as it is."""
-    folder = Path(__file__).parents[2] / "configs"
-    preset = folder / f"{name_or_path}.yaml"
-    return preset if preset.is_file() and not Path(name_or_path).exists() else Path(name_or_path)
-
-
-def configs_first(given: Sequence[str]) -> list[str]:
-    """The command line with its configs, presets as paths, ahead of the options, which have the last word."""
-    configs, others, words = [], [], iter(given[1:])
-    for word in words:
-        name, equals, value = word.partition("=")
-        if name in ("--config", "-c") and (equals or (value := next(words, ""))):
-            configs.append(f"--config={preset_path(value)}")
-        else:
-            others.append(word)
-    return [*given[:1], *configs, *others]
-
-
 def run_train(arguments: Sequence[str]) -> None:
     """Run `dejavu train ARGUMENTS`.
 
@@ -237,7 +218,7 @@ def run_train(arguments: Sequence[str]) -> None:
             PlaceRecognitionTask,
             RouteData,
             trainer_class=MapTrainer,
-            args=configs_first(arguments),
+            args=list(arguments),
             parser_kwargs={"prog": "dejavu train", "description": "Train features that repeat, end to end."},
             seed_everything_default=0,
             save_config_kwargs={"overwrite": True},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,8 +107,8 @@ class RouteData(LightningDataModule):
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
-        resize: (height, width) in pixels that frames are stored in; None is the `frame_size` of the task that
-            is trained, which is what its backbone resizes them to, and their own size where it has none.
+        resize: (height, width) in pixels that frames are stored in; None is what the backbone of the task
+            resizes them to (its `frame_size`) where that is smaller, and their own size otherwise.
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
 
@@ -156,18 +157,18 @@ class RouteData(LightningDataModule):
         self.velocity = velocity
         self.reference: Traverse  # at even steps, where there is `velocity`
         self.sets: dict[str, StoredFrames] = {}
-        self._size: tuple[int, int] | None = None  # of the stored frames
+        self._wanted: tuple[int, int] | None = None  # size of the stored frames, where it makes them smaller
 
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
         task = None if self.trainer is None else self.trainer.lightning_module
-        size = getattr(task, "frame_size", None) if self.resize is None else self.resize
-        if size != self._size:
+        wanted = getattr(task, "frame_size", None) if self.resize is None else self.resize
+        if wanted != self._wanted:
             self.sets.clear()
-            self._size = size
+            self._wanted = wanted
         if "reference" not in self.sets:
             self.reference = self._resampled(_open(self.sources["source"]))
-            values = store(self.reference, size)
+            values = store(self.reference, self._size)
             self._check_length(self.reference.name, len(values))
             self.sets["reference"] = StoredFrames(
                 [values], as_ground_truth(torch.arange(len(values))[:, None])
@@ -178,6 +179,13 @@ class RouteData(LightningDataModule):
                 self.sets[name] = self._read(name)
         if stage == "test" and "query" not in self.sets:
             raise InputError("there is nothing to test on; expected data.query, a second traverse")
+
+    @property
+    def _size(self) -> tuple[int, int] | None:
+        """(height, width) of stored frames; None is their own."""
+        shape = self.reference.frame_shape
+        smaller = self._wanted and len(shape) == 3 and math.prod(self._wanted) < math.prod(shape[1:])
+        return self._wanted if smaller or self.resize is not None else None
 
     def _read(self, name: str) -> StoredFrames:
         reference = self.sets["reference"].values

@@ -315,7 +315,9 @@ class PlaceRecognitionTask(pl.LightningModule):
             assert self.metric is not None  # setup made it
             frames = batch.frames if self.trainer.testing else self.data.validated(batch)
             with torch.autocast(self.device.type, enabled=False):
-                self.metric.update(best_match(self(frames)), batch.truth)
+                match = best_match(self(frames))
+            index = self.route.place_of(self.route.frame_of(match.index))  # one place for each frame shown
+            self.metric.update(match._replace(index=index), batch.truth)
 
     def on_validation_epoch_end(self) -> None:
         """Log what `evaluate` says; the reference itself, under augmentation, is no validation traverse."""

@@ -227,6 +227,7 @@ def test_even_steps_are_places(tmp_path: Path) -> None:
     [
         ({}, None, (1, 16, 16), (1, 24, 24)),  # once, to what the backbone would resize them to
         ({}, (20, 20), (1, 20, 20), (1, 20, 20)),
+        ({"backbone": SmallCNN(8, 1, (32, 32), (4,))}, None, (1, 24, 24), (1, 24, 24)),  # never larger
         ({"preprocess": Preprocess(contrast="patch")}, None, (1, 24, 24), (1, 24, 24)),  # of the whole frame
         ({"backbone": nn.Sequential(nn.Flatten(), nn.Linear(576, 8))}, None, (1, 24, 24), (1, 24, 24)),
     ],

@@ -20,7 +20,6 @@ from torch import nn
 
 from dejavu_torch import DejaVu, RouteData, TemplateMap
 from dejavu_torch.cli import main
-from dejavu_torch.cli.train import configs_first, preset_path
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.mapfile import read_map
 from dejavu_torch.database.summary import describe
@@ -72,7 +71,7 @@ def test_a_built_in_route(folder: Path, tmp_path: Path) -> None:
 def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, validations and checkpoints have defaults; here but a few steps are taken."""
     monkeypatch.chdir(tmp_path)
-    np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 20, 24, 3), dtype=np.uint8))
+    np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 120, 160, 3), dtype=np.uint8))
     seen: dict[str, object] = {}
 
     def taken(self: Trainer, model: object, datamodule: RouteData) -> None:
@@ -84,7 +83,7 @@ def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("dejavu_torch.cli.train.MapTrainer.fit", taken)
     main(["train", "fit", "--data.source", "photos.npy", "--trainer.accelerator", "cpu"])
     assert seen == {"steps": 3000, "every": 500, "epochs": None}
-    assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 20, 24)
+    assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 120, 160)
 
 
 def test_it_resumes(folder: Path, tmp_path: Path) -> None:
@@ -217,11 +216,6 @@ def test_export_makes_a_map_of_a_checkpoint(
 
 
 def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:
-    assert preset_path("train_small").is_file()
-    assert preset_path("train.yaml") == Path("train.yaml")
-    given = ["fit", "--trainer.max_steps", "5", "--config=train_road", "-c", "mine.yaml", "--x=1"]
-    expected = ["fit", f"--config={preset_path('train_road')}", "--config=mine.yaml"]
-    assert configs_first(given) == [*expected, "--trainer.max_steps", "5", "--x=1"]
     options = [
         "--trainer.max_steps",
         2,
