@@ -319,7 +319,7 @@ def test_a_foreign_safetensors_file_is_refused(path: Path, metadata: dict[str, s
 def test_a_missing_file_and_a_folder_are_refused(path: Path) -> None:
     with refused(str(path), "not there"):
         DejaVu.load(path)
-    with refused(str(path.parent), "not there"):
+    with refused(str(path.parent), "is a folder", "map file"):
         DejaVu.load(path.parent)
 
 
