@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.source import open_source
+from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.extract import feature_batches
@@ -35,7 +36,7 @@ def flights(data_dir: Path) -> tuple[Tensor, Tensor]:
 @pytest.fixture(scope="module")
 def paper(flights: tuple[Tensor, Tensor]) -> DejaVu:
     periods = SpectrogramAnalysis(peaks="bins", false_alarm=None, short="refuse")
-    return DejaVu(periods=periods, reduction="sum").learn(flights[0])
+    return DejaVu(mapper=TemplateMapper(periods, reduction="sum")).learn(flights[0])
 
 
 def test_layers_are_learnt_and_the_dashes_stand_out(paper: DejaVu) -> None:

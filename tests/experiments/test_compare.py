@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import Fixed, refused
-from test_evenly import QUERY, REFERENCE, STEP, camera
-from test_evenly import footage as ground
+from footage import QUERY, REFERENCE, STEP, camera, everything
+from footage import footage as ground
+from helpers import Fixed, refused, template_model
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, InputError, SpectrogramAnalysis
-from dejavu_torch.evaluation.controls import null_control
+from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.types import FrequencyLayer, Training, Traverse
@@ -29,7 +29,7 @@ def route(seed: int, frames: int = 240) -> torch.Tensor:
 
 @pytest.fixture
 def model() -> DejaVu:
-    return DejaVu(periods=SpectrogramAnalysis(window=240, min_period=4, strongest=1))
+    return template_model(periods=SpectrogramAnalysis(window=240, min_period=4, strongest=1))
 
 
 def test_scores_of_a_route_that_repeats(model: DejaVu) -> None:
@@ -54,7 +54,7 @@ def test_leave_out_is_printed_beside_never_instead(model: DejaVu) -> None:
 
 
 def test_the_seed_shuffles_the_null_only() -> None:
-    model = DejaVu(periods=SpectrogramAnalysis(window=240, false_alarm=None))
+    model = template_model(periods=SpectrogramAnalysis(window=240, false_alarm=None))
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
     first, second = (compare(*pair, model=model, seed=seed).report.as_json() for seed in (0, 1))
     assert first["auc"] == second["auc"]
@@ -67,7 +67,7 @@ def test_refuses_a_negative_tolerance(model: DejaVu) -> None:
 
 
 def test_a_callable_metric() -> None:
-    model = DejaVu(periods=SpectrogramAnalysis(window=240), metric=torch.cdist)
+    model = template_model(periods=SpectrogramAnalysis(window=240), metric=torch.cdist)
     result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model)
     assert result.report.as_json()["recall_at_1"] > 0
 
@@ -97,16 +97,16 @@ def trained(model: DejaVu) -> DejaVu:
     model.map.trainable(weights=True, start=torch.linspace(0.5, 1.5, 60))
     with torch.no_grad():
         model.map.templates.mul_(0.9)
-    model.map.settle()
-    model.matcher.temperature = 0.1
+    model.map.freeze()
+    model.map.temperature = 0.1
     model.trained = Training(steps=30, seconds=1000.0, seed=3)
     return model
 
 
-def test_a_map_that_is_there_is_judged_as_it_is(trained: DejaVu) -> None:
+def test_a_map_that_is_there_is_evaluated_as_it_is(trained: DejaVu) -> None:
     before, expected = trained.map, trained.localize(route(1))
     templates = before.templates.clone()
-    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=trained, learn=False)
+    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=trained)
     assert result.model.map is before
     assert torch.equal(before.templates, templates)
     for one, other in zip(result.match, expected, strict=True):
@@ -114,9 +114,10 @@ def test_a_map_that_is_there_is_judged_as_it_is(trained: DejaVu) -> None:
     report = result.report.as_json()
     assert report["trained"] == {"steps": 30, "seconds": 1000.0, "seed": 3}
     assert 1000 < report["seconds_learn"] < 1100
-    assert report["map_bytes"] == trained.map_bytes
-    # the area tells them apart: this map's is not the learnt map's
-    anew = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=trained).report.as_json()
+    assert report["map_bytes"] == trained.summary().map_bytes
+    # the area tells them apart: this map's is not that of one learned anew
+    fresh = with_mapper(trained, trained.mapper)
+    anew = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=fresh).report.as_json()
     assert anew["trained"] is None
     assert anew["seconds_learn"] < 100
     assert anew["auc"] != report["auc"]
@@ -124,7 +125,7 @@ def test_a_map_that_is_there_is_judged_as_it_is(trained: DejaVu) -> None:
 
 def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained: DejaVu) -> None:
     reference, query = route(0), route(1)
-    result = compare(ArrayTraverse(reference), ArrayTraverse(query), model=trained, learn=False, seed=5)
+    result = compare(ArrayTraverse(reference), ArrayTraverse(query), model=trained, seed=5)
     null = result.report.contenders["null"]
     assert null.name == "null: templates of shuffled frames"
     assert "null_same_plan" not in result.report.contenders
@@ -132,30 +133,25 @@ def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained:
     assert null.scores == evaluate(expected, torch.arange(240)[:, None], 5)
 
 
-def test_a_learnt_map_that_is_there_keeps_its_nulls(model: DejaVu) -> None:
+def test_a_map_that_is_there_keeps_its_nulls(model: DejaVu) -> None:
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    learnt = compare(*pair, model=model).report.as_json()
-    there = compare(*pair, model=model, learn=False).report.as_json()
+    learned = compare(*pair, model=model).report.as_json()
+    there = compare(*pair, model=model).report.as_json()
     for key in ("auc", "recall_at_1", "null", "null_same_plan", "stride", "trained", "periods"):
-        assert there[key] == learnt[key], key
+        assert there[key] == learned[key], key
 
 
 @pytest.mark.parametrize("kind", [ArrayTraverse, Unknown])
 @pytest.mark.parametrize("frames", [239, 241])
 def test_another_reference_than_the_map_s_is_refused(trained: DejaVu, frames: int, kind: Any) -> None:
     with refused(f"gives {frames} places", "holds 240", "expected the reference that it was made of"):
-        compare(kind(route(0, frames)), kind(route(1)), "0", model=trained, learn=False)
-
-
-def test_a_model_without_a_map_has_nothing_to_judge(model: DejaVu) -> None:
-    with refused("240 places", "holds 0"):
-        compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model, learn=False)
+        compare(kind(route(0, frames)), kind(route(1)), "0", model=trained)
 
 
 def test_features_of_another_dimension_than_the_map_s_are_refused(trained: DejaVu) -> None:
     pair = ArrayTraverse(route(0)[:, :59]), ArrayTraverse(route(1)[:, :59])
     with refused("59", "60"):
-        compare(*pair, model=trained, learn=False)
+        compare(*pair, model=trained)
 
 
 class Unreadable(ArrayTraverse):
@@ -167,44 +163,45 @@ class Unreadable(ArrayTraverse):
 
 def test_leaving_out_of_a_trained_map_is_refused_at_once(trained: DejaVu) -> None:
     with refused("leave_out is 2", "trained templates", "no means of frames"):
-        compare(Unreadable(route(0)), Unreadable(route(1)), model=trained, leave_out=2, learn=False)
-    # learnt anew they are means again
-    report = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=trained, leave_out=2).report
+        compare(Unreadable(route(0)), Unreadable(route(1)), model=trained, leave_out=2)
+    # learned anew they are means again
+    fresh = with_mapper(trained, trained.mapper)
+    report = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=fresh, leave_out=2).report
     assert "leave_out" in report.contenders
 
 
-def test_a_map_of_another_route_is_told_of(model: DejaVu, caplog: pytest.LogCaptureFixture) -> None:
-    def told(reference: Tensor) -> list[str]:
+def test_a_map_of_another_route_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    def warnings(reference: Tensor, tolerance: int = 2) -> list[str]:
         caplog.clear()
         pair = ArrayTraverse(reference, "one"), ArrayTraverse(route(1), "two")
-        compare(*pair, model=model, tolerance=2, learn=False)
+        compare(*pair, model=model, tolerance=tolerance)
         return [one.getMessage() for one in caplog.records]
 
-    model.periods = Fixed(FrequencyLayer(240, 240, 0, 240, tuple(range(60))))
-    model.learn(route(0))
-    assert told(route(0)) == []
-    (message,) = told(torch.randn(240, 60))
+    model = template_model(periods=Fixed(FrequencyLayer(240, 240, 0, 240, tuple(range(60))))).learn(route(0))
+    assert warnings(route(0)) == []
+    assert warnings(route(0), tolerance=0) == []
+    (message,) = warnings(torch.randn(240, 60))
     assert re.fullmatch(r"the map finds \d+ of 240 frames of one; expected the reference .*", message)
 
 
 def test_the_template_that_is_drawn_is_called_what_it_is(trained: DejaVu) -> None:
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    for learn, thick in ((False, "the trained template"), (True, "their mean")):
-        picture = compare(*pair, model=trained, learn=learn).pictures["templates"]
+    fresh = with_mapper(trained, trained.mapper)
+    for model, thick in ((trained, "the trained template"), (fresh, "their mean")):
+        picture = compare(*pair, model=model).pictures["templates"]
         assert f"thick: {thick}" in picture.plot[1][0].get_title(loc="left")
-        assert ("that training made of it" in picture.caption) != learn
+        assert ("that training made of it" in picture.caption) == (model is trained)
 
 
-def test_a_map_of_even_steps_is_judged_at_its_own_step() -> None:
+def test_a_map_of_even_steps_is_compared_at_its_own_step() -> None:
     """Not at the one that its reference would get of itself."""
-    everything = Fixed(FrequencyLayer(101, 101, 0, 101, tuple(range(900))))
     reference, query = ArrayTraverse(ground(REFERENCE)), ArrayTraverse(ground(QUERY))
-    model = DejaVu(periods=everything, velocity=camera()).learn(reference)
+    model = template_model(periods=everything(101), velocity=camera()).learn(reference)
     model.velocity = camera(step=None)
-    result = compare(reference, query, "0", model, learn=False)
-    assert len(result.stored) == len(result.seen) == 101
-    assert result.report.as_json()["spacing"]["step"] == STEP
-    assert result.report.as_json()["recall_at_1"] == 1
+    result = compare(reference, query, "0", model)
+    assert len(result.reference_features) == len(result.query_features) == 101
+    report = result.report.as_json()
+    assert (report["resampling"]["step"], report["unit"]) == (STEP, "places at even steps")
 
 
 # HOG beside other features
@@ -219,9 +216,11 @@ def pictures(seed: int, size: int = 24) -> ArrayTraverse:
 
 def contenders(features: nn.Module | None, size: int = 24, tolerance: int = 3) -> dict[str, Any]:
     periods = SpectrogramAnalysis(window=64, min_period=4, strongest=1)
-    model = DejaVu(features, periods)
+    model = template_model(features, periods)
     return dict(
-        compare(pictures(1, size), pictures(2, size), "0", model, tolerance).report.contenders.items()
+        compare(
+            pictures(1, size), pictures(2, size), "0", model, tolerance=tolerance
+        ).report.contenders.items()
     )
 
 
@@ -238,8 +237,8 @@ def test_hog_stands_beside_other_features() -> None:
 
 def test_the_curves_show_hog_as_well() -> None:
     periods = SpectrogramAnalysis(window=64, min_period=4, strongest=1)
-    model = DejaVu(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()), periods)
-    result = compare(pictures(1), pictures(2), "0", model, 3)
+    model = template_model(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()), periods)
+    result = compare(pictures(1), pictures(2), "0", model, tolerance=3)
     labels = [text.get_text() for text in result.pictures["auc"].plot[1].texts]
     assert {one.name for one in result.report.contenders.values()} < set(labels)
     assert {"HOG, every frame", "HOG, every 6th frame"} < set(labels)
@@ -248,10 +247,10 @@ def test_the_curves_show_hog_as_well() -> None:
 def test_whatever_stores_features_needs_the_backbone_as_well() -> None:
     net = nn.Sequential(nn.AvgPool2d(4), nn.Flatten(), nn.Linear(36, 40), nn.BatchNorm1d(40)).eval()
     weights = sum(tensor.nbytes for tensor in net.state_dict().values())
-    model = DejaVu(net, SpectrogramAnalysis(window=64, min_period=4, strongest=1))
-    report = compare(pictures(1), pictures(2), "0", model, 3).report.as_json()
+    model = template_model(net, SpectrogramAnalysis(window=64, min_period=4, strongest=1))
+    report = compare(pictures(1), pictures(2), "0", model, tolerance=3).report.as_json()
     assert report["backbone_bytes"] == weights > 0
-    assert report["map_bytes"] == model.map_bytes > weights
+    assert report["map_bytes"] == model.summary().map_bytes > weights
     for key in ("uncompressed", "stride", "stride_coarsest"):
         kept = -(-64 // report[key]["k"])
         assert report[key]["bytes"] == kept * 160 + weights, key

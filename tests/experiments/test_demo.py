@@ -90,7 +90,7 @@ def test_page_is_self_contained(demo: Path) -> None:
     assert page.count("data:image/png;base64,") == len(PICTURES)
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "right within 5 frames" in page
-    assert "null: all learnt shuffled" in page
+    assert "null: everything learned from shuffled frames" in page
     assert "<pre>dejavu demo --out" in page
     assert "dejavu_torch" in page
 
