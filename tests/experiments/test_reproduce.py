@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers import refused
 
-from dejavu_torch.cli import commands, main
+from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.data.source import open_source
@@ -138,7 +138,8 @@ def test_other_datasets_are_refused() -> None:
 def test_the_command_writes_an_index_over_the_reports(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(commands, "reproduce", partial(reproduce, frames=FRAMES, lengths=(1024,)))
+    short = partial(reproduce, frames=FRAMES, lengths=(1024,))
+    monkeypatch.setattr("dejavu_torch.experiments.reproduce.reproduce", short)
     main(["reproduce", "aerial", "--out", str(tmp_path / "out")])
     assert "aerial: the paper, its own footage" in capsys.readouterr().out
     page = (tmp_path / "out" / "index.html").read_text()
