@@ -43,7 +43,12 @@ def test_python_is_twelve_lines_at_most() -> None:
 def test_every_linked_file_is_there() -> None:
     links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
     assert links
-    assert [link for link in links if not (ROOT / link).exists()] == []
+    headings = {
+        line.lstrip("# ").lower().replace(" ", "-") for line in README.splitlines() if line[:1] == "#"
+    }
+    files, anchors = ([link for link in links if link.startswith("#") == anchor] for anchor in (False, True))
+    assert [link for link in files if not (ROOT / link).exists()] == []
+    assert [link for link in anchors if link[1:] not in headings] == []
 
 
 class Understood(Exception):
