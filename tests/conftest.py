@@ -11,6 +11,9 @@ from hypothesis import settings
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+# commands and notebooks run in processes of their own, beside each other
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # the same examples on every machine, however slow it is
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=40)
 settings.load_profile("repeatable")
