@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import math
 from collections.abc import Iterator
@@ -55,7 +56,6 @@ PARTS: dict[str, type[nn.Module]] = {
     "mapper": Mapper,
     "velocity": GroundOdometry,
 }
-SETTINGS = ("threshold", "batch_size")
 
 
 class DejaVu(nn.Module):
@@ -112,6 +112,10 @@ class DejaVu(nn.Module):
         self.frame_shape: tuple[int, ...] | None = None  # of the reference, or (D,) of ready features
         self.frame_names: list[str] = []  # of the reference's frames; empty where they have none
         self.trained: Training | None = None
+
+    def settings(self) -> dict[str, Any]:
+        """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
+        return {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
 
     def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
@@ -278,7 +282,10 @@ class DejaVu(nn.Module):
         tensors, header = read_map(Path(path))
         try:
             check_kind(header["map"])
-            model = cls(**_build_parts(header, features), **{name: header[name] for name in SETTINGS})
+            model = cls(
+                **_build_parts(header, features),
+                **{n: header[n] for n in inspect.signature(cls).parameters if n not in PARTS},
+            )
             model.set_extra_state({name: header[name] for name in model.get_extra_state()})
             names, frames = header["names"], len(tensors["map.positions"]) or header["map"]["places"]
             model.frame_names = [] if names is None else decode_names(names, frames)
@@ -300,7 +307,8 @@ class DejaVu(nn.Module):
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         parts = {name: getattr(self, name) for name in PARTS}
         header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
-        header |= {name: getattr(self, name) for name in SETTINGS} | self.get_extra_state()
+        header |= {name: value for name, value in self.settings().items() if name not in PARTS}
+        header |= self.get_extra_state()
         header["map"] = self.map.get_extra_state()
         header["names"] = encode_names(self.frame_names) if self.frame_names else None
         tensors = {f"map.{name}": t for name, t in self.map.state_dict().items() if isinstance(t, Tensor)}

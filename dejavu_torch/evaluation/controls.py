@@ -19,7 +19,7 @@ from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 def with_mapper(model: DejaVu, mapper: Mapper) -> DejaVu:
     """A model with the settings and the feature module of another, this mapper, and no map."""
-    return DejaVu(model.features, mapper, model.threshold, model.batch_size, model.preprocess, model.velocity)
+    return DejaVu(**model.settings() | {"mapper": mapper})
 
 
 def template_map_of(model: DejaVu, what: str) -> TemplateMap:
