@@ -27,6 +27,7 @@ from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match
@@ -169,7 +170,9 @@ class DejaVu(nn.Module):
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast are left as they are")
         with torch.no_grad():
-            route: PlaceMap = self.mapper(features)
+            route: PlaceMap = self.mapper(features).to(
+                self.map.positions.device
+            )  # spilled ones are on the CPU
         if route.places != len(features) or route.dimension != features.shape[1]:
             raise InputError(
                 f"{type(self.mapper).__name__} made a map of {route.places} places of {route.dimension} "
@@ -178,7 +181,7 @@ class DejaVu(nn.Module):
         self.step, source, frames = None, traverse, len(features)
         if isinstance(traverse, ResampledTraverse):
             self.step, source, frames = traverse.step, traverse.traverse, len(traverse.positions)
-            route.positions = traverse.positions.to(features.device)
+            route.positions = traverse.positions.to(self.map.positions.device)
             route.check()
         self.map = route
         self.frame_names = [] if source is None else names_of(source, frames)
@@ -287,13 +290,14 @@ class DejaVu(nn.Module):
                 **{n: header[n] for n in inspect.signature(cls).parameters if n not in PARTS},
             )
             model.set_extra_state({name: header[name] for name in model.get_extra_state()})
-            names, frames = header["names"], len(tensors["map.positions"]) or header["map"]["places"]
-            model.frame_names = [] if names is None else decode_names(names, frames)
             state: dict[str, Any] = {**tensors, "map._extra_state": header["map"]}
             loaded = model.load_state_dict(state, strict=False)
             missing = [name for name in loaded.missing_keys if name.startswith(("map.", "features."))]
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
+            frames = len(model.map.positions) or model.map.places
+            if model.frame_names and len(model.frame_names) != frames:
+                raise InputError(f"it names {len(model.frame_names)} frames; expected {frames}")
             resampled = model.velocity is not None and isinstance(model.step, float) and model.step > 0
             if (len(model.map.positions) > 0) != resampled or (model.step is not None) != resampled:
                 raise InputError(f"it has step {model.step!r} and {len(model.map.positions)} frame positions")
@@ -310,7 +314,6 @@ class DejaVu(nn.Module):
         header |= {name: value for name, value in self.settings().items() if name not in PARTS}
         header |= self.get_extra_state()
         header["map"] = self.map.get_extra_state()
-        header["names"] = encode_names(self.frame_names) if self.frame_names else None
         tensors = {f"map.{name}": t for name, t in self.map.state_dict().items() if isinstance(t, Tensor)}
         return tensors | self._weights(), header
 
@@ -329,13 +332,15 @@ class DejaVu(nn.Module):
     def get_extra_state(self) -> dict[str, Any]:
         """What the state_dict holds beside the tensors and the map's own state."""
         trained = self.trained and self.trained._asdict()
-        return {"frame_shape": self.frame_shape, "step": self.step, "trained": trained}
+        names = encode_names(self.frame_names) if self.frame_names else None
+        return {"frame_shape": self.frame_shape, "step": self.step, "trained": trained, "names": names}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` gave."""
         shape, trained = state["frame_shape"], state["trained"]
         self.frame_shape, self.step = shape and tuple(shape), state["step"]
         self.trained = trained and Training(**trained)
+        self.frame_names = [] if state["names"] is None else decode_names(state["names"])
 
     def _require_map(self) -> None:
         if not self.map.places:
@@ -396,5 +401,8 @@ def _build(header: dict[str, Any], name: str, features: nn.Module | None) -> nn.
     # only learning needs what found the periods: one from elsewhere need not be built
     periods = recipe.init_args.get("periods")
     if name == "mapper" and isinstance(periods, dict) and periods.get("class_path") not in REGISTRY:
-        recipe = recipe._replace(init_args=recipe.init_args | {"periods": None})
+        plain = recipe._replace(init_args=recipe.init_args | {"periods": None})
+        mapper = build(plain, TemplateMapper, REGISTRY)
+        mapper.periods = ForeignPeriods(**periods)
+        return mapper
     return build(recipe, PARTS[name], REGISTRY, features)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers import refused
 from torch import Tensor, nn
 
+from dejavu_torch import HOG, best_match, evaluate
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.place_map import Mapper, PlaceMap
@@ -18,6 +20,7 @@ from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.model import DejaVu, read_place_map
+from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import FrequencyLayer
 
 
@@ -183,3 +186,82 @@ def test_templates_become_parameters_by_an_argument() -> None:
     assert gradient.abs().max() > 0
     plain = DejaVu().learn(wave)
     assert torch.equal(model(wave), plain(wave))
+
+
+def test_a_trainable_map_is_saved_loaded_and_compared(tmp_path: Path) -> None:
+    wave = torch.arange(128)[:, None] % torch.tensor([8.0, 9.0]) + 0.01 * torch.rand(128, 2)
+    model = DejaVu(mapper=TemplateMapper(trainable=True)).learn(wave)
+    model.save(tmp_path / "m.safetensors")
+    again = DejaVu.load(tmp_path / "m.safetensors")
+    assert torch.equal(again(wave), model(wave))
+    fresh = DejaVu(mapper=TemplateMapper(trainable=True))
+    fresh.load_state_dict(model.state_dict())
+    assert torch.equal(fresh(wave), model(wave))
+    result = compare(ArrayTraverse(wave, "a"), ArrayTraverse(wave + 0.01, "b"), "0", model)
+    assert result.report.contenders["null_same_plan"].scores is not None
+
+
+@pytest.mark.parametrize("change", ["templates", "_extra_state", "layers"])
+def test_a_state_that_is_refused_leaves_the_map_as_it_was(change: str) -> None:
+    wave = torch.arange(128)[:, None] % torch.tensor([8.0, 9.0])
+    model, other = DejaVu().learn(wave), DejaVu().learn(wave[:64] + 1)
+    expected, state = model(wave), other.map.state_dict()
+    if change == "templates":
+        state[change] = state[change][:-1]
+    elif change == "layers":
+        state[change] = state[change].float()
+    else:
+        state[change] = {**state[change], "metric": "l2"}
+    with refused("map"):
+        model.map.load_state_dict(state)
+    assert torch.equal(model(wave), expected)
+
+
+def test_the_names_of_frames_are_part_of_the_state() -> None:
+    model = DejaVu().learn(torch.rand(64, 2))
+    model.frame_names = [f"{i:04}.png" for i in range(64)]
+    again = DejaVu()
+    again.load_state_dict(model.state_dict())
+    assert (again.frame_name(7), again.map.places) == ("0007.png", 64)
+    again.load_state_dict(DejaVu().learn(torch.rand(32, 2)).state_dict())
+    assert (again.frame_name(7), again.map.places) == ("", 32)
+
+
+class Foreign(PeriodFinder):
+    """A finder that no map file can bring."""
+
+    def plan(self, features: Tensor) -> tuple[FrequencyLayer, ...]:
+        return (FrequencyLayer(10, 10, 0, len(features), tuple(range(features.shape[1]))),)
+
+
+def test_a_loaded_map_says_that_its_period_finder_is_missing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    values = torch.rand(60, 4)
+    DejaVu(mapper=TemplateMapper(Foreign())).learn(values).save(tmp_path / "m.safetensors")
+    model = DejaVu.load(tmp_path / "m.safetensors")
+    with refused("Foreign", "learn anew"):
+        model.learn(values)
+    report = compare(ArrayTraverse(values, "a"), ArrayTraverse(values + 0.01, "b"), "0", model).report
+    assert "null" not in report.contenders
+    assert "null_same_plan" in report.contenders
+    assert "not of this package" in caplog.text
+    model.save(tmp_path / "again.safetensors")
+    assert "Foreign" in repr(DejaVu.load(tmp_path / "again.safetensors").mapper.periods)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: DejaVu().learn("sim:aerial"),
+        lambda: compare("one/", "two/"),
+        lambda: evaluate(torch.arange(3), torch.arange(3)[:, None], 0),
+        lambda: best_match(np.zeros((2, 3))),
+        lambda: HOG()(np.zeros((1, 1, 32, 32))),
+        lambda: DejaVu().learn(torch.rand(64, 2))(np.zeros((3, 2))),
+    ],
+    ids=["learn", "compare", "evaluate", "best_match", "HOG", "forward"],
+)
+def test_what_is_no_tensor_or_traverse_is_refused_in_one_line(use: Any) -> None:
+    with refused("expected"):
+        use()

@@ -26,6 +26,8 @@ class IndexedTraverse(Traverse):
         yield from self.select(range(start, stop), 64)
 
     def select(self, frames: range, size: int) -> Iterator[Tensor]:
+        if size < 1:
+            raise InputError(f"a batch holds {size} frames; expected at least 1")
         there = range(frames.start, min(frames.stop, self.length), frames.step)
         for first in range(0, len(there), size):
             yield self.read(there[first : first + size])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import torch
@@ -15,7 +15,7 @@ from dejavu_torch.types import InputError
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
 
 
-class PlaceMap(nn.Module):
+class PlaceMap(nn.Module, ABC):
     """A route in a form that scores: the seam between how a map is made and how places are found on it.
 
     A new kind of map subclasses it and implements `scores`, `settings`, `summary` and `disagreement`; a
@@ -132,20 +132,33 @@ class PlaceMap(nn.Module):
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        if prefix + EXTRA in state_dict:  # before any tensor is touched
-            self.set_extra_state(state_dict[prefix + EXTRA])
-        for name, own in list(self.named_buffers(recurse=False)):  # what trains keeps its shape
-            if prefix + name in state_dict:
-                setattr(self, name, torch.empty_like(state_dict[prefix + name], device=own.device))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        self.loaded()
-        self.check()
+        before = self.get_extra_state(), dict(self._buffers), dict(self._parameters)
+        try:
+            if prefix + EXTRA in state_dict:  # before any tensor is touched
+                self.set_extra_state(state_dict[prefix + EXTRA])
+            self._take_shapes(state_dict, prefix)
+            super()._load_from_state_dict(state_dict, prefix, *args)
+            self.loaded()
+            self.check()
+        except InputError:  # a state that is refused leaves the map as it was
+            extra, self._buffers, self._parameters = before
+            self.set_extra_state(extra)
+            self.loaded()
+            raise
+
+    def _take_shapes(self, state_dict: dict[str, Any], prefix: str) -> None:
+        """Make room for what is loaded; a parameter that holds something keeps its shape."""
+        for name, own in [*self.named_buffers(recurse=False), *self.named_parameters(recurse=False)]:
+            trained = isinstance(own, nn.Parameter)
+            if prefix + name in state_dict and not (trained and own.numel()):
+                new = torch.empty_like(state_dict[prefix + name], device=own.device)
+                setattr(self, name, nn.Parameter(new) if trained else new)
 
     def loaded(self) -> None:
         """Called when a state was loaded: work out what follows from the buffers."""
 
 
-class Mapper(nn.Module):
+class Mapper(nn.Module, ABC):
     """Makes a map from descriptors. Subclass it, and `PlaceMap`, to bring another kind of map.
 
     Attributes:

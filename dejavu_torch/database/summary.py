@@ -107,7 +107,7 @@ def describe(summary: MapSummary) -> str:
         >>> from dejavu_torch.types import FrequencyLayer
         >>> layers = [FrequencyLayer(Fraction(p), p, 0, 1024, (0, 1)) for p in (93, 171)]
         >>> print(summarise(tuple(layers), places=1024, route={"templates": 2112, "layers": 1984}))
-        frames 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); together 5301 frames
+        places 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); together 5301 places
         1024 of 1024 places covered; 264 templates, 528 numbers
         4096 bytes, 4.0 per place: templates 2112, layers 1984
     """
@@ -126,11 +126,11 @@ def _chunk_line(chunk: ChunkSummary) -> str:
     shown = ", ".join(f"{_number(chunk.periods[j])} ({chunk.features[j]} features)" for j in sorted(largest))
     more = len(chunk.periods) - len(largest)
     layers = f"{len(chunk.periods)} layer{'s' * (len(chunk.periods) > 1)}"
-    line = f"frames {chunk.start}-{chunk.stop - 1}: {layers}, periods {shown}"
+    line = f"places {chunk.start}-{chunk.stop - 1}: {layers}, periods {shown}"
     if more:
         line += f" and {more} smaller layer{'s' * (more > 1)}"
     if len(chunk.periods) > 1 and chunk.common_period < LARGE:
-        line += f"; together {_number(chunk.common_period)} frames"
+        line += f"; together {_number(chunk.common_period)} places"
     return line
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.types import FrequencyLayer, InputError
 
-MASKED_AT_ONCE = 2**14  # frames of a mask that is summed over
+MASK_NUMBERS = 2**22  # of a mask that is held at a time
 
 
 def phase_mask(
@@ -93,7 +93,9 @@ def _means(features: Tensor, layer: FrequencyLayer) -> Tensor:
     chosen = torch.tensor(layer.features, device=features.device)
     total = features.new_zeros(layer.phases, len(layer.features))
     count = features.new_zeros(layer.phases, 1)
-    for frames in torch.arange(layer.start, layer.stop, device=features.device).split(MASKED_AT_ONCE):
+    for frames in torch.arange(layer.start, layer.stop, device=features.device).split(
+        max(1, MASK_NUMBERS // layer.phases)
+    ):
         mask = phase_mask(frames, layer.period, layer.phases, dtype=features.dtype)
         total = total + mask @ features[frames[0] : frames[-1] + 1].index_select(1, chosen)
         count = count + mask.sum(1, keepdim=True)

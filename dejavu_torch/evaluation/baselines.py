@@ -15,6 +15,7 @@ from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
+from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import InputError, Match, Traverse
 
@@ -57,7 +58,7 @@ def nearest_frames(
     with torch.no_grad():
         batches = query.split(rows)
         for batch in tqdm(batches, progress, disable=None if progress else True, leave=False):
-            distances = phase_distances(batch, reference, metric)
+            distances = phase_distances(batch.to(reference.device), reference, metric)
             for found, k in zip(parts, strides, strict=True):
                 match = best_match(distances[:, ::k])
                 match = match._replace(index=torch.where(match.index >= 0, match.index * k, -1))
@@ -105,8 +106,9 @@ def baselines_of(
     fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
     strides = {"uncompressed": 1, "stride": fair, "stride_coarsest": max(1, 2 * tolerance)}
     of = "" if isinstance(model.features, HOG) else "same features, "
+    skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
     names = {
-        "uncompressed": f"{of}all {frames} frames",
+        "uncompressed": f"{of}all {frames} frames{skipped}",
         "stride": f"{of}{_every(fair)} (at least the map's bytes)",
         "stride_coarsest": f"{of}{_every(strides['stride_coarsest'])} (2 x tolerance)",
     }
@@ -118,7 +120,10 @@ def baselines_of(
         for (key, k), match in zip(strides.items(), nearest, strict=True)
     }
     text = "null control: shuffled frames" if progress else None
-    if model.trained is None:
+    foreign = isinstance(getattr(model.mapper, "periods", None), ForeignPeriods)
+    if foreign:
+        log.warning("no null control learned anew: what found the map's periods is not of this package")
+    if model.trained is None and not foreign:
         anew = null_control(model, reference, query, seed, progress=text)
         found["null"] = Baseline("null: everything learned from shuffled frames", anew)
     if isinstance(model.map, TemplateMap):

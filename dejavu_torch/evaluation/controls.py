@@ -73,9 +73,10 @@ def null_control(
 
 def _same_layers(route: TemplateMap, features: Tensor) -> TemplateMap:
     """The layers and settings of a map, with the phase means of other features."""
-    templates = PhaseTemplates()(route.weighted(features), route.plan)
     null = copy.deepcopy(route)
+    null.freeze()
     null.positions = null.positions[:0]
+    templates = PhaseTemplates()(null.weighted(features), null.plan)
     if templates:
         null.templates = torch.cat([block.flatten() for block in templates])
     return null
@@ -112,9 +113,13 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
     layers = list(zip(route.plan, route.blocks(), route.layer_features(), strict=True))
     with torch.no_grad():
         for frames in torch.arange(len(reference), device=reference.device).split(256):
+            first = max(0, int(frames[0]) - width)
+            rows = reference[first : int(frames[-1]) + width + 1]  # of the queries and windows
             scores = route.combine(
                 [
-                    _distances_without(reference[:, index], layer, block, frames, width, route.metric)
+                    _distances_without(
+                        rows.index_select(1, index), first, layer, block, frames, width, route.metric
+                    )
                     for layer, block, index in layers
                 ]
             )
@@ -125,23 +130,32 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
 
 
 def _distances_without(
-    values: Tensor, layer: FrequencyLayer, block: Tensor, frames: Tensor, width: int, metric: Metric
+    values: Tensor,
+    first: int,
+    layer: FrequencyLayer,
+    block: Tensor,
+    frames: Tensor,
+    width: int,
+    metric: Metric,
 ) -> Tensor:
-    """Phase distances of the queries `frames`, each without the frames within `width` of it: (B,P)."""
+    """Phase distances of the queries `frames`, each without the frames within `width` of it: (B,P).
+
+    Shape: values (n,F), of the frames from `first` on.
+    """
     near = frames[:, None] + torch.arange(-width, width + 1, device=frames.device)  # (B,K)
     inside = (near >= layer.start) & (near < layer.stop)
-    near = near.clamp(0, len(values) - 1)
+    near = near.clamp(first, first + len(values) - 1)
     phase = layer.phase(near)
     # frames of the window that share a phase leave its mean together
     together = (phase[:, :, None] == phase[:, None, :]) & inside[:, None, :]
-    taken = together.to(values.dtype) @ values[near]  # (B,K,F)
+    taken = together.to(values.dtype) @ values[near - first]  # (B,K,F)
     count = torch.bincount(layer.place_phases, minlength=layer.phases).to(frames.device)[phase]
     left = count - together.sum(2)
     mean = (block[phase] * count[..., None] - taken) / left.clamp(min=1)[..., None]
-    rows = zip(values[frames].split(1), mean, strict=True)
+    rows = zip(values[frames - first].split(1), mean, strict=True)
     distance = torch.cat([phase_distances(query, means, metric) for query, means in rows])
     distance = torch.where(left > 0, distance, torch.inf)
-    table = phase_distances(values[frames], block, metric)
+    table = phase_distances(values[frames - first], block, metric)
     row = torch.arange(len(frames), device=frames.device)[:, None].expand_as(phase)
     table[row[inside], phase[inside]] = distance[inside]
     return table

@@ -175,6 +175,11 @@ def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> 
 
 def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> None:
     """Refuse a truth that does not fit the matches."""
+    if not isinstance(match, Match) or not isinstance(truth, Tensor | GroundTruth):
+        raise InputError(
+            f"evaluate got a {type(match).__name__} and a {type(truth).__name__}; expected a Match, as "
+            "`localize` gives, and a tensor (Q,R) or a GroundTruth"
+        )
     right, *others = (truth,) if isinstance(truth, Tensor) else (truth.positives, truth.judged, truth.ignored)
     queries = len(match.index)
     if right.ndim != 2 or len(right) != queries:

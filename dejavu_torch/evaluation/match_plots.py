@@ -103,13 +103,18 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
     return examples
 
 
-def plot_pairs(examples: Sequence[Example], frames: Sequence[Sequence[Tensor]]) -> Plot:
+def plot_pairs(
+    examples: Sequence[Example],
+    frames: Sequence[Sequence[Tensor]],
+    label: Callable[[str, int], str] = lambda kind, number: f"{kind} {number}",
+) -> Plot:
     """Queries beside the reference frames that were reported for them, and those that are right.
 
     Args:
         examples: see `example_matches`; a row each.
         frames: for each the frames (C,H,W) of the query, of the reported place and, where it is known, of the
             right place.
+        label: what to call a query or a place, from its kind ("query" or "place") and number.
     """
     columns = max(len(row) for row in frames)
     sides = [max(frame.shape[1] / frame.shape[2] for frame in row) for row in frames]
@@ -118,8 +123,9 @@ def plot_pairs(examples: Sequence[Example], frames: Sequence[Sequence[Tensor]]) 
     for axis in axes.flat:
         axis.set_axis_off()
     for row, (one, shown) in enumerate(zip(examples, frames, strict=True)):
-        right = "none is known" if one.right < 0 else f"place {one.right}"
-        titles = (f"query {one.query}", f"reported: place {one.place}", f"right: {right}")
+        right = "none is known" if one.right < 0 else label("place", one.right)
+        place = label("place", one.place)
+        titles = (label("query", one.query), f"reported: {place}", f"right: {right}")
         for axis, title in zip(axes[row], titles, strict=False):
             axis.set_title(f"\n{title}", loc="left", fontsize=9, pad=3)  # the empty line is for the heading
         for axis, frame in zip(axes[row], shown, strict=False):

@@ -116,12 +116,21 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     )
     return {
         "pairs": Picture(
-            plot_pairs(examples, frames),
+            plot_pairs(examples, frames, lambda kind, number: frame_label(run, kind, number)),
             "queries and what was found",
             f"A query, beside it the reference frame of the place reported{known}. The lower the score, the "
             f"surer the match. {last}",
         )
     }
+
+
+def frame_label(run: Localization, kind: str, number: int) -> str:
+    """A query or a place by what matches.csv calls it: the frame of its source, and the frame's name."""
+    traverse = run.query if kind == "query" else run.reference
+    if isinstance(traverse, ResampledTraverse):
+        number, traverse = int(traverse.frame[number]), traverse.traverse
+    what = "query frame" if kind == "query" else "frame"
+    return f"{what} {number} {traverse.frame_name(number)}".strip()
 
 
 def draw_scores(run: Localization) -> dict[str, Picture]:

@@ -13,14 +13,17 @@ import torch
 from torch import Tensor
 
 import dejavu_torch
+from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import (
     as_ground_truth,
     check_ground_truth,
     describe_ground_truth,
     ground_truth_in_places,
 )
+from dejavu_torch.data.positions import unit_of
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.place_map import PlaceMap
+from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.curves import (
@@ -34,7 +37,8 @@ from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.model import DejaVu
+from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
@@ -65,8 +69,8 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    reference: Traverse,
-    query: Traverse,
+    reference: Traverse | Tensor,
+    query: Traverse | Tensor,
     truth: str | None = None,
     model: DejaVu | None = None,
     *,
@@ -94,6 +98,7 @@ def compare(
         InputError: bad input of any of the stages, or a map of another number of places.
     """
     model = DejaVu() if model is None else model
+    reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
     _check_sizes(model, reference, query)
     clock, has_map = Clock(), model.map.places > 0
@@ -120,15 +125,15 @@ def compare(
         known = ground_truth_of(truth, reference, query, *lengths, interpolate)
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
-    match = of_shown_frames(match, model.map)
     run = Localization(model, reference, query, reference_features, query_features, match, known, tolerance)
     contenders = _contenders(run, seed, leave_out, progress)
     facts = _facts(run, clock)
     if known is not None:
         positions = all(source_of(one).place is not None for one in (reference, query))
-        facts |= count_queries(match, known, tolerance)
+        shown = of_shown_frames(match, model.map)
+        facts |= count_queries(shown, known, tolerance)
         facts["truth"] = describe_ground_truth(truth, interpolate, positions)
-        facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, known, tolerance))
+        facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(shown, known, tolerance))
     pictures = draw_pictures(run, contenders)
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     report = Report(contenders.pop("map"), contenders, facts)
@@ -209,16 +214,24 @@ def _contenders(run: Localization, seed: int, leave_out: int | None, progress: b
     model, tolerance = run.model, run.tolerance
     features = run.reference_features, run.query_features
     baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress)
-    if not isinstance(model.features, HOG):
+    if not _is_plain_hog(model):
         baselines |= hog_baselines(run.reference, run.query, model.batch_size, tolerance, progress)
     size = model.summary().map_bytes
-    contenders = {"map": contend("this map", run.match, run.truth, tolerance, size)}
+    ours = of_shown_frames(run.match, model.map)
+    contenders = {"map": contend("this map", ours, run.truth, tolerance, size)}
     for key, (name, match, bytes, k) in baselines.items():
         truth, match = run.truth, of_shown_frames(match, model.map)
         if key == "leave_out":  # its queries are the places themselves
             truth = ground_truth_in_places(as_ground_truth(_own_frames(model.map)), model.map.place_of)
         contenders[key] = contend(name, match, truth, tolerance, bytes, k)
     return contenders
+
+
+def _is_plain_hog(model: DejaVu) -> bool:
+    """Whether the uncompressed baseline is HOG with its defaults, by L1."""
+    pairs = (model.preprocess, Preprocess()), (model.features, HOG())
+    same = all(recipe_of(own, REGISTRY) == recipe_of(plain, REGISTRY) for own, plain in pairs)
+    return same and getattr(model.map, "metric", "l1") == "l1"
 
 
 def _own_frames(route: PlaceMap) -> Tensor:
@@ -233,7 +246,7 @@ def _facts(run: Localization, clock: Clock) -> dict[str, Any]:
         "frames": len(features),
         "queries": len(run.match.index),
         "tolerance": run.tolerance,
-        "unit": "places at even steps" if len(model.map.positions) else "frames",
+        "unit": unit_of(model.map.positions),
         "recall_definition": RECALL_DEFINITION,
         "kind": summary.kind,
         "map_bytes": summary.map_bytes,

@@ -66,6 +66,8 @@ def feature_batches(
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
     """Features of one batch: (B,C,H,W) frames are described, (B,D) features stay as they are."""
+    if not isinstance(batch, Tensor):
+        raise InputError(f"{name} is a {type(batch).__name__}; expected a tensor of frames or features")
     if batch.ndim == 2 and batch.is_floating_point():
         return batch
     if batch.ndim != 4 or not batch.is_floating_point():

@@ -151,6 +151,8 @@ def hog(
         torch.Size([5, 1764])
     """
     check_names(bins, gradient)
+    if not isinstance(frames, Tensor):
+        raise InputError(f"HOG got a {type(frames).__name__}; expected a tensor of frames (B,C,H,W)")
     if frames.ndim != 4 or not frames.is_floating_point():
         raise InputError(
             f"HOG got {tuple(frames.shape)} {frames.dtype}; expected float frames (B,C,H,W) in [0, 1]"

@@ -28,6 +28,8 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
         >>> best_match(torch.tensor([[3.0, 1.0, 1.0], [2.0, 4.0, 9.0]]), threshold=2.0)
         Match(index=tensor([1, 0]), score=tensor([1., 2.]), accepted=tensor([ True, False]))
     """
+    if not isinstance(scores, Tensor):
+        raise InputError(f"scores are a {type(scores).__name__}; expected a tensor (Q,N)")
     if scores.ndim != 2 or scores.shape[1] < 1:
         raise InputError(f"scores are {tuple(scores.shape)}; expected (Q,N) with N >= 1")
     score, index = scores.min(1)

@@ -23,7 +23,7 @@ from dejavu_torch.data.names import LONGEST, clock_time, decode_names, encode_na
 def packed(names: list[str]) -> str:
     """The code, once it was read back."""
     code = encode_names(names)
-    assert decode_names(json.loads(json.dumps(code)), len(names)) == names
+    assert decode_names(json.loads(json.dumps(code))) == names
     return code
 
 
@@ -101,12 +101,9 @@ def coded(value: object) -> str:
         base64.b64encode(b"no zlib").decode(),
         base64.b64encode(zlib.compress(b"no json")).decode(),
         base64.b64encode(zlib.compress(b"[" * 10**6)).decode(),
-        base64.b64encode(zlib.compress(b" " * 10**7)).decode(),
-        coded(["one"]),
         coded(["one", 2]),
         coded("ab"),
         coded({"texts": ["a", "b"]}),
-        coded({"texts": ["a", "b"], "columns": [[1, 0, 1, 1]]}),
         coded({"texts": ["a", "b"], "columns": [[10**9, 0, 1]]}),
         coded({"texts": ["a", "b"], "columns": [["1", 0, 1]]}),
         coded({"texts": ["a"], "columns": [[1, 0, 1]]}),
@@ -114,8 +111,8 @@ def coded(value: object) -> str:
     ids=lambda code: str(code)[:30],
 )
 def test_a_code_that_is_none_is_refused(code: object) -> None:
-    with refused("names of", "2"):
-        decode_names(code, 2)  # type: ignore[arg-type]
+    with refused("names of frames cannot be read"):
+        decode_names(code)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

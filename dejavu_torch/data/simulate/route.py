@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import field, fields
 from hashlib import blake2b
 from numbers import Integral, Real
@@ -17,7 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.types import InputError
 
 _T = TypeVar("_T")
 
@@ -27,7 +28,7 @@ def option(default: float, low: float, high: float = math.inf) -> Any:
     return field(default=default, metadata={"span": (low, high)})
 
 
-class SimulatedRoute(Traverse):
+class SimulatedRoute(IndexedTraverse):
     """A route drawn by the computer, so that the true place of every frame is known.
 
     A subclass is a dataclass whose fields are each an `option`, `seed` and `traverse` among them. It sets
@@ -63,17 +64,8 @@ class SimulatedRoute(Traverse):
     def _frames(self, at: Tensor) -> Tensor:
         """Draw the frames with these numbers. Shape: (B,) int64 -> (B,3,H,W) float32 in [0,1]."""
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        """Yield the frames in order, at most `size` at a time. Shape: (B,3,H,W) float32 in [0,1]."""
-        if size < 1:
-            raise InputError(f"a batch holds {size} frames; expected at least 1")
-        yield from self.between(0, self.length, size)
-
-    def between(self, start: int, stop: int, size: int = 64) -> Iterator[Tensor]:
-        """Yield the frames [start, stop), at most `size` at a time; no frame before them is drawn."""
-        stop = min(stop, self.length)
-        for first in range(start, stop, size):
-            yield self._frames(torch.arange(first, min(first + size, stop)))
+    def read(self, frames: range) -> Tensor:
+        return self._frames(torch.arange(frames.start, frames.stop, frames.step))
 
 
 class Random:
