@@ -10,18 +10,22 @@ from typing import Any
 import pytest
 import torch
 
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
 from dejavu_torch.cli import train
 from dejavu_torch.cli.commands import COMMANDS
 from dejavu_torch.cli.parser import UsageError, command_parser
 from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.periods.imposed import ImposedPeriods
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 TRAINING = (ROOT / "docs" / "training.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+OPTIONS = [
+    option
+    for option in re.findall(r"`(--(?:model|data|trainer)\.[^`*\s]+ [^`]+)`", TRAINING.replace("\n  ", " "))
+    if "my_module" not in option
+]
 
 
 def test_python_runs_and_its_shapes_are_true(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,20 +90,19 @@ def test_every_command_shown_is_understood(text: str) -> None:
         understand(line)
 
 
-def test_options_that_the_text_on_training_names_are_understood() -> None:
-    text = TRAINING.replace("\n  ", " ")
-    options = re.findall(r"`(--(?:model|data|trainer)\.[^`*\s]+ [^`]+)`", text)
-    assert len(options) >= 8
-    for option in options:
-        if "my_module" in option:
-            continue
-        understand(f"dejavu train fit --config configs/train_small.yaml --data.source sim:aerial {option}")
+def test_the_text_on_training_names_options() -> None:
+    assert len(OPTIONS) >= 8
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_options_that_the_text_on_training_names_are_understood(option: str) -> None:
+    understand(f"dejavu train fit --config train_small --data.source sim:aerial {option}")
 
 
 def test_yaml_on_training_is_understood(tmp_path: Path) -> None:
     (shown,) = re.findall(r"```yaml\n(.*?)```", TRAINING, re.DOTALL)
     (tmp_path / "stop.yaml").write_text(shown)
-    config = f"--config configs/train_small.yaml --config {tmp_path / 'stop.yaml'}"
+    config = f"--config train_small --config {tmp_path / 'stop.yaml'}"
     understand(f"dejavu train fit {config} --data.source sim:aerial")
 
 
@@ -108,17 +111,29 @@ def test_export_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "road").mkdir()
     shown = re.findall(r"```py\n(.*?)```", TRAINING, re.DOTALL)[-1]
     features = SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2).eval()
-    model = DejaVu(features, ImposedPeriods([3, 4])).learn(torch.rand(50, 3, 64, 64))
+    model = DejaVu(features, TemplateMapper(ImposedPeriods([3, 4]))).learn(torch.rand(50, 3, 64, 64))
     model.save("road/map.safetensors")
     exec(shown, {})
     frames, program = torch.rand(5, 3, 64, 64), torch.export.load(tmp_path / "road.pt2")
     torch.testing.assert_close(program.module()(frames), model.eval()(frames))
 
 
+def test_training_in_python_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shown = re.findall(r"```py\n(.*?)```", TRAINING, re.DOTALL)[0]
+    shorter = {"max_steps=3000": "max_steps=2, logger=False", "morning/": "sim:aerial?frames=80"}
+    for given, short in shorter.items():
+        assert given in shown
+        shown = shown.replace(given, short)
+    space: dict[str, Any] = {"my_backbone": SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2)}
+    exec(shown, space)
+    assert space["model"](torch.rand(2, 3, 64, 64)).shape == (2, 80)
+
+
 def test_a_training_that_is_shown_would_be_understood() -> None:
-    config = "dejavu train fit --config configs/train_road.yaml"
+    config = "dejavu train fit --config train_road"
     understand(f"{config} --data.source sim:aerial --trainer.default_root_dir out --trainer.max_steps 50")
-    for wrong in ("--data.colour red", "--trainer.max_steps many", "--model.periods.bin 0.5"):
+    for wrong in ("--data.colour red", "--trainer.max_steps many", "--model.mapper.periods.bin 0.5"):
         with pytest.raises(UsageError):
             understand(f"{config} --data.source sim:aerial {wrong}")
     with pytest.raises(UsageError):
