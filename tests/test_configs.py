@@ -19,7 +19,7 @@ from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import find_config, preset_names, with_configs
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.experiments.reproduce import paper_model
-from dejavu_torch.model import PARTS, REGISTRY, SETTINGS
+from dejavu_torch.model import PARTS, REGISTRY
 
 ROOT = Path(__file__).parents[1]
 PRESETS = ["default", "paper"]
@@ -34,7 +34,7 @@ def model_of(name: str) -> DejaVu:
 def settings(model: DejaVu) -> dict[str, Any]:
     parts = {name: getattr(model, name) for name in PARTS}
     recipes = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
-    return recipes | {name: getattr(model, name) for name in SETTINGS}
+    return recipes | {name: value for name, value in model.settings().items() if name not in PARTS}
 
 
 def written(name: str) -> dict[str, Any]:

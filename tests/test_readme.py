@@ -84,7 +84,7 @@ def understand(line: str) -> None:
 @pytest.mark.parametrize("text", [README, TRAINING], ids=["README", "training"])
 def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
-    shown += [line for line in re.findall(r"`(dejavu [^`]+)`", text) if "--help" not in line]
+    shown += [line for line in re.findall(r"`(dejavu [^`]+)`", text) if " -" in line and "--help" not in line]
     assert len(shown) >= 4
     for line in shown:
         understand(line)

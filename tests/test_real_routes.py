@@ -114,14 +114,12 @@ def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_d
     dashes = patches[:, :, column - 1 : column + 2].mean(2)
     dashes = dashes - dashes.mean(0)
     frames, still = top(autocorrelation(dashes, 40), 9, 16), top(autocorrelation(dashes.T, 95), 40, 90)
-    found = re.search(r"(5\.\d+) pixels of ground a frame.*?12.2 m", section("The same motorway"), re.S)
+    found = re.search(r"(5\.\d+) pixels of ground a frame.*?apart", section("The same motorway"), re.S)
     assert found is not None
     told = numbers(found[0])
-    mean, spread, _, low, high, confidence, period, moved, stands, *_ = told
+    mean, spread, confidence, period, moved, stands = told
     assert float(speed.mean()) == pytest.approx(mean, rel=0.01)
     assert 100 * float(speed.std() / speed.mean()) == pytest.approx(spread, abs=0.5)
-    means = speed.view(-1, 20).mean(1)
-    assert [float(means.min()), float(means.max())] == pytest.approx([low, high], rel=0.01)
     assert float(ground.confidence.min()) == pytest.approx(confidence, abs=0.03)
     assert [frames, still] == pytest.approx([period, stands], rel=0.01)
     assert frames * float(speed.mean()) == pytest.approx(moved, rel=0.01)
@@ -131,7 +129,7 @@ def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_d
 def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
     pytest.importorskip("cv2")
     clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
-    found = re.search(r"Optical flow does worse(.*?)Even spacing", section("The same motorway"), re.S)
+    found = re.search(r"Optical flow does worse(.*?)Resampling changes", section("The same motorway"), re.S)
     assert found is not None
     lk_lost, _, lk_mean, dis_lost, dis_mean = numbers(found[1].replace("stood still:", ""))[:5]
     for flow, lost, mean in (("lk", lk_lost, lk_mean), ("dis", dis_lost, dis_mean)):
@@ -140,7 +138,7 @@ def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
         assert float(ground.distance.diff().mean()) == pytest.approx(mean, rel=0.03)
 
 
-@pytest.mark.parametrize("places", ["221 frames as they came", "220 even steps"])
+@pytest.mark.parametrize("places", ["221 frames as they are", "220 even steps"])
 def test_even_steps_leave_the_periods_of_a_constant_speed(
     places: str, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -157,7 +155,7 @@ def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(da
     laps = open_source(f"{data_dir}/rc_car_laps/frames")
     features = DejaVu().extract_all(open_source(f"{data_dir}/rc_car_laps/frames?width=80"))
     told = rows(section("Laps of a small car"))
-    frames = {"frames as they came": torch.arange(len(features))}
+    frames = {"frames as they are": torch.arange(len(features))}
     for name in ("even steps, near ground", "even steps, far ground"):
         values = numbers(told[name][0])
         corners = tuple(zip(values[::2], values[1::2], strict=True))

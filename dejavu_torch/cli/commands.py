@@ -58,7 +58,10 @@ def run_learn(source: str, *, map: Path, model: DejaVu) -> None:
     model.learn(traverse, progress=True)
     model.save(map)
     _print_map(model)
-    _print_next("localize", map, "QUERY", "--out", "matches.csv")
+    if model.map.summary().covered:
+        _print_next("localize", map, "QUERY", "--out", "matches.csv")
+    else:
+        print("next: try more frames, another --preprocess.contrast, or `dejavu train fit`")
 
 
 def run_localize(
@@ -344,6 +347,7 @@ def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model:
 def _print_scores(report: Report, out: Path) -> None:
     from dejavu_torch.evaluation.report import score_table, summary, text_table
 
-    print(text_table(score_table(report)))
+    if report.ours.scores is not None:
+        print(text_table(score_table(report)))
     print(summary(report))
     print(f"next: open {out / 'index.html'}")

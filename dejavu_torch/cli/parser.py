@@ -44,10 +44,11 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
 
 def refusal(error: Exception) -> InputError:
     """What a part's constructor refused."""
-    *_, first = causes(error)
-    if isinstance(first, InputError):
-        return first
-    return InputError(f"a part cannot be built: {one_line(first)[:LONGEST]}")
+    chain = list(causes(error))
+    own = [one for one in chain if isinstance(one, InputError)]
+    if own:
+        return own[-1]
+    return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST]}")
 
 
 def one_line(text: object) -> str:

@@ -200,7 +200,7 @@ def print_written(export: MapExport, data: RouteData) -> None:
         known = [data.sources[name] for name in ("validation", "query") if data.sources[name]]
         reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], [*known, "SECOND"][0]))
         print(f"{describe(summary)}\nwritten to {path}; only a second traverse shows what it is worth:")
-        print(f"dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")
+        print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")
 
 
 def run_train(arguments: Sequence[str]) -> None:

@@ -156,8 +156,9 @@ class Clock:
 def _check_arguments(
     model: DejaVu, truth: str | None, tolerance: int, leave_out: int | None, interpolate: bool
 ) -> None:
-    if tolerance < 0 or (leave_out is not None and leave_out < 0):
-        raise InputError(f"tolerance is {tolerance}, leave_out {leave_out}; expected at least 0")
+    for name, value in (("tolerance", tolerance), ("leave_out", leave_out)):
+        if value is not None and value < 0:
+            raise InputError(f"{name} is {value}; expected at least 0")
     if leave_out is not None and model.map.places and model.trained is not None:
         raise InputError(
             f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"

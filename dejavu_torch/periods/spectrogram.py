@@ -158,7 +158,8 @@ class SpectrogramAnalysis(PeriodFinder):
         if window < self.window:
             if self.short == "refuse":
                 raise InputError(
-                    f"the traverse has {frames} frames; expected at least {self.window}, the window"
+                    f"the traverse has {frames} frames; expected at least {self.window}, the window, "
+                    "or a shorter window, or short='shrink'"
                 )
             self._warn_once(f"window shrunk from {self.window} to {frames} frames, the whole traverse")
         hop = min(self.hop or window, window)

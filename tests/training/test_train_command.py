@@ -276,7 +276,7 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
         plan, *rest = said.out.split("written to ")
         assert plan.endswith(f"{describe(DejaVu.load(tmp_path / 'map.safetensors').summary())}\n")
         assert "only a second traverse" in rest[0]
-        command = f"dejavu compare one.npy SECOND --map {tmp_path}/map.safetensors --out report"
+        command = f"next: dejavu compare one.npy SECOND --map {tmp_path}/map.safetensors --out report"
         assert rest[0].splitlines()[-1] == command
     # Python itself keeps deprecations to those who develop
     assert [str(w.message) for w in recwarn if not issubclass(w.category, DeprecationWarning)] == []
