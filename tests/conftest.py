@@ -19,6 +19,19 @@ settings.register_profile("repeatable", derandomize=True, deadline=None, databas
 settings.load_profile("repeatable")
 
 
+# whole commands, trainings, real footage and notebooks: not in a developer's inner loop
+SLOW = ("training", "experiments", "test_cli", "test_readme", "test_real_routes", "test_periods_on_real_data")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What runs whole commands is marked `slow` as well as single tests above 5 s."""
+    here = Path(__file__).parent
+    for item in items:
+        path = item.path.relative_to(here) if item.path.is_relative_to(here) else item.path
+        if str(path).startswith(SLOW) or path.suffix == ".ipynb":
+            item.add_marker("slow")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
     """Many small operations: on a busy machine two threads mostly wait for each other."""
