@@ -20,7 +20,15 @@ settings.load_profile("repeatable")
 
 
 # whole commands, trainings, real footage and notebooks: not in a developer's inner loop
-SLOW = ("training", "experiments", "test_cli", "test_readme", "test_real_routes", "test_periods_on_real_data")
+SLOW = (
+    *("training", "experiments", "motion", "test_cli", "test_readme", "test_real_routes"),
+    *(
+        "test_periods_on_real_data",
+        "test_model_export",
+        "data/test_simulate_railway",
+        "evaluation/test_pictures",
+    ),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
