@@ -154,6 +154,18 @@ class PlaceMap(nn.Module, ABC):
                 new = torch.empty_like(state_dict[prefix + name], device=own.device)
                 setattr(self, name, nn.Parameter(new) if trained else new)
 
+    def packed(self) -> dict[str, Tensor]:
+        """The tensors that a file holds of the map; a kind that compresses them says how."""
+        return {name: value for name, value in self.state_dict().items() if isinstance(value, Tensor)}
+
+    def unpacked(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The state's tensors, from what `packed` gave.
+
+        Raises:
+            InputError: tensors that do not fit together.
+        """
+        return tensors
+
     def loaded(self) -> None:
         """Called when a state was loaded: work out what follows from the buffers."""
 

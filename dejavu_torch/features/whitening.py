@@ -2,26 +2,46 @@
 
 from __future__ import annotations
 
+import logging
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from dejavu_torch.types import InputError
+from dejavu_torch.features.extract import features_of
+from dejavu_torch.types import InputError, Traverse
 
-SHRINKAGE = 1.0  # how much of its mean over all directions is added to the change in each
+if TYPE_CHECKING:
+    from dejavu_torch.features.augmentation import Augmentation
+
+log = logging.getLogger("dejavu_torch")
+
 ROWS = 8192  # in double precision at a time
+SAMPLED = 4096  # rows that principal components are found in
+NUMBERS = 128  # of a descriptor, unless said otherwise
+PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
+COMPONENTS = 400  # that whitening works on
+SPARE = 32  # further directions of the randomised subspace, which make it near the true one
+ROUNDS = 3  # of its iteration
+ROUNDING = 1e-7  # of the largest variance: what lies below it is none
 
 
-def learned_whitening(views: Tensor, places: Tensor, kept: int) -> tuple[Tensor, Tensor]:
+def learned_whitening(
+    views: Tensor, places: Tensor, kept: int, shrinkage: float = 0.5
+) -> tuple[Tensor, Tensor]:
     """The projection to what tells places apart and changes little between two views of one place.
 
-    With d = (view - place) / 2, m = (view + place) / 2, B = Cov[m], and W = E[d d^T] plus its mean over all
-    directions in each of them (shrinkage: a few pairs say little about most directions), the columns of P are
+    With d = (view - place) / 2, m = (view + place) / 2, B = Cov[m] and W = (1 - a) E[d d^T] + a tr(E[d d^T]) / K
+    (shrinkage: a few pairs say little about most directions), the columns of P are
     the `kept` directions with the largest p^T B p / p^T W p, scaled to p^T W p = 1, the largest first
     (learned whitening of Mikolajczyk and Matas, ICCV 2007; a linear discriminant analysis of pairs).
 
     Args:
         views, places: descriptors of one place each, K numbers.
         kept: K', at most K.
+        shrinkage: a, above 0 and at most 1.
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,K'), float32.
 
@@ -54,8 +74,216 @@ def learned_whitening(views: Tensor, places: Tensor, kept: int) -> tuple[Tensor,
             "in the mean square; expected a finite number, and more than rounding: an augmentation, or a "
             "second traverse"
         )
-    within.diagonal().add_(SHRINKAGE * scale)
+    within = (1 - shrinkage) * within
+    within.diagonal().add_(shrinkage * scale)
     # P = L^-T E, where W = L L^T and E holds the eigenvectors of L^-1 B L^-T
     unit = torch.linalg.inv(torch.linalg.cholesky(within))
     vectors = torch.linalg.eigh(unit @ (second - torch.outer(mean, mean)) @ unit.T).eigenvectors.flip(1)
     return mean.float(), (unit.T @ vectors[:, :kept]).float()
+
+
+class Whitening(nn.Module):
+    """A descriptor of few numbers: what tells places apart, and changes little with light and view.
+
+    `learn` finds it in closed form for one route: principal components, then `learned_whitening` of what the
+    views of one place change in them. A view is an augmented copy of a reference frame, or a frame of a second
+    traverse.
+
+    Args:
+        numbers: K. None is 128, fewer on a short route (a quarter of its places) and never more than the rank.
+        components: principal components that are whitened, at least K.
+        shrinkage: of `learned_whitening`.
+        views: augmented copies of each frame; frames are drawn evenly where there are more than `most_views`.
+        most_views: copies in all.
+        strengths: arguments of `Augmentation`; None is its defaults.
+        seed: of the copies.
+        bits: of each number of the projection, 8 or 16.
+
+    Shape: (B,D) -> (B,K).
+
+    Convention: whitened descriptors have length 1. Without views, as for ready features, the descriptors are
+        principal components, centred, their variances kept, and one constant number behind them, the root mean
+        square of their length: it lets a cosine tell long from short. Before `learn` there is no projection,
+        and descriptors pass as they are.
+
+    Raises:
+        InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
+            more `numbers` than the rank; forward: descriptors of another dimension.
+
+    Example:
+        >>> route = torch.randn(400, 16)
+        >>> whitening = Whitening(numbers=4)
+        >>> whitening.learn(route, [(route + 0.1 * torch.randn(400, 16), torch.arange(400))])
+        >>> whitening(route).shape
+        torch.Size([400, 4])
+    """
+
+    projection: Tensor
+    scale: Tensor
+    offset: Tensor
+    length: Tensor
+
+    def __init__(
+        self,
+        numbers: int | None = None,
+        components: int = COMPONENTS,
+        shrinkage: float = 0.03,
+        views: int = 4,
+        most_views: int = 20000,
+        strengths: Mapping[str, Any] | None = None,
+        seed: int = 0,
+        bits: int = 8,
+    ) -> None:
+        super().__init__()
+        if (numbers is not None and numbers < 1) or components < (numbers or 1) or min(views, most_views) < 1:
+            raise InputError(
+                f"Whitening got numbers={numbers}, components={components}, views={views}, "
+                f"most_views={most_views}; expected at least 1 each, and no more numbers than components"
+            )
+        if not 0 < shrinkage <= 1 or bits not in (8, 16):
+            raise InputError(
+                f"Whitening got shrinkage={shrinkage}, bits={bits}; expected a shrinkage above 0 and at most 1, "
+                "8 or 16 bits"
+            )
+        self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
+        self.most_views, self.seed, self.bits = most_views, seed, bits
+        self.strengths = None if strengths is None else dict(strengths)
+        self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), in units of `scale`
+        self.register_buffer("scale", torch.zeros(0))  # (K,)
+        self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
+        self.register_buffer("length", torch.zeros(0))  # (1,), the constant number; (0,): to length 1
+
+    @property
+    def learned(self) -> bool:
+        """Whether there is a projection."""
+        return self.projection.numel() > 0
+
+    def forward(self, descriptors: Tensor) -> Tensor:
+        if not self.learned:
+            return descriptors
+        if descriptors.ndim != 2 or descriptors.shape[1] != len(self.projection):
+            raise InputError(
+                f"the whitening got descriptors {tuple(descriptors.shape)}; expected (B, {len(self.projection)})"
+            )
+        # bf16 is too coarse for the small differences that whitening enlarges
+        with torch.autocast(descriptors.device.type, enabled=False):
+            exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
+            whitened = (exact @ self.projection.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
+            if len(self.length):
+                return torch.cat([whitened, self.length.to(whitened).expand(len(whitened), 1)], 1)
+            return nn.functional.normalize(whitened, dim=1)
+
+    @torch.no_grad()
+    def learn(self, places: Tensor, views: Iterable[tuple[Tensor, Tensor]] | None = None) -> None:
+        """Find the projection for one route.
+
+        Args:
+            places: (N,D), the descriptors of the route; they may lie in a file.
+            views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
+        """
+        kept = self._kept(len(places), views is not None)
+        mean, basis, variances = principal_components(places, self.components if views else kept, self.seed)
+        rank = int((variances > ROUNDING * variances[0]).sum())
+        if kept > rank:
+            if self.numbers is not None:
+                raise InputError(f"numbers is {kept}, but the descriptors of this route have rank {rank}")
+            if views is not None:
+                log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
+            kept = rank
+        basis = basis[:, :rank]
+        if views is None:
+            self._store(mean, basis[:, :kept], variances[:kept].sum().sqrt())
+            return
+        pairs = [((view - mean) @ basis, place) for view, place in views]
+        shown = torch.cat([place for _, place in pairs])
+        own = torch.cat([(places[part] - mean) @ basis for part in shown.split(ROWS)])
+        centre, projection = learned_whitening(torch.cat([view for view, _ in pairs]), own, kept, self.shrinkage)
+        self._store(mean + basis @ centre, basis @ projection, None)
+
+    def _kept(self, places: int, views: bool) -> int:
+        if self.numbers is not None:
+            return self.numbers
+        return min(NUMBERS, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS
+
+    def _store(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
+        """Take over a projection in whole numbers, and its mean."""
+        largest = 2 ** (self.bits - 1) - 1
+        self.scale = projection.abs().amax(0) / largest
+        whole = (projection / self.scale).round()
+        self.projection = whole.to(torch.int8 if self.bits == 8 else torch.int16)
+        self.offset = (mean @ whole) * self.scale
+        self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
+        for name, own in self.named_buffers(recurse=False):
+            if prefix + name in state:
+                setattr(self, name, torch.empty_like(state[prefix + name], device=own.device))
+        super()._load_from_state_dict(state, prefix, *args)
+
+    def extra_repr(self) -> str:
+        names = ("numbers", "components", "shrinkage", "views", "most_views", "strengths", "seed", "bits")
+        return ", ".join(f"{name}={getattr(self, name)}" for name in names)
+
+
+def principal_components(rows: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """The directions in which descriptors vary most, by subspace iteration on a sample of them.
+
+    Args:
+        rows: descriptors; `SAMPLED` of them, drawn evenly, are used.
+        count: of directions at most; there are fewer where there are fewer rows or features.
+        seed: of the subspace that the iteration begins with.
+
+    Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first.
+
+    Source: Halko, Martinsson and Tropp, SIAM Review 53 (2011), algorithm 4.4.
+
+    Raises:
+        InputError: fewer than two rows, or rows that do not vary.
+    """
+    if rows.ndim != 2 or len(rows) < 2:
+        raise InputError(f"the descriptors are {tuple(rows.shape)}; expected (N,D), N at least 2")
+    sample = rows[:: max(1, len(rows) // SAMPLED)].float()
+    mean = sample.mean(0)
+    centred = sample - mean
+    generator = torch.Generator().manual_seed(seed)
+    width = min(count + SPARE, len(sample), rows.shape[1])
+    basis = torch.randn(rows.shape[1], width, generator=generator).to(centred)
+    for _ in range(ROUNDS):
+        basis = torch.linalg.qr(centred.T @ (centred @ basis)).Q
+    inside = (centred @ basis).double()
+    variances, turn = torch.linalg.eigh(inside.T @ inside / len(sample))
+    variances, turn = variances.flip(0)[:count], turn.flip(1)[:, :count]
+    if not variances[0] > ROUNDING * sample.square().mean():
+        raise InputError(f"the {len(rows)} descriptors are all alike; expected a route that changes")
+    return mean, basis @ turn.to(basis), variances.float()
+
+
+def augmented_views(
+    traverse: Traverse, describe: nn.Module, whitening: Whitening, places: int, batch_size: int = 64
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Descriptors of augmented copies of a traverse's frames, and the places that they show.
+
+    Args:
+        describe: frames (B,C,H,W) -> (B,D). whitening: says how many copies, how strong and which seed.
+        places: N, the frames of the traverse.
+
+    Shape: yields (B,D), (B,) int64.
+    """
+    from dejavu_torch.features.augmentation import Augmentation  # kornia's take a second to import
+
+    augmentation = Augmentation(**(whitening.strengths or {})).train()
+    every = max(1, -(-places * whitening.views // whitening.most_views))
+    begin = 0
+    for frames in traverse.select(range(0, places, every), traverse.batch_size(batch_size)):
+        shown = torch.arange(begin, begin + len(frames) * every, every)
+        begin += len(frames) * every
+        for view in range(whitening.views):
+            copies = _augmented(augmentation, frames, whitening.seed + view + whitening.views * begin)
+            yield features_of(copies, describe, traverse.name), shown
+
+
+def _augmented(augmentation: Augmentation, frames: Tensor, seed: int) -> Tensor:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        copies: Tensor = augmentation(frames)
+        return copies

@@ -1,0 +1,468 @@
+"""The spectral map: the strongest lines of every feature's spectrum along the route, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.database.codec import Stream, decode, encode, entropy_bytes, from_int8, to_int8
+from dejavu_torch.database.place_map import Mapper, PlaceMap
+from dejavu_torch.database.spectrum import Transform, from_spectrum, period_of, spectrum
+from dejavu_torch.database.summary import ChunkSummary, MapSummary
+from dejavu_torch.types import InputError
+
+SpectralMetric = Literal["cosine", "l2"]
+ROUNDING = 0.35  # what is added ahead of rounding down: a dead zone of 1.3 steps around 0
+SILENT = 1e-6  # of the map's RMS norm: a place below it has no direction
+FINEST = 64  # steps in an RMS line at most: a finer step changes no score
+STRONGEST = 10  # periods that a summary names
+CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and checksum in the file
+WITHIN = 0.98  # of the budget is near enough
+# measured, in multiplications of a matrix product:
+LINE_COST = 60  # of a coded line in a query's sum
+TRANSFORM_COST = 200  # of a place in a query's inverse transform
+REBUILD_COST = 120  # of a number that is rebuilt for all queries at once
+
+
+def quantise(lines: Tensor, step: Tensor | float) -> Tensor:
+    """Whole numbers of steps, those below 1 - `ROUNDING` of a step 0. Same shape, float; no gradient."""
+    return lines.sign() * (lines.abs() / step + ROUNDING).floor()
+
+
+class SpectralMap(PlaceMap):
+    """A route as the quantised spectrum of its descriptors along time, scored without decoding it.
+
+    A phase mean repeated along a chunk (eq. 1) is the descriptor's projection onto the harmonics of 1 / tau;
+    this map keeps whichever lines of the spectrum are worth their bytes: transform coding with one step for
+    all lines, which is reverse water-filling (Cover and Thomas, section 10.3.3).
+
+    Buffers:
+        levels: (N,K) int8, rows [start, stop) the lines of that chunk, in steps; `codec.ESCAPE` stands for the
+            next of `escapes`, (E,) int32.
+        lengths: (G,) int64, places of each chunk, one behind the other.
+        steps: (G,) float32, of each chunk.
+        mean: (K,) bfloat16, of the route's descriptors: the lines are of what differs from it.
+        positions: see `PlaceMap`.
+
+    Args:
+        metric: "cosine": 1 - the cosine of the angle between query and rebuilt descriptor. "l2": the square of
+            their distance.
+        transform: of the lines, see `spectrum`.
+        chunk: places of a chunk; "route" is one chunk, which cannot be extended.
+
+    Shape: scores: descriptors (Q,K) -> (Q,N), lower is better.
+
+    Convention: a place whose rebuilt descriptor has next to no length (`SILENT`) has cosine 0 with every
+        query, and no gradient; so has a query of length 0. Gradients reach the queries.
+
+    Raises:
+        InputError: an unknown metric or transform, buffers that do not fit together; scores: descriptors of
+            another dimension.
+    """
+
+    kind = "spectral"
+
+    levels: Tensor
+    escapes: Tensor
+    lengths: Tensor
+    steps: Tensor
+    mean: Tensor
+    line: Tensor
+    feature: Tensor
+    value: Tensor
+    norms: Tensor
+    per_norm: Tensor
+
+    def __init__(
+        self,
+        levels: Tensor | None = None,
+        escapes: Tensor | None = None,
+        lengths: Tensor | None = None,
+        steps: Tensor | None = None,
+        mean: Tensor | None = None,
+        metric: SpectralMetric = "cosine",
+        transform: Transform = "dft",
+        chunk: int | Literal["route"] = "route",
+    ) -> None:
+        super().__init__(*((0, 0) if levels is None else levels.shape))
+        check_settings(metric, transform, chunk)
+        self.metric, self.transform, self.chunk = metric, transform, chunk
+        empty = {
+            "levels": torch.zeros(0, 0, dtype=torch.int8),
+            "escapes": torch.zeros(0, dtype=torch.int32),
+            "lengths": torch.zeros(0, dtype=torch.int64),
+            "steps": torch.zeros(0),
+            "mean": torch.zeros(0, dtype=torch.bfloat16),
+        }
+        given = (levels, escapes, lengths, steps, mean)
+        for (name, nothing), value in zip(empty.items(), given, strict=True):
+            self.register_buffer(name, nothing if value is None else value)
+        for name in ("line", "feature", "value", "norms", "per_norm"):
+            self.register_buffer(name, torch.zeros(0), persistent=False)
+        self.loaded()
+        self.check()
+
+    def settings(self) -> dict[str, Any]:
+        return {"metric": self.metric, "transform": self.transform, "chunk": self.chunk}
+
+    def loaded(self) -> None:
+        """The lines that are not 0, one by one, and the norms of the rebuilt descriptors."""
+        problem = self.disagreement()
+        if problem:
+            raise InputError(f"the map does not fit together: {problem}")
+        self.chunks: list[tuple[int, int]] = []
+        for length in self.lengths.tolist():
+            start = self.chunks[-1][1] if self.chunks else 0
+            self.chunks.append((start, start + length))
+        levels = from_int8(self.levels, self.escapes)
+        rows, columns = levels.nonzero(as_tuple=True)
+        step = self.steps.repeat_interleave(self.lengths)
+        self.line, self.feature = rows.to(torch.int32), columns.to(torch.int32)
+        self.value = levels[rows, columns] * step[rows]
+        bounds = torch.tensor([0, *(stop for _, stop in self.chunks)], device=rows.device)
+        self.bounds: list[int] = torch.searchsorted(rows.contiguous(), bounds).tolist()
+        norms = [torch.linalg.vector_norm(self.rebuilt(g), dim=1) for g in range(len(self.chunks))]
+        self.norms = torch.cat(norms) if norms else self.steps.new_zeros(0)
+        heard = self.norms > SILENT * self.norms.square().mean().sqrt()
+        self.per_norm = torch.where(heard, 1 / self.norms, 0)
+        self.silent = int((~heard).sum())
+
+    def rebuilt(self, chunk: int) -> Tensor:
+        """The descriptors of a chunk as the map holds them, (W,K) float32."""
+        start, stop = self.chunks[chunk]
+        first, last = self.bounds[chunk : chunk + 2]
+        lines = self.value.new_zeros(stop - start, self.dimension)
+        where = (self.line[first:last].long() - start, self.feature[first:last].long())
+        lines = lines.index_put(where, self.value[first:last])
+        return from_spectrum(lines, self.transform) + self.mean.float()
+
+    def products(self, queries: Tensor, chunk: int) -> Tensor:
+        """Inner products with all descriptors of a chunk, decoding none of them: (Q,K) -> (Q,W).
+
+        The inverse transform is linear, so the product with every descriptor is the inverse transform of the
+        product with every line: O(lines + W log W) for a query instead of O(W K).
+        """
+        start, stop = self.chunks[chunk]
+        first, last = self.bounds[chunk : chunk + 2]
+        terms = queries.T.index_select(0, self.feature[first:last]) * self.value[first:last, None]
+        lines = queries.new_zeros(stop - start, len(queries))
+        lines = lines.index_add(0, self.line[first:last] - start, terms)
+        return from_spectrum(lines, self.transform).T + (queries @ self.mean.float())[:, None]
+
+    def rebuilds(self, queries: int) -> bool:
+        """Whether so many queries at once are scored by rebuilding a chunk and one matrix product.
+
+        That is how `scores` chooses what is faster.
+        """
+        in_frequency = LINE_COST * len(self.value) + TRANSFORM_COST * self.places
+        return queries * in_frequency > (REBUILD_COST + queries) * self.levels.numel()
+
+    def scores(self, queries: Tensor) -> Tensor:
+        """Scores of all places: (Q,K) -> (Q,N)."""
+        if queries.ndim != 2 or queries.shape[1] != self.dimension:
+            raise InputError(
+                f"the query descriptors are {tuple(queries.shape)}; the map expects (Q, {self.dimension})"
+            )
+        queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
+        # an exported program keeps one way, which must not hang on the number of queries
+        rebuild = not torch.compiler.is_compiling() and self.rebuilds(len(queries))
+        length = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
+        if self.metric == "cosine":
+            queries = queries / torch.where(length > 0, length, 1)
+        parts = [
+            queries @ self.rebuilt(g).to(queries).T if rebuild else self.products(queries, g)
+            for g in range(len(self.chunks))
+        ]
+        products = torch.cat(parts, 1)
+        if self.metric == "cosine":
+            return 1 - products * self.per_norm
+        return (length.square() - 2 * products + self.norms.square()).clamp(min=0)
+
+    def extend(self, features: Tensor) -> None:
+        """Add the places of (n,K) descriptors in chunks of their own; the others stay as they are.
+
+        Convention: the step is that of the last chunk. A last chunk that is short stays short.
+
+        Raises:
+            InputError: a map whose chunk is the route, or descriptors that do not fit.
+        """
+        if self.chunk == "route":
+            raise InputError(
+                "the map's chunk is the whole route, which cannot be extended; expected a map learned with a "
+                "chunk of so many places"
+            )
+        if not self.places:
+            raise InputError("there is no map yet; expected one to extend")
+        check_descriptors(features, self.dimension)
+        lengths = _lengths(len(features), self.chunk)
+        lines = _lines(features - self.mean.float(), lengths, self.transform)
+        small, escapes = to_int8(quantise(lines, self.steps[-1]))
+        self.levels = torch.cat([self.levels, small])
+        self.escapes = torch.cat([self.escapes, escapes])
+        self.lengths = torch.cat([self.lengths, self.lengths.new_tensor(lengths)])
+        self.steps = torch.cat([self.steps, self.steps[-1:].expand(len(lengths))])
+        self.places += len(features)
+        self.loaded()
+        self.check()
+
+    def packed(self) -> dict[str, Tensor]:
+        """As `PlaceMap.packed`: the levels of each chunk compressed, with a table of the chunks."""
+        streams = [encode(self.levels[start:stop]) for start, stop in self.chunks]
+        tensors = super().packed()
+        del tensors["levels"]
+        sizes = torch.tensor([[len(stream.bytes), stream.checksum] for stream in streams], dtype=torch.int64)
+        return tensors | {"streams": torch.cat([stream.bytes for stream in streams]), "stream_table": sizes}
+
+    def unpacked(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """As `PlaceMap.unpacked`: the levels decoded."""
+        state = dict(tensors)
+        table, streams = state.pop("stream_table"), state.pop("streams")
+        lengths, columns = state["lengths"], len(state["mean"])
+        if table.shape != (len(lengths), 2) or not len(lengths) or streams.dtype != torch.uint8:
+            raise InputError(f"a stream table {tuple(table.shape)} for {len(lengths)} chunks; expected a row each")
+        sizes = table[:, 0].tolist()
+        if min(sizes) < 0 or sum(sizes) != len(streams) or int(lengths.min()) < 1:
+            raise InputError(f"the coded lines are {len(streams)} bytes; the table claims {sum(sizes)}")
+        parts = zip(streams.split(sizes), lengths.tolist(), table[:, 1].tolist(), strict=True)
+        state["levels"] = torch.cat([decode(Stream(part, sum_), rows, columns) for part, rows, sum_ in parts])
+        return state
+
+    def disagreement(self) -> str:
+        dtypes = {"levels": torch.int8, "escapes": torch.int32, "lengths": torch.int64, "steps": torch.float32}
+        for name, dtype in dtypes.items():
+            buffer = getattr(self, name)
+            if buffer.dtype != dtype or buffer.ndim != 1 + (name == "levels"):
+                return f"{name} {tuple(buffer.shape)} {buffer.dtype}; expected {dtype}"
+        if tuple(self.levels.shape) != (self.places, self.dimension):
+            return f"levels {tuple(self.levels.shape)}; expected ({self.places}, {self.dimension})"
+        if int(self.lengths.sum()) != self.places or bool((self.lengths < 1).any()):
+            return f"chunks of {self.lengths.tolist()} places; expected {self.places} in all"
+        if len(self.steps) != len(self.lengths) or not bool(((self.steps > 0) & self.steps.isfinite()).all()):
+            return f"steps {self.steps.tolist()}; expected {len(self.lengths)} finite numbers above 0"
+        if tuple(self.mean.shape) != (self.dimension,) or not self.mean.isfinite().all():
+            return f"a mean {tuple(self.mean.shape)}; expected ({self.dimension},) finite numbers"
+        marks = int((self.levels == -128).sum())
+        return "" if marks == len(self.escapes) else f"{len(self.escapes)} escapes; expected {marks}"
+
+    def summary(self) -> MapSummary:
+        """See `MapSummary`; the parts are those of the route."""
+        chunks = []
+        for g, (start, stop) in enumerate(self.chunks):
+            first, last = self.bounds[g : g + 2]
+            line, value = self.line[first:last].long() - start, self.value[first:last]
+            energy = value.new_zeros(stop - start).index_add(0, line, value.square())
+            chunks.append(ChunkSummary(start, stop, self._periods(energy), (), Fraction(0), ()))
+        packed = self.packed() if self.places else {}
+        names = {"streams": "lines", "mean": "mean", "positions": "positions"}
+        route = {own: packed[name].nbytes for name, own in names.items() if name in packed}
+        others = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
+        return MapSummary(
+            self.kind, self.places, self.places - self.silent, 0, 0, tuple(chunks), route | {"chunks": others}, {}
+        )
+
+    def _periods(self, energy: Tensor) -> tuple[Fraction, ...]:
+        """The periods of the strongest lines, sorted; cosine and sine of one frequency count together."""
+        total: dict[Fraction, float] = {}
+        for line in energy[1:].nonzero().flatten().tolist():
+            period = period_of(line + 1, len(energy), self.transform)
+            total[period] = total.get(period, 0.0) + float(energy[line + 1])
+        return tuple(sorted(sorted(total, key=lambda period: -total[period])[:STRONGEST]))
+
+    def extra_repr(self) -> str:
+        return (
+            f"places={self.places}, dimension={self.dimension}, lines={len(self.value)}, "
+            f"chunks={len(self.chunks)}, metric={self.metric!r}, transform={self.transform!r}"
+        )
+
+
+class SpectralMapper(Mapper):
+    """Codes descriptors along the route: the transform of each number over a chunk, in steps of one size.
+
+    Args:
+        route_bytes_per_place: what the map may take for each place, without what does not grow with the route;
+            the step is chosen so that its coded lines fit.
+        step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
+        chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
+            and the map can be extended.
+        transform, metric: of the maps, see `SpectralMap`.
+
+    Shape: descriptors (N,K) -> SpectralMap of N places.
+
+    Convention: the written route is within 2 % of the budget and not above it, unless steps so fine that they
+        change no score take less.
+
+    Raises:
+        InputError: settings out of range; forward: fewer than two places, descriptors that are not finite or
+            all alike, or a budget that cannot be met.
+
+    Example:
+        >>> wave = torch.sin(torch.arange(500.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
+        >>> SpectralMapper()(wave).scores(wave[20:21]).argmin()
+        tensor(20)
+    """
+
+    kind = SpectralMap.kind
+
+    def __init__(
+        self,
+        route_bytes_per_place: float | None = 5.0,
+        step: float | None = None,
+        chunk: int | Literal["route"] = "route",
+        transform: Transform = "dft",
+        metric: SpectralMetric = "cosine",
+    ) -> None:
+        super().__init__()
+        if (route_bytes_per_place is None) == (step is None):
+            raise InputError(
+                f"route_bytes_per_place is {route_bytes_per_place} and step is {step}; expected one of them, "
+                "the other None"
+            )
+        for name, value in (("route_bytes_per_place", route_bytes_per_place), ("step", step)):
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{name} is {value}; expected a number above 0")
+        check_settings(metric, transform, chunk)
+        self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
+        self.transform, self.metric = transform, metric
+
+    @torch.no_grad()
+    def forward(self, features: Tensor) -> SpectralMap:
+        check_descriptors(features)
+        features = features.float()
+        mean = features.mean(0).to(torch.bfloat16)
+        lengths = _lengths(len(features), self.chunk)
+        lines = _lines(features - mean.float(), lengths, self.transform)
+        scale = float(lines.square().mean().sqrt())
+        if not scale > 1e-6 * float(features.square().mean().sqrt()):
+            raise InputError(f"the {len(features)} descriptors are all alike; expected a route that changes")
+        overhead = mean.nbytes + CHUNK_BYTES * len(lengths)
+        step = self._step(lines, lengths, overhead) if self.step is None else self.step
+        small, escapes = to_int8(quantise(lines, step))
+        steps = features.new_full((len(lengths),), step)
+        return SpectralMap(
+            small,
+            escapes,
+            torch.tensor(lengths, device=features.device),
+            steps,
+            mean,
+            self.metric,
+            self.transform,
+            self.chunk,
+        )
+
+    def empty(self) -> SpectralMap:
+        return SpectralMap(metric=self.metric, transform=self.transform, chunk=self.chunk)
+
+    def _step(self, lines: Tensor, lengths: list[int], overhead: int) -> float:
+        """The smallest step whose coded lines fit into the budget, to 2 %."""
+        assert self.route_bytes_per_place is not None
+        places, numbers = lines.shape
+        room = self.route_bytes_per_place * places - overhead
+        if room <= 0 or self.route_bytes_per_place > 4 * numbers:
+            raise InputError(
+                f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
+                f"{overhead / places:.3g}, which the mean and the chunk table of {places} places take, and at "
+                f"most {4 * numbers}, their {numbers} numbers as floats"
+            )
+        finest, coarsest = float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
+        aim, fitting = room, coarsest
+        for _ in range(8):
+            step = _step_of_entropy(lines, aim, finest, coarsest)
+            size = _coded_bytes(lines, lengths, step)
+            if size <= room:
+                fitting = min(fitting, step)
+                if size >= WITHIN * room or step == finest:
+                    break
+            aim *= (1 + WITHIN) / 2 * room / size
+        return fitting
+
+
+class SpectralCode(nn.Module):
+    """Lines of a spectrum that are trained together with the step they are coded in.
+
+    Args:
+        lines: (W,K) float, see `spectrum`. step: of the quantisation. transform: of the lines.
+
+    Shape: () -> the series as a map of these lines holds it, (W,K).
+
+    Convention: rounding passes the gradient of the lines straight through, and the step's is that of its
+        rounding error (learned step size quantisation: Esser et al., ICLR 2020).
+
+    Example:
+        >>> code = SpectralCode(spectrum(torch.randn(64, 3)), step=0.5)
+        >>> code().square().sum().backward()
+        >>> code.lines.grad.shape, code.step.grad.ndim
+        (torch.Size([64, 3]), 0)
+    """
+
+    def __init__(self, lines: Tensor, step: float, transform: Transform = "dft") -> None:
+        super().__init__()
+        if lines.ndim != 2 or not lines.is_floating_point() or not 0 < step < math.inf:
+            raise InputError(
+                f"SpectralCode got lines {tuple(lines.shape)} and step {step}; expected floats (W,K) and a step "
+                "above 0"
+            )
+        self.transform = transform
+        self.lines = nn.Parameter(lines.detach().clone())
+        self.step = nn.Parameter(lines.new_tensor(step))
+
+    def forward(self, noise: Tensor | None = None) -> Tensor:
+        """The series; `noise` (W,K), in steps, takes the place of the rounding error."""
+        wanted = self.lines / self.step
+        if noise is None:
+            noise = (quantise(self.lines, self.step) - wanted).detach()
+        return from_spectrum((wanted + noise) * self.step, self.transform)
+
+
+def check_settings(metric: str, transform: str, chunk: int | str) -> None:
+    """Refuse settings that no spectral map has."""
+    if metric not in get_args(SpectralMetric):
+        raise InputError(f"metric {metric!r} is none of a spectral map; expected 'cosine' or 'l2'")
+    if transform not in get_args(Transform):
+        raise InputError(f"transform {transform!r} is unknown; expected 'dft' or 'dct'")
+    if chunk != "route" and (isinstance(chunk, (str, bool)) or not 2 <= chunk < math.inf or chunk != int(chunk)):
+        raise InputError(f"chunk is {chunk!r}; expected 'route' or a number of places, at least 2")
+
+
+def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
+    """Refuse what is no route of descriptors."""
+    expected = "K" if dimension is None else dimension
+    few = dimension is None and features.ndim == 2 and len(features) < 2
+    wrong = features.ndim != 2 or not features.numel() or dimension not in (None, features.shape[1])
+    if few or wrong or not features.is_floating_point():
+        least = "N at least 2" if dimension is None else "n at least 1"
+        raise InputError(
+            f"the descriptors are {tuple(features.shape)} {features.dtype}; expected floats (N, {expected}), {least}"
+        )
+    if not bool(features.isfinite().all()):
+        raise InputError("the descriptors hold NaN or infinity; expected finite numbers")
+
+
+def _lengths(places: int, chunk: int | str) -> list[int]:
+    """Places of each chunk; the last one takes what is left."""
+    size = places if chunk == "route" else int(chunk)
+    return [min(size, places - start) for start in range(0, places, size)]
+
+
+def _lines(series: Tensor, lengths: list[int], transform: Transform) -> Tensor:
+    return torch.cat([spectrum(part, transform) for part in series.split(lengths)])
+
+
+def _coded_bytes(lines: Tensor, lengths: list[int], step: float) -> int:
+    small, escapes = to_int8(quantise(lines, step))
+    return escapes.nbytes + sum(len(encode(part).bytes) for part in small.split(lengths))
+
+
+def _step_of_entropy(lines: Tensor, size: float, finest: float, coarsest: float) -> float:
+    """The step at which the levels' entropy is so many bytes, by bisection of its logarithm."""
+    low, high = math.log(finest), math.log(coarsest)
+    if entropy_bytes(quantise(lines, finest)) <= size:
+        return finest
+    for _ in range(20):
+        middle = (low + high) / 2
+        fits = entropy_bytes(quantise(lines, math.exp(middle))) <= size
+        low, high = (low, middle) if fits else (middle, high)
+    return math.exp(high)

@@ -1,0 +1,96 @@
+"""Orthonormal real transforms along time: which frequencies a series is made of, a line for each."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.types import InputError
+
+Transform = Literal["dft", "dct"]
+
+
+def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
+    """The lines of W numbers in time; there are W of them.
+
+    Args:
+        series: float; gradients pass.
+        transform: "dft": line 0 is the mean, lines 2k - 1 and 2k are the cosine and the sine of k cycles; of
+            an even W the last line is the cosine of W / 2 cycles. "dct" (DCT-II): line r is the cosine of r
+            half cycles.
+
+    Shape: (W,...) -> (W,...).
+
+    Convention: orthonormal: the squares of the lines add up to those of the series.
+
+    Raises:
+        InputError: an unknown transform, or no numbers.
+
+    Example:
+        >>> wave = torch.cos(torch.arange(8) * torch.pi / 2)  # two cycles
+        >>> spectrum(wave).round(decimals=4).abs().tolist()
+        [0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0]
+    """
+    count = _check(series, transform)
+    if transform == "dct":
+        halves = torch.fft.rfft(torch.cat([series, series.flip(0)]), dim=0, norm="ortho")[:count]
+        cosine, sine = _quarter_steps(series)
+        return (halves.real * cosine + halves.imag * sine) * _along(_scale(count, transform, series), series)
+    parts = torch.view_as_real(torch.fft.rfft(series, dim=0, norm="ortho")).movedim(-1, 1).flatten(0, 1)
+    lines = torch.cat([parts[:1], parts[2 : count + 1]])  # the mean has no sine; nor have W / 2 cycles
+    return lines * _along(_scale(count, transform, series), series)
+
+
+def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
+    """The series that has these lines: the inverse of `spectrum`. (W,...) -> (W,...)"""
+    count = _check(lines, transform)
+    lines = lines / _along(_scale(count, transform, lines), lines)
+    nothing = torch.zeros_like(lines[:1])
+    if transform == "dct":
+        cosine, sine = _quarter_steps(lines)
+        halves = torch.complex(torch.cat([lines * cosine, nothing]), torch.cat([lines * sine, nothing]))
+        return torch.fft.irfft(halves, n=2 * count, dim=0, norm="ortho")[:count]
+    parts = torch.cat([lines[:1], nothing, lines[1:], *([nothing] if count % 2 == 0 else [])])
+    pairs = parts.unflatten(0, (-1, 2)).movedim(1, -1).contiguous()
+    return torch.fft.irfft(torch.view_as_complex(pairs), n=count, dim=0, norm="ortho")
+
+
+def period_of(line: int, count: int, transform: Transform = "dft") -> Fraction:
+    """The period of a line above 0, in steps of the series: W / k of k cycles."""
+    return Fraction(count, (line + 1) // 2) if transform == "dft" else Fraction(2 * count, line)
+
+
+def _check(values: Tensor, transform: str) -> int:
+    if transform not in get_args(Transform):
+        raise InputError(f"transform {transform!r} is unknown; expected 'dft' or 'dct'")
+    if values.ndim < 1 or not len(values) or not values.is_floating_point():
+        raise InputError(
+            f"the transform got {tuple(values.shape)} {values.dtype}; expected floats (W,...), W at least 1"
+        )
+    return len(values)
+
+
+def _along(factors: Tensor, values: Tensor) -> Tensor:
+    """Factors (W,) of a series (W,...)."""
+    return factors.view(-1, *[1] * (values.ndim - 1))
+
+
+def _scale(count: int, transform: str, like: Tensor) -> Tensor:
+    """What makes torch's transform of W numbers orthonormal, (W,)."""
+    scale = torch.ones(count, dtype=like.dtype, device=like.device)
+    if transform == "dct":
+        scale[:1] /= math.sqrt(2)
+    else:
+        scale[1 : count - (count % 2 == 0)] *= math.sqrt(2)
+    return scale
+
+
+def _quarter_steps(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine of pi r / 2W: frames lie half a step from where the mirrored series begins."""
+    count = len(values)
+    angles = torch.arange(count, dtype=torch.float64, device=values.device) * (math.pi / (2 * count))
+    return _along(angles.cos().to(values.dtype), values), _along(angles.sin().to(values.dtype), values)
