@@ -17,6 +17,7 @@ from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.database.mapfile import map_size, read_map, write_map
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
+from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.cnn import SmallCNN
@@ -25,6 +26,8 @@ from dejavu_torch.features.extract import check_queries, feature_batches, featur
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.views import AugmentedTraverse, Views
+from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import ForeignPeriods
@@ -36,6 +39,7 @@ from dejavu_torch.types import InputError, Match, Training, Traverse
 log = logging.getLogger("dejavu_torch")
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
+ROWS = 4096  # descriptors whitened at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
 
 # the classes that a map file may name; any other has to be given by the caller
@@ -44,9 +48,11 @@ CLASSES: tuple[type[nn.Module], ...] = (
     HOG,
     SmallCNN,
     Embedding,
+    Whitening,
     SpectrogramAnalysis,
     ImposedPeriods,
     TemplateMapper,
+    SpectralMapper,
     GroundOdometry,
 )
 REGISTRY: Registry = {cls.__name__: cls for cls in CLASSES}
@@ -54,9 +60,11 @@ KINDS = [cls.kind for cls in CLASSES if issubclass(cls, Mapper)]
 PARTS: dict[str, type[nn.Module]] = {
     "preprocess": Preprocess,
     "features": nn.Module,
+    "whitening": Whitening,
     "mapper": Mapper,
     "velocity": GroundOdometry,
 }
+OPTIONAL = ("whitening", "velocity")
 
 
 class DejaVu(nn.Module):
@@ -64,7 +72,9 @@ class DejaVu(nn.Module):
 
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
-        mapper: makes the map from the features of a traverse; None is TemplateMapper with its defaults.
+        whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; None
+            keeps the features as they are.
+        mapper: makes the map from the descriptors of a traverse; None is TemplateMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
@@ -92,6 +102,7 @@ class DejaVu(nn.Module):
         batch_size: int = 64,
         preprocess: Preprocess | None = None,
         velocity: GroundOdometry | None = None,
+        whitening: Whitening | None = None,
     ) -> None:
         super().__init__()
         if mapper is not None and not isinstance(mapper, Mapper):
@@ -104,6 +115,7 @@ class DejaVu(nn.Module):
             raise InputError("the threshold is NaN; expected a number")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
+        self.whitening = whitening
         self.mapper = TemplateMapper() if mapper is None else mapper
         self.threshold = threshold
         self.batch_size = batch_size
@@ -118,11 +130,14 @@ class DejaVu(nn.Module):
         """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
         return {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
 
-    def learn(self, traverse: Traverse | Tensor, progress: bool = False) -> DejaVu:
+    def learn(
+        self, traverse: Traverse | Tensor, progress: bool = False, second: Views | None = None
+    ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
 
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
+            second: see `describe_reference`.
             progress: show a progress bar on a terminal.
 
         Returns:
@@ -134,7 +149,36 @@ class DejaVu(nn.Module):
             InputError: no frames, too few, NaN, or mixed sizes.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
-        return self.learn_features(self.extract_all(traverse, "learning" if progress else None), traverse)
+        text = "learning" if progress else None
+        return self.learn_features(self.describe_reference(traverse, second, text), traverse)
+
+    def describe_reference(
+        self, traverse: Traverse, second: Views | None = None, progress: str | None = None
+    ) -> Tensor:
+        """Descriptors of the reference, the whitening learned from it: what `learn_features` makes a map of.
+
+        Args:
+            second: another traverse of the same places, from which whitening learns, in place of augmented
+                copies, what changes between two visits.
+            progress: text of a progress bar on a terminal; None is no bar.
+
+        Shape: -> (N,K).
+        """
+        whitening = self.whitening
+        if whitening is None or whitening.fixed:
+            return self.extract_all(traverse, progress)
+        device = self.map.positions.device
+        features = concatenate(self._features(traverse, progress))
+        if second is None and len(traverse.frame_shape) == 3:
+            copies = whitening.views, whitening.most_views, whitening.strengths, whitening.seed
+            second = AugmentedTraverse(traverse, len(features), *copies).views
+        if second is None:
+            whitening.learn(features)
+        else:
+            batches = self._features(second.traverse, progress and "whitening")
+            whitening.learn(features, _labelled(batches, second.places.to(device)))
+        whitening.to(device)
+        return concatenate(self.whitened(part) for part in features.split(ROWS))
 
     def resample(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
         """A traverse at even steps along the ground, where `velocity` is set; else as it is.
@@ -154,10 +198,10 @@ class DejaVu(nn.Module):
         return ResampledTraverse(traverse, self.velocity, self.batch_size, step, progress)
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
-        """As `learn`, from features that are there already.
+        """As `learn`, from descriptors that are there already.
 
         Args:
-            features: (N,D) float.
+            features: (N,K) float, whitened where the model whitens.
             traverse: what they come from, where known: the map then knows what frames to expect, and,
                 where they were resampled, which frame each place shows.
         """
@@ -193,12 +237,16 @@ class DejaVu(nn.Module):
         features: Tensor = self.features(self.preprocess(frames))
         return features
 
+    def whitened(self, features: Tensor) -> Tensor:
+        """Descriptors of features, (B,D) -> (B,K); the features themselves without whitening."""
+        return features if self.whitening is None else self.whitening(features)
+
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
         features = features_of(queries, self.describe, "the query")
         self.check_queries(tuple(queries.shape[1:]), features.shape[1], "the query")
-        return self.map.scores(features)
+        return self.map.scores(self.whitened(features))
 
     def localize(self, queries: Traverse | Tensor, progress: str | None = None) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
@@ -214,31 +262,43 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        matches = list(self.matches(queries, progress))
-        return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
+        return _joined(self.matches(queries, progress))
+
+    def localize_descriptors(self, descriptors: Tensor) -> Match:
+        """As `localize`, of descriptors (Q,K) as the map's own are: whitened where the model whitens."""
+        self._require_map()
+        return _joined(self._found(descriptors))
 
     def matches(self, queries: Traverse | Tensor, progress: str | None = None) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
-        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         queries = as_traverse(queries)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress is not None)
         shape = queries.frame_shape
-        for i, features in enumerate(self.extract(queries, progress)):
+        for i, features in enumerate(self._features(queries, progress)):
             if i == 0:
                 self.check_queries(shape, features.shape[1], queries.name)
-            for part in features.split(at_once):
-                with torch.no_grad():
-                    match = best_match(self.map.scores(part), self.threshold)
-                yield Match(*(column.cpu() for column in match))
+            yield from self._found(self.whitened(features))
+
+    def _found(self, descriptors: Tensor) -> Iterator[Match]:
+        """Matches of descriptors, as many at a time as memory allows."""
+        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
+        for part in descriptors.split(at_once):
+            with torch.no_grad():
+                match = best_match(self.map.scores(part), self.threshold)
+            yield Match(*(column.cpu() for column in match))
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
-        """Features of a traverse in batches (B,D), without gradients."""
+        """Descriptors of a traverse in batches (B,K), without gradients."""
+        return map(self.whitened, self._features(traverse, progress))
+
+    def _features(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
+        """What whitening takes: features of a traverse in batches (B,D), without gradients."""
         return feature_batches(traverse, self.pipeline, self.batch_size, self.map.positions.device, progress)
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
-        """Features of a whole traverse, (N,D); many of them lie in a temporary file, see `concatenate`."""
+        """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""
         return concatenate(self.extract(traverse, progress))
 
     @property
@@ -254,7 +314,9 @@ class DejaVu(nn.Module):
             name: of the queries, for the message.
         """
         resized = getattr(self.features, "resize", None) is not None
-        check_queries(shape, dimension, self.frame_shape, self.map.dimension, resized, name)
+        whitening = self.whitening
+        own = len(whitening.projection) if whitening is not None else self.map.dimension
+        check_queries(shape, dimension, self.frame_shape, own, resized, name)
 
     def frame_name(self, frame: int) -> str:
         """The name of a reference frame, such as its file's; empty where it has none."""
@@ -290,9 +352,15 @@ class DejaVu(nn.Module):
                 **{n: header[n] for n in inspect.signature(cls).parameters if n not in PARTS},
             )
             model.set_extra_state({name: header[name] for name in model.get_extra_state()})
+            own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("map.")}
+            packed = {name.removeprefix("map."): tensor for name, tensor in own.items()}
+            unpacked = model.map.unpacked(packed)
             state: dict[str, Any] = {**tensors, "map._extra_state": header["map"]}
+            state |= {f"map.{name}": tensor for name, tensor in unpacked.items()}
             loaded = model.load_state_dict(state, strict=False)
-            missing = [name for name in loaded.missing_keys if name.startswith(("map.", "features."))]
+            missing = [
+                name for name in loaded.missing_keys if name.startswith(("map.", "features.", "whitening."))
+            ]
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
             frames = len(model.map.positions) or model.map.places
@@ -314,20 +382,24 @@ class DejaVu(nn.Module):
         header |= {name: value for name, value in self.settings().items() if name not in PARTS}
         header |= self.get_extra_state()
         header["map"] = self.map.get_extra_state()
-        tensors = {f"map.{name}": t for name, t in self.map.state_dict().items() if isinstance(t, Tensor)}
-        return tensors | self._weights(), header
+        tensors = {f"map.{name}": tensor for name, tensor in self.map.packed().items()}
+        return tensors | self._weights("features") | self._weights("whitening"), header
 
-    def _weights(self) -> dict[str, Tensor]:
-        weights = self.features.state_dict()
-        return {f"features.{name}": tensor for name, tensor in weights.items() if isinstance(tensor, Tensor)}
+    def _weights(self, part: str) -> dict[str, Tensor]:
+        module = getattr(self, part)
+        weights = {} if module is None else module.state_dict()
+        return {f"{part}.{name}": tensor for name, tensor in weights.items() if isinstance(tensor, Tensor)}
 
     def summary(self) -> MapSummary:
         """What the map can tell apart, and the bytes of its file by part."""
         tensors, header = self._file()
-        backbone = sum(tensor.nbytes for tensor in self._weights().values())
+        fixed = {
+            name: sum(tensor.nbytes for tensor in self._weights(part).values())
+            for name, part in (("backbone", "features"), ("whitening", "whitening"))
+        }
         summary = self.map.summary().with_parts(route={"names": len(header["names"] or "")})
-        rest = map_size(tensors, header) - summary.route_bytes - backbone
-        return summary.with_parts(fixed={"backbone": backbone, "header": rest})
+        rest = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
+        return summary.with_parts(fixed=fixed | {"header": rest})
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the state_dict holds beside the tensors and the map's own state."""
@@ -345,6 +417,18 @@ class DejaVu(nn.Module):
     def _require_map(self) -> None:
         if not self.map.places:
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
+
+
+def _joined(matches: Iterator[Match]) -> Match:
+    return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
+
+
+def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Batches of descriptors, each with the places (B,) that they show."""
+    done = 0
+    for batch in batches:
+        yield batch, places[done : done + len(batch)]
+        done += len(batch)
 
 
 def check_kind(state: dict[str, Any]) -> None:
@@ -368,11 +452,11 @@ def read_place_map(path: Path) -> PlaceMap:
         check_kind(header["map"])
         mapper = _build(header, "mapper", None)
         assert isinstance(mapper, Mapper)
-        route, own = mapper.empty(), {"_extra_state": header["map"]}
-        own |= {
+        route = mapper.empty()
+        own = {
             name.removeprefix("map."): tensor for name, tensor in tensors.items() if name.startswith("map.")
         }
-        route.load_state_dict(own)
+        route.load_state_dict({**route.unpacked(own), "_extra_state": header["map"]})
     except (InputError, RuntimeError, KeyError, TypeError) as error:
         raise InputError(f"{path}: {' '.join(str(error).split())}") from error
     return route
@@ -395,7 +479,7 @@ def _build_parts(header: dict[str, Any], features: nn.Module | None) -> dict[str
 
 
 def _build(header: dict[str, Any], name: str, features: nn.Module | None) -> nn.Module | None:
-    if header[name] is None and name == "velocity":
+    if header[name] is None and name in OPTIONAL:
         return None
     recipe = Recipe(**header[name])
     # only learning needs what found the periods: one from elsewhere need not be built

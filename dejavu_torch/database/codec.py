@@ -1,4 +1,4 @@
-"""Integer levels as a stream of bytes: most of them are 0, and the file holds little more than their entropy."""
+"""Integer levels as a stream of bytes: most of them are 0, and it holds little more than their entropy."""
 
 from __future__ import annotations
 

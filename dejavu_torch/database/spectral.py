@@ -41,16 +41,16 @@ class SpectralMap(PlaceMap):
     all lines, which is reverse water-filling (Cover and Thomas, section 10.3.3).
 
     Buffers:
-        levels: (N,K) int8, rows [start, stop) the lines of that chunk, in steps; `codec.ESCAPE` stands for the
-            next of `escapes`, (E,) int32.
+        levels: (N,K) int8, rows [start, stop) the lines of that chunk, in steps; `codec.ESCAPE` stands for
+            the next of `escapes`, (E,) int32.
         lengths: (G,) int64, places of each chunk, one behind the other.
         steps: (G,) float32, of each chunk.
         mean: (K,) bfloat16, of the route's descriptors: the lines are of what differs from it.
         positions: see `PlaceMap`.
 
     Args:
-        metric: "cosine": 1 - the cosine of the angle between query and rebuilt descriptor. "l2": the square of
-            their distance.
+        metric: "cosine": 1 - the cosine of the angle between query and rebuilt descriptor. "l2": the square
+            of their distance.
         transform: of the lines, see `spectrum`.
         chunk: places of a chunk; "route" is one chunk, which cannot be extended.
 
@@ -138,7 +138,7 @@ class SpectralMap(PlaceMap):
         lines = self.value.new_zeros(stop - start, self.dimension)
         where = (self.line[first:last].long() - start, self.feature[first:last].long())
         lines = lines.index_put(where, self.value[first:last])
-        return from_spectrum(lines, self.transform) + self.mean.float()
+        return from_spectrum(lines.T, self.transform).T + self.mean.to(lines)
 
     def products(self, queries: Tensor, chunk: int) -> Tensor:
         """Inner products with all descriptors of a chunk, decoding none of them: (Q,K) -> (Q,W).
@@ -148,10 +148,12 @@ class SpectralMap(PlaceMap):
         """
         start, stop = self.chunks[chunk]
         first, last = self.bounds[chunk : chunk + 2]
-        terms = queries.T.index_select(0, self.feature[first:last]) * self.value[first:last, None]
-        lines = queries.new_zeros(stop - start, len(queries))
-        lines = lines.index_add(0, self.line[first:last] - start, terms)
-        return from_spectrum(lines, self.transform).T + (queries @ self.mean.float())[:, None]
+        terms = queries.index_select(1, self.feature[first:last]) * self.value[first:last].to(queries)
+        # shape[0], since len() would fix the number of queries in an exported program
+        lines = queries.new_zeros(queries.shape[0], stop - start)
+        lines = lines.index_add(1, self.line[first:last] - start, terms)
+        products: Tensor = from_spectrum(lines, self.transform) + (queries @ self.mean.to(queries))[:, None]
+        return products
 
     def rebuilds(self, queries: int) -> bool:
         """Whether so many queries at once are scored by rebuilding a chunk and one matrix product.
@@ -169,7 +171,7 @@ class SpectralMap(PlaceMap):
             )
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         # an exported program keeps one way, which must not hang on the number of queries
-        rebuild = not torch.compiler.is_compiling() and self.rebuilds(len(queries))
+        rebuild = not torch.compiler.is_compiling() and self.rebuilds(queries.shape[0])
         length = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
@@ -179,8 +181,8 @@ class SpectralMap(PlaceMap):
         ]
         products = torch.cat(parts, 1)
         if self.metric == "cosine":
-            return 1 - products * self.per_norm
-        return (length.square() - 2 * products + self.norms.square()).clamp(min=0)
+            return 1 - products * self.per_norm.to(products)
+        return (length.square() - 2 * products + self.norms.to(products).square()).clamp(min=0)
 
     def extend(self, features: Tensor) -> None:
         """Add the places of (n,K) descriptors in chunks of their own; the others stay as they are.
@@ -223,7 +225,9 @@ class SpectralMap(PlaceMap):
         table, streams = state.pop("stream_table"), state.pop("streams")
         lengths, columns = state["lengths"], len(state["mean"])
         if table.shape != (len(lengths), 2) or not len(lengths) or streams.dtype != torch.uint8:
-            raise InputError(f"a stream table {tuple(table.shape)} for {len(lengths)} chunks; expected a row each")
+            raise InputError(
+                f"a stream table {tuple(table.shape)} for {len(lengths)} chunks; expected a row each"
+            )
         sizes = table[:, 0].tolist()
         if min(sizes) < 0 or sum(sizes) != len(streams) or int(lengths.min()) < 1:
             raise InputError(f"the coded lines are {len(streams)} bytes; the table claims {sum(sizes)}")
@@ -232,7 +236,12 @@ class SpectralMap(PlaceMap):
         return state
 
     def disagreement(self) -> str:
-        dtypes = {"levels": torch.int8, "escapes": torch.int32, "lengths": torch.int64, "steps": torch.float32}
+        dtypes = {
+            "levels": torch.int8,
+            "escapes": torch.int32,
+            "lengths": torch.int64,
+            "steps": torch.float32,
+        }
         for name, dtype in dtypes.items():
             buffer = getattr(self, name)
             if buffer.dtype != dtype or buffer.ndim != 1 + (name == "levels"):
@@ -260,9 +269,9 @@ class SpectralMap(PlaceMap):
         names = {"streams": "lines", "mean": "mean", "positions": "positions"}
         route = {own: packed[name].nbytes for name, own in names.items() if name in packed}
         others = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
-        return MapSummary(
-            self.kind, self.places, self.places - self.silent, 0, 0, tuple(chunks), route | {"chunks": others}, {}
-        )
+        heard, lines = self.places - self.silent, len(self.value)
+        route["chunks"] = others
+        return MapSummary(self.kind, self.places, heard, 0, 0, tuple(chunks), route, {}, lines)
 
     def _periods(self, energy: Tensor) -> tuple[Fraction, ...]:
         """The periods of the strongest lines, sorted; cosine and sine of one frequency count together."""
@@ -283,8 +292,8 @@ class SpectralMapper(Mapper):
     """Codes descriptors along the route: the transform of each number over a chunk, in steps of one size.
 
     Args:
-        route_bytes_per_place: what the map may take for each place, without what does not grow with the route;
-            the step is chosen so that its coded lines fit.
+        route_bytes_per_place: what the map may take for each place, without what does not grow with the
+            route; the step is chosen so that its coded lines fit.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -364,8 +373,8 @@ class SpectralMapper(Mapper):
         if room <= 0 or self.route_bytes_per_place > 4 * numbers:
             raise InputError(
                 f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
-                f"{overhead / places:.3g}, which the mean and the chunk table of {places} places take, and at "
-                f"most {4 * numbers}, their {numbers} numbers as floats"
+                f"{overhead / places:.3g}, which the mean and the table of chunks take, and at most "
+                f"{4 * numbers}, {numbers} numbers as floats"
             )
         finest, coarsest = float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
         aim, fitting = room, coarsest
@@ -386,13 +395,13 @@ class SpectralCode(nn.Module):
     Args:
         lines: (W,K) float, see `spectrum`. step: of the quantisation. transform: of the lines.
 
-    Shape: () -> the series as a map of these lines holds it, (W,K).
+    Shape: () -> the series as a map of these lines holds it, (W,K), as `lines` are.
 
     Convention: rounding passes the gradient of the lines straight through, and the step's is that of its
         rounding error (learned step size quantisation: Esser et al., ICLR 2020).
 
     Example:
-        >>> code = SpectralCode(spectrum(torch.randn(64, 3)), step=0.5)
+        >>> code = SpectralCode(spectrum(torch.randn(3, 64)).T, step=0.5)
         >>> code().square().sum().backward()
         >>> code.lines.grad.shape, code.step.grad.ndim
         (torch.Size([64, 3]), 0)
@@ -402,8 +411,8 @@ class SpectralCode(nn.Module):
         super().__init__()
         if lines.ndim != 2 or not lines.is_floating_point() or not 0 < step < math.inf:
             raise InputError(
-                f"SpectralCode got lines {tuple(lines.shape)} and step {step}; expected floats (W,K) and a step "
-                "above 0"
+                f"SpectralCode got lines {tuple(lines.shape)} {lines.dtype} and step {step}; expected floats "
+                "(W,K) and a step above 0"
             )
         self.transform = transform
         self.lines = nn.Parameter(lines.detach().clone())
@@ -414,7 +423,7 @@ class SpectralCode(nn.Module):
         wanted = self.lines / self.step
         if noise is None:
             noise = (quantise(self.lines, self.step) - wanted).detach()
-        return from_spectrum((wanted + noise) * self.step, self.transform)
+        return from_spectrum(((wanted + noise) * self.step).T, self.transform).T
 
 
 def check_settings(metric: str, transform: str, chunk: int | str) -> None:
@@ -423,7 +432,8 @@ def check_settings(metric: str, transform: str, chunk: int | str) -> None:
         raise InputError(f"metric {metric!r} is none of a spectral map; expected 'cosine' or 'l2'")
     if transform not in get_args(Transform):
         raise InputError(f"transform {transform!r} is unknown; expected 'dft' or 'dct'")
-    if chunk != "route" and (isinstance(chunk, (str, bool)) or not 2 <= chunk < math.inf or chunk != int(chunk)):
+    whole = isinstance(chunk, int) and not isinstance(chunk, bool) and chunk >= 2
+    if chunk != "route" and not whole:
         raise InputError(f"chunk is {chunk!r}; expected 'route' or a number of places, at least 2")
 
 
@@ -433,9 +443,10 @@ def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
     few = dimension is None and features.ndim == 2 and len(features) < 2
     wrong = features.ndim != 2 or not features.numel() or dimension not in (None, features.shape[1])
     if few or wrong or not features.is_floating_point():
-        least = "N at least 2" if dimension is None else "n at least 1"
+        least = 2 if dimension is None else 1
         raise InputError(
-            f"the descriptors are {tuple(features.shape)} {features.dtype}; expected floats (N, {expected}), {least}"
+            f"the descriptors are {tuple(features.shape)} {features.dtype}; expected floats (N, {expected}), "
+            f"N at least {least}"
         )
     if not bool(features.isfinite().all()):
         raise InputError("the descriptors hold NaN or infinity; expected finite numbers")
@@ -448,7 +459,7 @@ def _lengths(places: int, chunk: int | str) -> list[int]:
 
 
 def _lines(series: Tensor, lengths: list[int], transform: Transform) -> Tensor:
-    return torch.cat([spectrum(part, transform) for part in series.split(lengths)])
+    return torch.cat([spectrum(part.T, transform).T for part in series.split(lengths)])
 
 
 def _coded_bytes(lines: Tensor, lengths: list[int], step: float) -> int:

@@ -23,7 +23,7 @@ def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
             an even W the last line is the cosine of W / 2 cycles. "dct" (DCT-II): line r is the cosine of r
             half cycles.
 
-    Shape: (W,...) -> (W,...).
+    Shape: (...,W) -> (...,W).
 
     Convention: orthonormal: the squares of the lines add up to those of the series.
 
@@ -37,26 +37,28 @@ def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
     """
     count = _check(series, transform)
     if transform == "dct":
-        halves = torch.fft.rfft(torch.cat([series, series.flip(0)]), dim=0, norm="ortho")[:count]
+        halves: Tensor = torch.fft.rfft(torch.cat([series, series.flip(-1)], -1), norm="ortho")[..., :count]
         cosine, sine = _quarter_steps(series)
-        return (halves.real * cosine + halves.imag * sine) * _along(_scale(count, transform, series), series)
-    parts = torch.view_as_real(torch.fft.rfft(series, dim=0, norm="ortho")).movedim(-1, 1).flatten(0, 1)
-    lines = torch.cat([parts[:1], parts[2 : count + 1]])  # the mean has no sine; nor have W / 2 cycles
-    return lines * _along(_scale(count, transform, series), series)
+        return (halves.real * cosine + halves.imag * sine) * _scale(series, transform)
+    parts = torch.view_as_real(torch.fft.rfft(series, norm="ortho")).flatten(-2)
+    lines = torch.cat([parts[..., :1], parts[..., 2 : count + 1]], -1)  # the mean has no sine; nor have W / 2
+    return lines * _scale(series, transform)
 
 
 def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
-    """The series that has these lines: the inverse of `spectrum`. (W,...) -> (W,...)"""
+    """The series that has these lines: the inverse of `spectrum`. (...,W) -> (...,W)"""
     count = _check(lines, transform)
-    lines = lines / _along(_scale(count, transform, lines), lines)
-    nothing = torch.zeros_like(lines[:1])
+    lines = lines / _scale(lines, transform)
+    nothing = torch.zeros_like(lines[..., :1])
     if transform == "dct":
         cosine, sine = _quarter_steps(lines)
-        halves = torch.complex(torch.cat([lines * cosine, nothing]), torch.cat([lines * sine, nothing]))
-        return torch.fft.irfft(halves, n=2 * count, dim=0, norm="ortho")[:count]
-    parts = torch.cat([lines[:1], nothing, lines[1:], *([nothing] if count % 2 == 0 else [])])
-    pairs = parts.unflatten(0, (-1, 2)).movedim(1, -1).contiguous()
-    return torch.fft.irfft(torch.view_as_complex(pairs), n=count, dim=0, norm="ortho")
+        parts = [torch.cat([lines * factor, nothing], -1) for factor in (cosine, sine)]
+        mirrored: Tensor = torch.fft.irfft(torch.complex(*parts), n=2 * count, norm="ortho")
+        return mirrored[..., :count]
+    ends = [nothing] if count % 2 == 0 else []
+    pairs = torch.cat([lines[..., :1], nothing, lines[..., 1:], *ends], -1).unflatten(-1, (-1, 2))
+    series: Tensor = torch.fft.irfft(torch.view_as_complex(pairs), n=count, norm="ortho")
+    return series
 
 
 def period_of(line: int, count: int, transform: Transform = "dft") -> Fraction:
@@ -67,21 +69,17 @@ def period_of(line: int, count: int, transform: Transform = "dft") -> Fraction:
 def _check(values: Tensor, transform: str) -> int:
     if transform not in get_args(Transform):
         raise InputError(f"transform {transform!r} is unknown; expected 'dft' or 'dct'")
-    if values.ndim < 1 or not len(values) or not values.is_floating_point():
+    if values.ndim < 1 or not values.shape[-1] or not values.is_floating_point():
         raise InputError(
-            f"the transform got {tuple(values.shape)} {values.dtype}; expected floats (W,...), W at least 1"
+            f"the transform got {tuple(values.shape)} {values.dtype}; expected floats (...,W), W at least 1"
         )
-    return len(values)
+    return values.shape[-1]
 
 
-def _along(factors: Tensor, values: Tensor) -> Tensor:
-    """Factors (W,) of a series (W,...)."""
-    return factors.view(-1, *[1] * (values.ndim - 1))
-
-
-def _scale(count: int, transform: str, like: Tensor) -> Tensor:
-    """What makes torch's transform of W numbers orthonormal, (W,)."""
-    scale = torch.ones(count, dtype=like.dtype, device=like.device)
+def _scale(values: Tensor, transform: str) -> Tensor:
+    """What makes torch's transform orthonormal, (W,)."""
+    count = values.shape[-1]
+    scale = torch.ones(count, dtype=values.dtype, device=values.device)
     if transform == "dct":
         scale[:1] /= math.sqrt(2)
     else:
@@ -90,7 +88,7 @@ def _scale(count: int, transform: str, like: Tensor) -> Tensor:
 
 
 def _quarter_steps(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine of pi r / 2W: frames lie half a step from where the mirrored series begins."""
-    count = len(values)
+    """Cosine and sine of pi r / 2W, (W,): places lie half a step from where the mirrored series begins."""
+    count = values.shape[-1]
     angles = torch.arange(count, dtype=torch.float64, device=values.device) * (math.pi / (2 * count))
-    return _along(angles.cos().to(values.dtype), values), _along(angles.sin().to(values.dtype), values)
+    return angles.cos().to(values.dtype), angles.sin().to(values.dtype)

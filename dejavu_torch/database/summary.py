@@ -21,7 +21,8 @@ class ChunkSummary(NamedTuple):
     common_period: the least common multiple of the periods, in frames; the capacity.
     shared_factors: greatest common divisor of each pair of periods, in the order of
         itertools.combinations(periods, 2).
-    features: number of features of each layer.
+    features: number of features of each layer; () in a spectral map, whose periods are those of its ten
+        strongest lines.
     """
 
     start: int
@@ -42,6 +43,7 @@ class MapSummary:
         chunks: what repeats in each.
         fixed: bytes that do not grow with the route, by part, such as the backbone.
         route: bytes that do, by part, such as the templates.
+        lines: of a spectral map, those that are not 0.
     """
 
     kind: str
@@ -52,6 +54,7 @@ class MapSummary:
     chunks: tuple[ChunkSummary, ...]
     route: Mapping[str, int]
     fixed: Mapping[str, int]
+    lines: int = 0
 
     @property
     def fixed_bytes(self) -> int:
@@ -112,16 +115,19 @@ def describe(summary: MapSummary) -> str:
         4096 bytes, 4.0 per place: templates 2112, layers 1984
     """
     lines = [_chunk_line(chunk) for chunk in summary.chunks]
-    lines.append(
-        f"{summary.covered} of {summary.places} places covered; {summary.templates} templates, "
-        f"{summary.template_numbers} numbers"
-    )
+    stored = f"{summary.templates} templates, {summary.template_numbers} numbers"
+    if summary.lines:
+        stored = f"{summary.lines} lines of their spectra"
+    lines.append(f"{summary.covered} of {summary.places} places covered; {stored}")
     parts = ", ".join(f"{name} {size}" for name, size in {**summary.route, **summary.fixed}.items())
     lines.append(f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: {parts}")
     return "\n".join(lines)
 
 
 def _chunk_line(chunk: ChunkSummary) -> str:
+    if not chunk.features:
+        periods = ", ".join(_number(period) for period in chunk.periods) or "none"
+        return f"places {chunk.start}-{chunk.stop - 1}: strongest periods {periods}"
     largest = sorted(range(len(chunk.periods)), key=lambda j: -chunk.features[j])[:LAYERS_SHOWN]
     shown = ", ".join(f"{_number(chunk.periods[j])} ({chunk.features[j]} features)" for j in sorted(largest))
     more = len(chunk.periods) - len(largest)
@@ -135,4 +141,4 @@ def _chunk_line(chunk: ChunkSummary) -> str:
 
 
 def _number(value: Fraction) -> str:
-    return f"{float(value):.9g}" if value.denominator > 1 else str(value.numerator)
+    return f"{float(value):.5g}" if value.denominator > 1 else str(value.numerator)

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.extract import features_of
-from dejavu_torch.types import InputError, Traverse
-
-if TYPE_CHECKING:
-    from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
 
@@ -33,9 +28,9 @@ def learned_whitening(
 ) -> tuple[Tensor, Tensor]:
     """The projection to what tells places apart and changes little between two views of one place.
 
-    With d = (view - place) / 2, m = (view + place) / 2, B = Cov[m] and W = (1 - a) E[d d^T] + a tr(E[d d^T]) / K
-    (shrinkage: a few pairs say little about most directions), the columns of P are
-    the `kept` directions with the largest p^T B p / p^T W p, scaled to p^T W p = 1, the largest first
+    With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m] and
+    W = (1 - a) C + a tr(C) / K I (shrinkage: a few pairs say little about most directions), the columns of P
+    are the `kept` directions with the largest p^T B p / p^T W p, scaled to p^T W p = 1, the largest first
     (learned whitening of Mikolajczyk and Matas, ICCV 2007; a linear discriminant analysis of pairs).
 
     Args:
@@ -86,11 +81,11 @@ class Whitening(nn.Module):
     """A descriptor of few numbers: what tells places apart, and changes little with light and view.
 
     `learn` finds it in closed form for one route: principal components, then `learned_whitening` of what the
-    views of one place change in them. A view is an augmented copy of a reference frame, or a frame of a second
-    traverse.
+    views of one place change in them. A view is an augmented copy of a reference frame, or a frame of a
+    second traverse.
 
     Args:
-        numbers: K. None is 128, fewer on a short route (a quarter of its places) and never more than the rank.
+        numbers: K. None is 128, fewer on a short route (a quarter of its places), and at most the rank.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`.
         views: augmented copies of each frame; frames are drawn evenly where there are more than `most_views`.
@@ -102,9 +97,9 @@ class Whitening(nn.Module):
     Shape: (B,D) -> (B,K).
 
     Convention: whitened descriptors have length 1. Without views, as for ready features, the descriptors are
-        principal components, centred, their variances kept, and one constant number behind them, the root mean
-        square of their length: it lets a cosine tell long from short. Before `learn` there is no projection,
-        and descriptors pass as they are.
+        principal components, centred, their variances kept, and one constant number behind them, the root
+        mean square of their length: it lets a cosine tell long from short. Before `learn` there is no
+        projection, and descriptors pass as they are.
 
     Raises:
         InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
@@ -142,12 +137,13 @@ class Whitening(nn.Module):
             )
         if not 0 < shrinkage <= 1 or bits not in (8, 16):
             raise InputError(
-                f"Whitening got shrinkage={shrinkage}, bits={bits}; expected a shrinkage above 0 and at most 1, "
-                "8 or 16 bits"
+                f"Whitening got shrinkage={shrinkage}, bits={bits}; expected a shrinkage above 0 and at most "
+                "1, 8 or 16 bits"
             )
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
         self.most_views, self.seed, self.bits = most_views, seed, bits
         self.strengths = None if strengths is None else dict(strengths)
+        self.fixed = False  # learned elsewhere: it serves this route as it is
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), in units of `scale`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
         self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
@@ -163,7 +159,8 @@ class Whitening(nn.Module):
             return descriptors
         if descriptors.ndim != 2 or descriptors.shape[1] != len(self.projection):
             raise InputError(
-                f"the whitening got descriptors {tuple(descriptors.shape)}; expected (B, {len(self.projection)})"
+                f"the whitening got descriptors {tuple(descriptors.shape)}; "
+                f"expected (B, {len(self.projection)})"
             )
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
@@ -196,8 +193,10 @@ class Whitening(nn.Module):
             return
         pairs = [((view - mean) @ basis, place) for view, place in views]
         shown = torch.cat([place for _, place in pairs])
-        own = torch.cat([(places[part] - mean) @ basis for part in shown.split(ROWS)])
-        centre, projection = learned_whitening(torch.cat([view for view, _ in pairs]), own, kept, self.shrinkage)
+        own = torch.cat([(places[part].to(mean) - mean) @ basis for part in shown.split(ROWS)])
+        centre, projection = learned_whitening(
+            torch.cat([view for view, _ in pairs]), own, kept, self.shrinkage
+        )
         self._store(mean + basis @ centre, basis @ projection, None)
 
     def _kept(self, places: int, views: bool) -> int:
@@ -256,34 +255,3 @@ def principal_components(rows: Tensor, count: int, seed: int = 0) -> tuple[Tenso
     if not variances[0] > ROUNDING * sample.square().mean():
         raise InputError(f"the {len(rows)} descriptors are all alike; expected a route that changes")
     return mean, basis @ turn.to(basis), variances.float()
-
-
-def augmented_views(
-    traverse: Traverse, describe: nn.Module, whitening: Whitening, places: int, batch_size: int = 64
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Descriptors of augmented copies of a traverse's frames, and the places that they show.
-
-    Args:
-        describe: frames (B,C,H,W) -> (B,D). whitening: says how many copies, how strong and which seed.
-        places: N, the frames of the traverse.
-
-    Shape: yields (B,D), (B,) int64.
-    """
-    from dejavu_torch.features.augmentation import Augmentation  # kornia's take a second to import
-
-    augmentation = Augmentation(**(whitening.strengths or {})).train()
-    every = max(1, -(-places * whitening.views // whitening.most_views))
-    begin = 0
-    for frames in traverse.select(range(0, places, every), traverse.batch_size(batch_size)):
-        shown = torch.arange(begin, begin + len(frames) * every, every)
-        begin += len(frames) * every
-        for view in range(whitening.views):
-            copies = _augmented(augmentation, frames, whitening.seed + view + whitening.views * begin)
-            yield features_of(copies, describe, traverse.name), shown
-
-
-def _augmented(augmentation: Augmentation, frames: Tensor, seed: int) -> Tensor:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        copies: Tensor = augmentation(frames)
-        return copies

@@ -1,0 +1,318 @@
+"""The spectral map: what it keeps, what it costs, and that its scores are those of what it holds."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from torch import Tensor
+
+from dejavu_torch import DejaVu, PhaseTemplates
+from dejavu_torch.database.spectral import SpectralCode, SpectralMap, SpectralMapper, quantise
+from dejavu_torch.database.spectrum import from_spectrum, spectrum
+from dejavu_torch.types import FrequencyLayer
+
+
+def route(places: int = 400, numbers: int = 12, seed: int = 0) -> Tensor:
+    """Smooth descriptors of length 1, as whitening gives."""
+    noise = torch.randn(places, numbers, generator=torch.Generator().manual_seed(seed))
+    lines = spectrum(noise.T) / (1 + torch.arange(places) / 20)
+    return torch.nn.functional.normalize(from_spectrum(lines).T, dim=1)
+
+
+def held(learned: SpectralMap) -> Tensor:
+    return torch.cat([learned.rebuilt(g) for g in range(len(learned.chunks))])
+
+
+def forced(learned: SpectralMap, rebuild: bool) -> SpectralMap:
+    learned.rebuilds = lambda queries: rebuild  # type: ignore[method-assign]
+    return learned
+
+
+SETTINGS: list[dict[str, Any]] = [
+    {},
+    {"metric": "l2"},
+    {"transform": "dct"},
+    {"chunk": 64},
+    {"chunk": 150, "transform": "dct", "metric": "l2"},
+]
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("rebuild", [False, True])
+def test_scores_are_those_of_the_rebuilt_descriptors(settings: dict[str, Any], rebuild: bool) -> None:
+    descriptors = route(403)
+    learned = forced(SpectralMapper(**settings)(descriptors), rebuild)
+    queries = descriptors[::7] + 0.1 * torch.randn(58, 12)
+    own = held(learned)
+    if settings.get("metric") == "l2":
+        expected = torch.cdist(queries, own).square()
+    else:
+        expected = 1 - torch.nn.functional.cosine_similarity(queries[:, None], own, dim=2)
+    assert torch.allclose(learned.scores(queries), expected, atol=1e-5)
+    assert (own - descriptors).square().mean() < 0.1 * descriptors.var()
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("rebuild", [False, True])
+def test_gradients_reach_the_queries(settings: dict[str, Any], rebuild: bool) -> None:
+    learned = forced(SpectralMapper(**settings)(route(170, 4)), rebuild).double()
+    queries = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(learned.scores, queries, atol=1e-6)
+
+
+def test_a_route_of_a_period_is_found() -> None:
+    wave = route(40, 6).repeat(12, 1)[:470] + torch.linspace(0, 2, 470)[:, None]
+    learned = SpectralMapper()(wave)
+    assert torch.equal(learned.scores(wave).argmin(1), torch.arange(470))
+
+
+@pytest.mark.parametrize("budget", [0.8, 2.5, 5.0, 9.0])
+@pytest.mark.parametrize("chunk", ["route", 500])
+def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_path: Path) -> None:
+    descriptors = route(2000, 24)
+    model = DejaVu(mapper=SpectralMapper(budget, chunk=chunk)).learn(descriptors)
+    per_place = model.summary().route_bytes / 2000
+    assert 0.98 * budget <= per_place <= budget
+    model.save(tmp_path / "m.safetensors")
+    again = DejaVu.load(tmp_path / "m.safetensors")
+    assert (
+        (tmp_path / "m.safetensors").stat().st_size == model.summary().map_bytes == again.summary().map_bytes
+    )
+    assert torch.equal(again(descriptors[:5]), model(descriptors[:5]))
+
+
+def test_more_bytes_hold_more_of_the_route() -> None:
+    descriptors = route(1000)
+    errors = [
+        float((held(SpectralMapper(b)(descriptors)) - descriptors).square().mean()) for b in (1, 2, 4, 8)
+    ]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_a_step_of_ones_own() -> None:
+    descriptors = route()
+    fine, coarse = (SpectralMapper(None, step=step)(descriptors) for step in (0.05, 0.5))
+    assert (held(fine) - descriptors).square().mean().sqrt() <= 0.05
+    assert coarse.summary().lines < fine.summary().lines
+    assert coarse.summary().route_bytes < fine.summary().route_bytes
+
+
+def waves(cycles: int, period: int = 20) -> Tensor:
+    """Four features of three harmonics each, a whole number of cycles."""
+    time = torch.arange(cycles * period, dtype=torch.float64)[:, None] * (2 * math.pi / period)
+    features = [sum(torch.sin(h * time + f + h) / h for h in (1, 2, 3)) for f in range(4)]
+    return torch.cat(features, 1).float()  # type: ignore[arg-type]
+
+
+def test_whole_cycles_take_the_same_lines_however_many_they_are() -> None:
+    kept = {}
+    for cycles in (10, 1000):
+        series = waves(cycles)
+        learned = SpectralMapper(None, step=0.5)(series)
+        rows, features = learned.line.long(), learned.feature
+        kept[cycles] = {
+            (int((r + 1) // 2) // cycles, int(r) % 2, int(f)) for r, f in zip(rows, features, strict=True)
+        }
+        assert all(((r + 1) // 2) % cycles == 0 for r in rows.tolist())
+        error = (held(learned) - series).square().mean().sqrt()
+        assert error <= 0.5 * math.sqrt(len(rows) / len(series) / 4) + 1e-6
+    assert kept[10] <= kept[1000]
+    assert {(cycles, feature) for cycles, _, feature in kept[10]} == {
+        (cycles, feature) for cycles, _, feature in kept[1000]
+    }
+
+
+def test_at_equal_error_the_file_grows_by_the_logarithm_of_the_cycles() -> None:
+    sizes, counts = {}, {}
+    for cycles in (10, 1000):
+        learned = SpectralMapper(None, step=0.02 * math.sqrt(20 * cycles))(waves(cycles))
+        sizes[cycles], counts[cycles] = learned.summary().route_bytes, learned.summary().lines
+    assert counts[10] == counts[1000] == 24
+    assert sizes[1000] <= sizes[10] + 64 + 24 * math.log2(1000 * 20) / 8 * 2
+
+
+def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period() -> None:
+    """Eq. 1 repeated along whole cycles is the projection onto the lines of 1 / tau and its multiples."""
+    for period, cycles in ((7, 11), (8, 6)):
+        series = torch.randn(period * cycles, 3, dtype=torch.float64)
+        layer = FrequencyLayer(period, period, 0, len(series), (0, 1, 2))
+        (means,) = PhaseTemplates()(series, (layer,))
+        lines = spectrum(series.T)
+        of_line = (torch.arange(len(series)) + 1) // 2
+        harmonics = torch.where(of_line % cycles == 0, lines, 0)
+        assert torch.allclose(from_spectrum(harmonics).T, means.repeat(cycles, 1), atol=1e-12)
+
+
+def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
+    descriptors = torch.cat([torch.eye(4)[[0, 1]], torch.zeros(1, 4), -torch.eye(4)[[0, 1]]]).repeat(20, 1)
+    learned = SpectralMapper(None, step=3e-7)(descriptors)
+    assert learned.silent == 20
+    assert learned.summary().covered == 80
+    queries = torch.randn(3, 4, requires_grad=True)
+    for rebuild in (False, True):
+        scores = forced(learned, rebuild).scores(queries)
+        assert torch.equal(scores[:, 2::5], torch.ones(3, 20))
+        (gradient,) = torch.autograd.grad(scores[:, 2::5].sum(), queries)
+        assert torch.equal(gradient, torch.zeros(3, 4))
+        nothing = torch.zeros(2, 4, requires_grad=True)
+        (gradient,) = torch.autograd.grad(learned.scores(nothing).sum(), nothing)
+        assert gradient.isfinite().all()
+
+
+def test_large_levels_escape() -> None:
+    series = torch.cat([1000 * torch.sin(torch.arange(300) / 10)[:, None], torch.randn(300, 1)], 1)
+    learned = SpectralMapper(None, step=1.0)(series)
+    assert len(learned.escapes) > 0
+    assert (held(learned) - series).abs().max() < 5
+    packed = learned.packed()
+    again = SpectralMapper(None, step=1.0).empty()
+    again.load_state_dict({**again.unpacked(packed), "_extra_state": learned.get_extra_state()})
+    assert torch.equal(held(again), held(learned))
+
+
+def test_chunks_are_added_without_touching_others() -> None:
+    descriptors = route(500)
+    learned = SpectralMapper(chunk=100)(descriptors[:250])
+    before, table = held(learned), learned.packed()["stream_table"]
+    learned.extend(descriptors[250:])
+    assert learned.places == 500
+    assert learned.lengths.tolist() == [100, 100, 50, 100, 100, 50]
+    assert torch.equal(held(learned)[:250], before)
+    assert torch.equal(learned.packed()["stream_table"][:3], table)
+    found = learned.scores(descriptors).argmin(1)
+    assert (found == torch.arange(500)).float().mean() > 0.95
+
+
+def test_what_cannot_be_extended_is_refused() -> None:
+    with refused("whole route", "chunk"):
+        SpectralMapper()(route()).extend(route())
+    with refused("no map yet"):
+        SpectralMapper(chunk=50).empty().extend(route())
+    with refused("(400, 12)", "(N, 5)"):
+        SpectralMapper(chunk=50)(route(60, 5)).extend(route())
+
+
+def test_summary() -> None:
+    series = waves(30)
+    summary = SpectralMapper(None, step=0.5)(series).summary()
+    assert summary.kind == "spectral"
+    assert (summary.templates, summary.template_numbers) == (0, 0)
+    assert {20, 10} <= set(summary.chunks[0].periods)
+    assert str(summary.lines) in str(summary)
+    assert summary.route_bytes == sum(summary.route.values())
+
+
+def test_code_trains_lines_and_step() -> None:
+    generator = torch.Generator().manual_seed(0)
+    lines = torch.randn(12, 3, dtype=torch.float64, generator=generator)
+    code = SpectralCode(lines, 0.4)
+    learned = SpectralMapper(None, step=0.4)
+    assert torch.allclose(code(), from_spectrum(quantise(lines, 0.4).T * 0.4).T)
+    noise = torch.rand(12, 3, dtype=torch.float64, generator=generator) - 0.5
+
+    def series(own: Tensor, step: Tensor) -> Tensor:
+        code = SpectralCode(lines, 0.4)
+        code.lines, code.step = torch.nn.Parameter(own), torch.nn.Parameter(step)
+        return torch.func.functional_call(code, {"lines": own, "step": step}, (noise,))
+
+    step = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(series, (lines.clone().requires_grad_(), step))
+    weights = torch.randn(12, 3, dtype=torch.float64, generator=generator)
+    (from_spectrum(weights.T).T * code()).sum().backward()
+    assert code.lines.grad is not None
+    assert code.step.grad is not None
+    assert torch.allclose(code.lines.grad, weights)  # straight through
+    error = quantise(lines, 0.4) - lines / 0.4
+    assert torch.allclose(code.step.grad, (weights * error).sum())  # of the rounding
+    assert learned(code().detach().float()).places == 12
+
+
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_the_map_is_exported(transform: Any) -> None:
+    learned = SpectralMapper(transform=transform, chunk=150)(route())
+    program = torch.export.export(
+        learned, (route()[:4],), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}}
+    ).module()
+    for batch in (1, 8, 100):
+        assert torch.allclose(program(route()[:batch]), learned(route()[:batch]), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"step": 0.1}, ("5.0", "0.1", "None")),
+        ({"route_bytes_per_place": None}, ("None", "expected one")),
+        ({"route_bytes_per_place": 0.0}, ("route_bytes_per_place is 0", "above 0")),
+        ({"route_bytes_per_place": math.nan}, ("nan", "above 0")),
+        ({"route_bytes_per_place": None, "step": 0.0}, ("step is 0", "above 0")),
+        ({"route_bytes_per_place": None, "step": math.inf}, ("step is inf", "above 0")),
+        ({"chunk": 1}, ("chunk is 1", "at least 2")),
+        ({"chunk": "all"}, ("'all'", "'route'")),
+        ({"transform": "fft"}, ("'fft'", "'dct'")),
+        ({"metric": "l1"}, ("'l1'", "'cosine' or 'l2'")),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, Any], words: tuple[str, ...]) -> None:
+    with refused(*words):
+        SpectralMapper(**settings)
+
+
+@pytest.mark.parametrize(
+    ("descriptors", "words"),
+    [
+        (torch.rand(1, 4), ("(1, 4)", "at least 2")),
+        (torch.rand(4), ("(4,)", "(N, K)")),
+        (torch.rand(4, 0), ("(4, 0)", "(N, K)")),
+        (torch.ones(9, 4, dtype=torch.int64), ("int64", "floats")),
+        (torch.ones(9, 4), ("9 descriptors", "all alike")),
+        (torch.full((9, 4), math.nan), ("NaN",)),
+    ],
+)
+def test_what_is_no_route_is_refused(descriptors: Tensor, words: tuple[str, ...]) -> None:
+    with refused(*words):
+        SpectralMapper()(descriptors)
+
+
+@pytest.mark.parametrize("budget", [0.01, 200.0])
+def test_a_budget_that_cannot_be_met_is_refused(budget: float) -> None:
+    with refused(f"{budget:g}", "mean", "at most 48"):
+        SpectralMapper(budget)(route())
+
+
+def damaged(tensors: dict[str, Tensor], change: str) -> dict[str, Tensor]:
+    tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+    if change == "truncated":
+        tensors["streams"] = tensors["streams"][:-9]
+    elif change == "altered":
+        tensors["streams"][40] ^= 1
+    elif change == "huge":
+        tensors["lengths"][0] = 2**50
+    elif change == "table":
+        tensors["stream_table"] = tensors["stream_table"][:, :1]
+    elif change == "step":
+        tensors["steps"][0] = 0
+    elif change == "mean":
+        tensors["mean"] = tensors["mean"][:-1]
+    else:
+        tensors["escapes"] = torch.ones(3, dtype=torch.int32)
+    return tensors
+
+
+@pytest.mark.parametrize("change", ["truncated", "altered", "huge", "table", "step", "mean", "escapes"])
+def test_a_damaged_map_is_refused(change: str) -> None:
+    learned = SpectralMapper(chunk=100)(route())
+    other = SpectralMapper(chunk=100).empty()
+    with refused("expected") if change != "truncated" else refused("bytes", "claims"):
+        state = other.unpacked(damaged(learned.packed(), change))
+        other.load_state_dict({**state, "_extra_state": learned.get_extra_state()})
+    assert other.places == 0
+
+
+def test_queries_of_another_dimension_are_refused() -> None:
+    with refused("(3, 5)", "(Q, 12)"):
+        SpectralMapper()(route()).scores(torch.rand(3, 5))
