@@ -1,4 +1,4 @@
-"""Imports point one way (CONTRIBUTING.md, the house)."""
+"""Imports point one way (CONTRIBUTING.md, Structure)."""
 
 from __future__ import annotations
 

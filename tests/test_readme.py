@@ -1,4 +1,4 @@
-"""What the README shows works as it stands there."""
+"""What README and docs show works as it stands there."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from dejavu_torch.features.cnn import SmallCNN
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 TRAINING = (ROOT / "docs" / "training.md").read_text()
+ROUTES = (ROOT / "docs" / "real_routes.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 OPTIONS = [
     option
@@ -81,7 +82,7 @@ def understand(line: str) -> None:
             train.run_train(words)
 
 
-@pytest.mark.parametrize("text", [README, TRAINING], ids=["README", "training"])
+@pytest.mark.parametrize("text", [README, TRAINING, ROUTES], ids=["README", "training", "real_routes"])
 def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
     shown += [line for line in re.findall(r"`(dejavu [^`]+)`", text) if " -" in line and "--help" not in line]

@@ -83,11 +83,9 @@ def lap_peak(features: Tensor, low: float, high: float) -> tuple[int, float, flo
 def assert_told(table: dict[str, list[str]], report: dict[str, Any], entries: dict[str, str]) -> None:
     for name, key in entries.items():
         entry = report[key] if key else report
-        told, measured = [float(cell) for cell in table[name][:4]], [entry[k] for k in KEYS]
-        # another machine rounds otherwise; recall at 100 % precision hangs on single frames
-        assert told[:2] == pytest.approx(measured[:2], rel=0.05, abs=0.003), name
-        assert told[2] == pytest.approx(measured[2], abs=0.1), name
-        assert told[3] == pytest.approx(measured[3], rel=0.05, abs=0.003), name
+        told = [float(cell) for cell in table[name][:2]]
+        # another machine rounds otherwise
+        assert told == pytest.approx([entry["auc"], entry["recall_at_1"]], rel=0.05, abs=0.003), name
 
 
 def test_the_dashes_of_the_motorway_are_found(
@@ -129,33 +127,35 @@ def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_d
 def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
     pytest.importorskip("cv2")
     clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
-    found = re.search(r"Optical flow does worse(.*?)Resampling changes", section("The same motorway"), re.S)
+    found = re.search(r"Optical flow does worse(.*?)At constant speed", section("The same motorway"), re.S)
     assert found is not None
-    lk_lost, _, lk_mean, dis_lost, dis_mean = numbers(found[1].replace("stood still:", ""))[:5]
+    lk_lost, _, lk_mean, dis_lost, dis_mean = numbers(found[1])
     for flow, lost, mean in (("lk", lk_lost, lk_mean), ("dis", dis_lost, dis_mean)):
         ground = GroundOdometry(corners=ROAD, flow=flow).distances(clip)
         assert int((ground.confidence < 0.4).sum()) == pytest.approx(lost, abs=8)
         assert float(ground.distance.diff().mean()) == pytest.approx(mean, rel=0.03)
 
 
-@pytest.mark.parametrize("places", ["221 frames as they are", "220 even steps"])
-def test_even_steps_leave_the_periods_of_a_constant_speed(
-    places: str, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("resampled", [False, True])
+def test_even_steps_leave_the_period_of_a_constant_speed(
+    resampled: bool, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clip = f"{data_dir}/highway/solidWhiteRight.mp4?width=320"
     corners = str([list(corner) for corner in ROAD]).replace(" ", "")
-    spaced = ["--velocity.corners", corners] if "even" in places else []
-    main(["learn", clip, "--map", str(tmp_path / "map.safetensors"), *spaced])
-    told, measured = layers(rows(section("The same motorway"))[places][0]), layers(capsys.readouterr().out)
-    assert measured[12] > 3500
-    assert all(measured[period] == pytest.approx(told[period], rel=0.03) for period in told)
+    velocity = ["--velocity.corners", corners] if resampled else []
+    main(["learn", clip, "--map", str(tmp_path / "map.safetensors"), *velocity])
+    told = re.search(r"layer of 12 frames has (\d+) features before and (\d+)", section("The same motorway"))
+    assert told is not None
+    measured = layers(capsys.readouterr().out)[12]
+    assert measured > 3500
+    assert measured == pytest.approx(int(told[1 + resampled]), rel=0.03)
 
 
 def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(data_dir: Path) -> None:
     laps = open_source(f"{data_dir}/rc_car_laps/frames")
     features = DejaVu().extract_all(open_source(f"{data_dir}/rc_car_laps/frames?width=80"))
     told = rows(section("Laps of a small car"))
-    frames = {"frames as they are": torch.arange(len(features))}
+    frames = {"original frames": torch.arange(len(features))}
     for name in ("even steps, near ground", "even steps, far ground"):
         values = numbers(told[name][0])
         corners = tuple(zip(values[::2], values[1::2], strict=True))
@@ -164,28 +164,25 @@ def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(da
     heights, widths = {}, {}
     for name, frame in frames.items():
         lap, heights[name], widths[name], elsewhere = lap_peak(features[frame], 0.2, 0.32)
-        (at, count), (level,), (wide,), (other,) = map(numbers, told[name][2:])
+        (at, count), (level,), (wide,) = map(numbers, told[name][2:])
         assert [lap, len(frame)] == pytest.approx([at, count], rel=0.02)
         assert heights[name] == pytest.approx(level, abs=0.015)
         assert 100 * widths[name] == pytest.approx(wide, abs=1.5)
-        assert elsewhere == pytest.approx(other, abs=0.01)
+        assert elsewhere < 0.02
     came, near, far = frames
     assert heights[near] < heights[came] < heights[far]
     assert widths[near] > widths[came] > widths[far]
     shuffled = autocorrelation(features[torch.randperm(len(features))], 440)[330:]
     assert float(shuffled.max()) < 0.02
 
-    halves = re.search(r"shorter by and by, (.*?)No recall", section("Laps of a small car"), re.S)
+    halves = re.search(r"little to gain: (.*?)Odometry", section("Laps of a small car"), re.S)
     assert halves is not None
-    first, _, last, *both = numbers(halves[1])
-    for name, share in ((came, both[:2]), (far, both[2:4])):
-        for (start, stop), told_height, told_lap in zip(
-            ((0, 800), (712, 1512)), share, (first, last), strict=True
-        ):
+    both = numbers(halves[1])
+    for name, share in ((came, both[:2]), (far, both[2:])):
+        for (start, stop), told_height in zip(((0, 800), (712, 1512)), share, strict=True):
             inside = frames[name][(frames[name] >= start) & (frames[name] < stop)]
-            found, peak, *_ = lap_peak(features[inside], 0.4, 0.56)
+            _, peak, *_ = lap_peak(features[inside], 0.4, 0.56)
             assert peak == pytest.approx(told_height, abs=0.015)
-            assert name != came or found == pytest.approx(told_lap, abs=6)
 
 
 @pytest.mark.parametrize("channel", ["grey", "R-B"])
@@ -238,10 +235,9 @@ def test_the_railway_in_two_seasons(data_dir: Path, tmp_path: Path) -> None:
     names = {
         "this map": "",
         "all 1800 frames": "uncompressed",
-        "every 3rd frame, at least the map's bytes": "stride",
         "every 10th frame": "stride_coarsest",
-        "null: all learnt shuffled": "null",
-        "null: the same layers, shuffled": "null_same_plan",
+        "null: everything learned from shuffled frames": "null",
+        "null: this map's layers, shuffled frames": "null_same_plan",
     }
     assert_told(rows(section("A railway")), report, names)
 
@@ -253,8 +249,8 @@ def test_the_corridor_and_its_truth_file(data_dir: Path, tmp_path: Path) -> None
     names = {
         "this map": "",
         "all 111 frames": "uncompressed",
-        "null: all learnt shuffled": "null",
-        "null: the same layers, shuffled": "null_same_plan",
+        "null: everything learned from shuffled frames": "null",
+        "null: this map's layers, shuffled frames": "null_same_plan",
     }
     assert_told(rows(section("A corridor")), report, names)
     main(["evaluate", str(tmp_path / "compare" / "matches.csv"), *truth, "--out", str(tmp_path / "again")])
