@@ -119,6 +119,29 @@ def _warn_doubtful(moved: Tensor, name: str) -> None:
         )
 
 
+def resampled(
+    traverse: Traverse,
+    odometry: GroundOdometry | None,
+    batch_size: int = 64,
+    step: float | None = None,
+    progress: bool = False,
+) -> Traverse:
+    """A traverse at even steps along the ground; as it is without odometry, or where it is so already.
+
+    Args:
+        step: pixels of ground; None is the odometry's own. Queries need the map's: of them a single frame,
+            and ready features, stay as they are.
+
+    Raises:
+        InputError: as `ResampledTraverse`.
+    """
+    if odometry is None or isinstance(traverse, ResampledTraverse):
+        return traverse
+    if step is not None and (traverse.length == 1 or len(traverse.frame_shape) == 1):
+        return traverse
+    return ResampledTraverse(traverse, odometry, batch_size, step, progress)
+
+
 def source_of(traverse: Traverse) -> Traverse:
     """The traverse whose frames a user counts: the inner one of a resampled traverse."""
     return traverse.traverse if isinstance(traverse, ResampledTraverse) else traverse
