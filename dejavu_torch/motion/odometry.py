@@ -6,6 +6,7 @@ import logging
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
@@ -199,8 +200,5 @@ def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
         "%s: no common ground in frames %s%s (%d of %d steps): the velocity there is interpolated",
         *(name, ", ".join(stretches[:NAMED]), more, len(bad), len(shift)),
     )
-    after = torch.searchsorted(good, bad)
-    left, right = good[(after - 1).clamp(min=0)], good[after.clamp(max=len(good) - 1)]
-    share = (bad - left).double() / (right - left).clamp(min=1)
-    share = share.clamp(0, 1)  # ahead of the first and behind the last: that one's
-    return shift.index_copy(0, bad, shift[left].lerp(shift[right], share))
+    # ahead of the first and behind the last: that one's
+    return torch.from_numpy(np.interp(np.arange(len(shift)), good.numpy(), shift[good].numpy())).to(shift)
