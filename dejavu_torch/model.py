@@ -29,7 +29,7 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import AugmentedTraverse, Views
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.motion.resampling import ResampledTraverse, resampled
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -181,21 +181,8 @@ class DejaVu(nn.Module):
         return concatenate(self.whitened(part) for part in features.split(ROWS))
 
     def resample(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
-        """A traverse at even steps along the ground, where `velocity` is set; else as it is.
-
-        Args:
-            traverse: frames, in order; one that is resampled already stays as it is.
-            step: pixels of ground; None is `velocity`'s own. Queries need the map's, `self.step`; of them a
-                single frame, and ready features, stay as they are.
-
-        Raises:
-            InputError: as `ResampledTraverse`.
-        """
-        if self.velocity is None or isinstance(traverse, ResampledTraverse):
-            return traverse
-        if step is not None and (traverse.length == 1 or len(traverse.frame_shape) == 1):
-            return traverse
-        return ResampledTraverse(traverse, self.velocity, self.batch_size, step, progress)
+        """`resampled` by the model's `velocity`; of queries, `step` is the map's, `self.step`."""
+        return resampled(traverse, self.velocity, self.batch_size, step, progress)
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
         """As `learn`, from descriptors that are there already.

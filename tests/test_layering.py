@@ -27,6 +27,20 @@ ORDER = [
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
 ONLY = {"motion": {"types", "data"}}  # rooms that use less than all to their left
+# what each room uses: a new arrow between two rooms is a decision, and is written down here
+ARROWS = {
+    "data": "types resize",
+    "features": "types resize",
+    "periods": "types",
+    "database": "types data periods",
+    "recognition": "types",
+    "motion": "types data",
+    "model": "types data features periods database recognition motion",
+    "evaluation": "types resize data features periods database recognition motion model",
+    "training": "types resize data features periods database recognition motion model evaluation",
+    "experiments": "types data features periods database motion model evaluation",
+    "cli": "types data features periods database motion model evaluation training experiments",
+}
 
 
 def room_of(file: Path) -> str:
@@ -74,6 +88,21 @@ def wrong_arrows(source: str, file: Path) -> list[str]:
 
 def test_every_file_stands_in_a_room() -> None:
     assert [file for file in FILES if room_of(file) not in RANK.keys() | {"__init__", "__main__"}] == []
+
+
+def arrows() -> dict[str, set[str]]:
+    """The rooms that each room uses, the front door left out."""
+    used: dict[str, set[str]] = {}
+    for file in FILES:
+        here = room_of(file)
+        rooms = {room for _, room in rooms_imported((PACKAGE / file).read_text(encoding="utf-8"), file)}
+        if here in RANK and rooms - {here, ""}:
+            used[here] = used.get(here, set()) | (rooms - {here, ""})
+    return used
+
+
+def test_the_arrows_between_rooms_are_these() -> None:
+    assert arrows() == {room: set(rooms.split()) for room, rooms in ARROWS.items()}
 
 
 @pytest.mark.parametrize("file", FILES, ids=NAMES)

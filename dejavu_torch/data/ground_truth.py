@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from dejavu_torch.data.files import LARGEST, as_number, read_text
 from dejavu_torch.types import GroundTruth, InputError, Traverse
@@ -31,23 +32,9 @@ def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
     return GroundTruth(truth, judged, truth.new_zeros(len(truth), 0))
 
 
-def padded(row: Tensor, place: Tensor, rows: int) -> Tensor:
-    """Pairs of row and place as a table, a line a row, -1 as padding.
-
-    Args:
-        row: (n,) int64, in increasing order. place: (n,) int64.
-
-    Shape: -> (rows,R) int64, R the most places of any row.
-
-    Example:
-        >>> padded(torch.tensor([0, 2, 2]), torch.tensor([5, 6, 7]), rows=3).tolist()
-        [[5, -1], [-1, -1], [6, 7]]
-    """
-    count = torch.bincount(row, minlength=rows)
-    slot = torch.arange(len(row)) - (count.cumsum(0) - count)[row]
-    table = place.new_full((rows, int(count.max()) if rows else 0), -1)
-    table[row, slot] = place
-    return table
+def padded(rows: Iterable[Tensor]) -> Tensor:
+    """Places of each query, (n,) int64, as a table (Q,R), -1 as padding."""
+    return pad_sequence(list(rows), batch_first=True, padding_value=-1)
 
 
 def offset_truth(queries: int | Tensor, frames: int | None, offset: int = 0) -> Tensor:
@@ -100,15 +87,12 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
         >>> near_truth(torch.tensor([[0.0, 0.0], [3.0, 4.0]]), torch.zeros(1, 2), radius=5.0).tolist()
         [[0, 1]]
     """
-    found = []
-    at_once = max(1, PAIRS_AT_ONCE // max(1, len(reference)))
-    for start in range(0, len(query), at_once):
-        part = query[start : start + at_once].double()
+    rows: list[Tensor] = []
+    for part in query.double().split(max(1, PAIRS_AT_ONCE // max(1, len(reference)))):
         # matrix products would cancel the metres of large coordinates
         distance = torch.cdist(part, reference.double(), compute_mode="donot_use_mm_for_euclid_dist")
-        found.append((distance <= radius).nonzero() + torch.tensor([start, 0]))
-    row, place = torch.cat(found).T
-    return padded(row, place, len(query))
+        rows += _columns(distance <= radius)
+    return padded(rows)
 
 
 def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
@@ -362,9 +346,8 @@ def read_table(truth: str, request: Request) -> GroundTruth:
     if not judged.any():
         wanted = f"{int(numbers.min())} to {int(numbers.max())}"
         raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
-    row = torch.arange(len(sets)).repeat_interleave(torch.tensor([len(places) for places in sets]))
-    flat = torch.tensor([_rounded(place) for places in sets for place in places], dtype=torch.int64)
-    return as_ground_truth(padded(row, flat, len(sets)))._replace(judged=judged)
+    rows = (torch.tensor([_rounded(place) for place in places], dtype=torch.int64) for places in sets)
+    return as_ground_truth(padded(rows))._replace(judged=judged)
 
 
 def _at_shown(listed: dict[int, list[float]], frames: Tensor) -> dict[int, list[float]]:
@@ -450,14 +433,13 @@ def read_matrices(truth: str, request: Request) -> GroundTruth:
     if len({matrix.shape for matrix in matrices.values()}) > 1:
         raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
     hard, *soft = [torch.from_numpy(m[:, request.numbers.numpy()].astype(bool)).T for m in matrices.values()]
-    found = as_ground_truth(_columns(hard))
-    return found._replace(ignored=_columns(soft[0] & ~hard)) if soft else found
+    found = as_ground_truth(padded(_columns(hard)))
+    return found._replace(ignored=padded(_columns(soft[0] & ~hard))) if soft else found
 
 
-def _columns(which: Tensor) -> Tensor:
-    """(Q,N) bool -> (Q,R), the columns that are true in each row."""
-    row, column = which.nonzero().T
-    return padded(row, column, len(which))
+def _columns(which: Tensor) -> Iterator[Tensor]:
+    """(Q,N) bool -> Q of (n,) int64, the columns that are true in each row."""
+    return (row.nonzero()[:, 0] for row in which)
 
 
 def _load_matrices(path: Path) -> dict[str, np.ndarray]:

@@ -12,20 +12,19 @@ from torch import Tensor
 NEAR = 1e-4  # steps: a frame so near to a place has reached it
 
 
-def first_reached(positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where each place is first reached: between which two frames, and at what share of the way.
+def shown_frames(positions: Tensor) -> Tensor:
+    """The frame nearest to each place, of the two between which it is first reached.
 
     Args:
         positions: (F,) float, of each frame.
 
-    Shape: -> low, high (M,) int64 frames, share (M,) float64 in [0, 1]; M places.
+    Shape: -> (M,) int64, never decreasing; M places.
 
     Convention: standing, and going back and forth, add no places.
 
     Example:
-        >>> low, high, share = first_reached(torch.tensor([0.0, 0.5, 0.5, 2.0]))
-        >>> low.tolist(), high.tolist(), [round(part, 3) for part in share.tolist()]
-        ([0, 2, 2], [0, 3, 3], [0.0, 0.333, 1.0])
+        >>> shown_frames(torch.tensor([0.0, 0.6, 0.6, 2.0])).tolist()
+        [0, 2, 3]
     """
     positions = positions.double()
     furthest = positions.cummax(0).values + NEAR
@@ -34,13 +33,7 @@ def first_reached(positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     low = (high - 1).clamp(min=0)
     # also after a reversal the frame before the first to reach a place lies short of it
     step = (positions[high] - positions[low]).clamp(min=1e-12)
-    return low, high, ((places - positions[low]) / step).clamp(0, 1)
-
-
-def shown_frames(positions: Tensor) -> Tensor:
-    """The frame nearest to each place where it is first reached: (F,) -> (M,) int64."""
-    low, high, share = first_reached(positions)
-    return torch.where(share < 0.5, low, high)
+    return torch.where((places - positions[low]) / step < 0.5, low, high)
 
 
 def nearest_places(positions: Tensor) -> Tensor:

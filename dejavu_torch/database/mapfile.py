@@ -15,6 +15,7 @@ from dejavu_torch.types import InputError
 
 FORMAT = 4
 NAME = "dejavu_torch-map"
+EXPECTED = "a map file, as DejaVu.save writes"
 
 
 def metadata_of(header: dict[str, Any]) -> dict[str, str]:
@@ -61,16 +62,14 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         InputError: missing, truncated, foreign, or of another format.
     """
     if path.is_dir():
-        raise InputError(f"{path} is a folder; expected a map file written by `dejavu learn`")
+        raise InputError(f"{path} is a folder; expected {EXPECTED}")
     if not path.is_file():
-        raise InputError(f"{path} is not there; expected a map file written by `dejavu learn`")
+        raise InputError(f"{path} is not there; expected {EXPECTED}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             if metadata.get("format") != NAME:
-                raise InputError(
-                    f"{path} is no map of dejavu_torch; expected a file written by `dejavu learn`"
-                )
+                raise InputError(f"{path} is no map of dejavu_torch; expected {EXPECTED}")
             version = int(metadata["version"])
             if version != FORMAT:
                 newer = "a newer dejavu_torch is needed" if version > FORMAT else "learn the route again"

@@ -73,8 +73,8 @@ def build(recipe: Recipe, kind: type[M], registry: Registry, given: nn.Module | 
         return given
     if name not in registry:
         raise InputError(
-            f"the map's features come from {name}, which only the caller can load; expected "
-            f"--features {name} with the arguments it was made with, or features=... in Python"
+            f"the map's features come from {name}, which only the caller can load; expected it as "
+            "`features`, with the arguments it was made with"
         )
     cls = registry[name]
     if not issubclass(cls, kind):

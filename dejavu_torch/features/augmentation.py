@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from kornia.augmentation import (
     RandomAffine,
@@ -12,10 +10,8 @@ from kornia.augmentation import (
     RandomGamma,
     RandomGaussianBlur,
     RandomLinearIllumination,
-    RandomPerspective,
     VideoSequential,
 )
-from kornia.geometry.transform import warp_perspective
 from torch import Tensor, nn
 
 from dejavu_torch.types import InputError
@@ -26,7 +22,6 @@ LARGEST: dict[str, tuple[float, ...]] = {
     "rotation": (180,),
     "shift": (1, 1),
     "scale": (0.9,),
-    "perspective": (0.5,),
     "exposure": (1, 1),
     "gamma": (10,),
     "illumination": (1,),
@@ -36,17 +31,6 @@ LARGEST: dict[str, tuple[float, ...]] = {
 }
 NOISY = 0.7  # the chance that a clip gets noise
 OCCLUDED = 0.7  # and that something stands in its way
-
-
-class _Perspective(RandomPerspective):  # type: ignore[misc]  # kornia's types are not read
-    """Kornia's, with the border repeated where it would leave black corners."""
-
-    def apply_transform(
-        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor
-    ) -> Tensor:
-        size = (input.shape[-2], input.shape[-1])
-        out: Tensor = warp_perspective(input, transform, size, padding_mode="border", align_corners=True)
-        return out
 
 
 class Augmentation(nn.Module):
@@ -64,8 +48,6 @@ class Augmentation(nn.Module):
         shift: (horizontal, vertical), fractions of the width and of the height, at most 1: lateral
             displacement; small yaw and pitch of a camera that looks ahead.
         scale: fraction, 1 +- scale, at most 0.9: height above the ground, focal length.
-        perspective: how far each corner moves, a fraction of the sides, at most 0.5: yaw and pitch of a
-            camera that looks ahead. Acts on 1 clip of 2 and repeats the border.
         exposure: all channels alike, (gain, offset): (x +- offset) * (1 +- gain), both at most 1, clamped
             to [0, 1] after each step. Always acts.
         gamma: x ** g with g from 1 / (1 + gamma) to 1 + gamma. Acts on 7 clips of 10.
@@ -102,7 +84,6 @@ class Augmentation(nn.Module):
         rotation: float = 3.0,
         shift: tuple[float, float] = (0.02, 0.04),
         scale: float = 0.05,
-        perspective: float = 0.0,
         exposure: tuple[float, float] = (0.4, 0.3),
         gamma: float = 0.5,
         illumination: float = 0.25,
@@ -120,8 +101,6 @@ class Augmentation(nn.Module):
         if rotation or any(shift) or scale:
             zoom = (1.0 - scale, 1.0 + scale)
             steps.append(RandomAffine(float(rotation), tuple(shift), zoom, padding_mode="border", p=0.9))
-        if perspective:
-            steps.append(_Perspective(2 * perspective, sampling_method="area_preserving"))
         if offset:  # kornia's brightness is an offset, its factor less 1
             steps.append(RandomBrightness((1.0 - offset, 1.0 + offset)))
         if gain:  # and its contrast is a gain

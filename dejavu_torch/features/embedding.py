@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
+from dejavu_torch.features.extract import in_mode
 from dejavu_torch.features.preprocess import select_channel
 from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.resize import resize_frames
@@ -155,18 +156,14 @@ class Embedding(nn.Module):
         self.noise = noise
         self.kept = kept
         black = torch.zeros(1, channels, *self.resize)
-        modes = [(module, module.training) for module in network.modules()]
         try:
-            with torch.no_grad():
-                output = network.eval()(black)
+            with torch.no_grad(), in_mode(network, False):
+                output = network(black)
         except Exception as error:  # a network may raise anything
             raise InputError(
                 f"{type(network).__name__} does not take frames {tuple(black.shape)}: "
                 f"{' '.join(str(error).split())}"
             ) from error
-        finally:
-            for module, training in modes:
-                module.training = training
         inputs = self._pooled(output).shape[1]
         self.linear = (
             Coder(inputs, dimension, hidden, noise, kept) if hidden else nn.Linear(inputs, dimension)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -35,12 +36,9 @@ def feature_batches(
         InputError: features that are not (B,D) or not finite, or no frames at all.
     """
     done = 0
-    modes = [(part, part.training) for part in module.modules()]  # a frozen part stays as it was
-    bar = tqdm(
-        total=traverse.length, desc=progress, unit="frame", disable=None if progress else True, leave=False
-    )
-    try:
-        module.eval()
+    hidden = None if progress else True
+    bar = tqdm(total=traverse.length, desc=progress, unit="frame", disable=hidden, leave=False)
+    with bar, in_mode(module, False):
         for batch in traverse.batches(traverse.batch_size(batch_size)):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
@@ -56,10 +54,6 @@ def feature_batches(
             done += len(features)
             bar.update(len(features))
             yield features
-    finally:
-        bar.close()
-        for part, training in modes:
-            part.training = training
     if done == 0:
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
 
@@ -121,3 +115,15 @@ def check_queries(
 
 def _by(shape: tuple[int, ...]) -> str:
     return " x ".join(map(str, shape))
+
+
+@contextmanager
+def in_mode(module: nn.Module, training: bool) -> Iterator[None]:
+    """The module in training or eval mode; afterwards every part is in its own mode again."""
+    modes = [(part, part.training) for part in module.modules()]
+    module.train(training)
+    try:
+        yield
+    finally:
+        for part, before in modes:
+            part.training = before

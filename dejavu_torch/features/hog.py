@@ -126,16 +126,7 @@ def hog(
 
     Args:
         frames: grey or colour images; of a colour image each pixel takes its strongest channel.
-        orientations: unsigned orientation bins in [0, 180) degrees.
-        cell: side of a square cell, pixels. Pixels beyond the last whole cell only feed gradients.
-        block: side of a square block, cells. Blocks overlap: they move by one cell.
-        resize: (height, width) in pixels to resize to first, antialiased; None keeps the size.
-        bins: "hard": a pixel votes for the bin its orientation lies in, so that only the magnitude carries
-            gradient to the frames. "linear": it shares its vote between the two nearest bin centres,
-            (k + 0.5) * 180 / orientations degrees, cyclic over 180; the orientation carries gradient too.
-        gradient: "central" differences f(x + 1) - f(x - 1), zero at the border, or "sobel": Sobel's
-            smoothed slope, with the border pixels repeated, so that the border votes too. It is half the
-            central difference on a ramp, which the blocks' norm takes out again, and slower.
+        orientations, cell, block, resize, bins, gradient: see `HOG`.
 
     Shape: (B,C,H,W) -> (B,D) with D = (ny - block + 1) * (nx - block + 1) * block**2 * orientations,
         ny = H // cell, nx = W // cell; ordered as skimage orders its feature vector.
@@ -178,13 +169,17 @@ class HOG(nn.Module):
     """Histograms of oriented gradients: `hog` as a module.
 
     Args:
-        orientations: unsigned orientation bins in 180 degrees.
-        cell: side of a square cell, pixels.
-        block: side of a square block, cells; blocks overlap.
-        resize: (height, width) in pixels to resize to first; None keeps the size.
-        bins: "hard": a pixel votes for one bin (as skimage); "linear": for the two nearest, the
-            trainable form.
-        gradient: "central" differences, or "sobel".
+        orientations: unsigned orientation bins in [0, 180) degrees.
+        cell: side of a square cell, pixels. Pixels beyond the last whole cell only feed gradients.
+        block: side of a square block, cells. Blocks overlap: they move by one cell.
+        resize: (height, width) in pixels to resize to first, antialiased; None keeps the size.
+        bins: "hard": a pixel votes for the bin its orientation lies in (as skimage), so that only the
+            magnitude carries gradient to the frames. "linear", the trainable form: it shares its vote between
+            the two nearest bin centres, (k + 0.5) * 180 / orientations degrees, cyclic over 180; the
+            orientation carries gradient too.
+        gradient: "central" differences f(x + 1) - f(x - 1), zero at the border, or "sobel": Sobel's
+            smoothed slope, with the border pixels repeated, so that the border votes too. It is half the
+            central difference on a ramp, which the blocks' norm takes out again, and slower.
 
     Shape: (B,C,H,W) -> (B,D).
     """

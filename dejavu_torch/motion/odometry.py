@@ -6,6 +6,7 @@ import logging
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
@@ -53,7 +54,6 @@ class GroundOdometry(nn.Module):
         still: pixels of ground; a shorter step of either sign counts as 0, as of a camera that stands. Noise
             of a few grey levels moves ground of clear texture by less; ground that hardly stands out from
             the noise needs more, slow footage of many frames a second less.
-        blend: `ResampledTraverse` shows a blend of the two frames next to each place instead of the nearest.
         flow: how patches are compared: "phase" (`shift_between`), or optical flow of OpenCV, "lk" on corners
             or "dis" on all pixels (`flow_shift`, with its limits; `pip install 'dejavu_torch[flow]'`).
 
@@ -81,7 +81,6 @@ class GroundOdometry(nn.Module):
         step: float | None = None,
         least: float = SURE,
         still: float = 0.1,
-        blend: bool = False,
         flow: str = "phase",
     ) -> None:
         super().__init__()
@@ -100,7 +99,7 @@ class GroundOdometry(nn.Module):
         self.corners = tuple((float(x), float(y)) for x, y in corners)
         self.size = (int(size[0]), int(size[1]))
         self.step = None if step is None else float(step)
-        self.least, self.still, self.blend, self.flow = least, still, blend, flow
+        self.least, self.still, self.flow = least, still, flow
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         patches = ground_patch(frames, self.corners, self.size)
@@ -174,7 +173,7 @@ class GroundOdometry(nn.Module):
     def extra_repr(self) -> str:
         return (
             f"corners={self.corners}, size={self.size}, step={self.step}, least={self.least}, "
-            f"still={self.still}, blend={self.blend}, flow={self.flow}"
+            f"still={self.still}, flow={self.flow}"
         )
 
 
@@ -201,8 +200,5 @@ def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
         "%s: no common ground in frames %s%s (%d of %d steps): the velocity there is interpolated",
         *(name, ", ".join(stretches[:NAMED]), more, len(bad), len(shift)),
     )
-    after = torch.searchsorted(good, bad)
-    left, right = good[(after - 1).clamp(min=0)], good[after.clamp(max=len(good) - 1)]
-    share = (bad - left).double() / (right - left).clamp(min=1)
-    share = share.clamp(0, 1)  # ahead of the first and behind the last: that one's
-    return shift.index_copy(0, bad, shift[left].lerp(shift[right], share))
+    # ahead of the first and behind the last: that one's
+    return torch.from_numpy(np.interp(np.arange(len(shift)), good.numpy(), shift[good].numpy())).to(shift)

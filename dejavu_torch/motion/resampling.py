@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import find_ground_truth
-from dejavu_torch.data.positions import NEAR, first_reached, look_up, nearest_places, shown_frames
+from dejavu_torch.data.positions import NEAR, look_up, nearest_places, shown_frames
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
@@ -27,15 +27,15 @@ class ResampledTraverse(Traverse):
 
     Args:
         traverse: frames, in order.
-        odometry: measures the ground, and says the step and whether to blend.
+        odometry: measures the ground, and says the step.
         batch_size: frames in memory at a time while measuring.
         step: pixels of ground, in place of the odometry's; as for the queries of a map.
         progress: show a progress bar on a terminal.
 
     Shape: frames (M,C,H,W). positions: (F,) float32, how many steps each frame of the other traverse lies
-        from the first. frame: (M,) int64, the frame of the other traverse nearest to each step. place: (M,)
-        float64, the other traverse's place of what is shown (interpolated where frames are blended), None
-        where it has none. step: pixels of ground.
+        from the first. frame: (M,) int64, the frame of the other traverse nearest to each step, which is
+        shown. place: (M,) float64, the other traverse's place of it, None where it has none. step: pixels of
+        ground.
 
     Convention: distances count from frame 0, in the direction in which the camera gets further from it. Each
         step is taken where it is first reached: standing, and going back and forth, add no frames.
@@ -74,13 +74,8 @@ class ResampledTraverse(Traverse):
             )
         self.frame = shown_frames(self.positions)
         self.length = len(self.frame)
-        if odometry.blend:
-            self._low, self._high, self._share = first_reached(self.positions)
-        else:
-            self._low, self._high, self._share = self.frame, self.frame, torch.zeros(self.length).double()
         if traverse.place is not None:
-            place = traverse.place.double()
-            self.place = place[self._low].lerp(place[self._high], self._share)
+            self.place = traverse.place.double()[self.frame]
 
     def place_of(self, frames: Tensor) -> Tensor:
         """The step nearest to each frame of the other traverse; -1 behind the first, and for -1."""
@@ -94,30 +89,24 @@ class ResampledTraverse(Traverse):
         return self.traverse.frame_shape
 
     def batches(self, size: int) -> Iterator[Tensor]:
-        yield from self._shown(self.traverse.batches(size), 0, 0, self.length, size)
+        yield from _shown(self.traverse.batches(size), 0, self.frame, size)
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        stop = min(stop, self.length)
-        if start < stop:
-            first, last = int(self._low[start]), int(self._high[stop - 1])
-            yield from self._shown(self.traverse.between(first, last + 1), first, start, stop, 64)
+        frames = self.frame[start:stop]
+        if len(frames):
+            first, last = int(frames[0]), int(frames[-1])
+            yield from _shown(self.traverse.between(first, last + 1), first, frames, 64)
 
-    def _shown(
-        self, batches: Iterator[Tensor], seen: int, done: int, stop: int, size: int
-    ) -> Iterator[Tensor]:
-        """The steps [done, stop) of batches that begin with frame `seen` of the other traverse."""
-        last: Tensor | None = None
-        for batch in batches:
-            frames = batch if last is None else torch.cat([last, batch])
-            seen += len(batch)
-            ready = min(stop, int(torch.searchsorted(self._high, seen)))
-            for part in torch.arange(done, ready).split(size) if done < ready else ():
-                low, high = (index[part] - (seen - len(frames)) for index in (self._low, self._high))
-                share = self._share[part].to(frames)[:, None, None, None]
-                yield frames[low].lerp(frames[high], share)
-            done, last = ready, frames[-1:]
-            if done == stop:
-                return
+
+def _shown(batches: Iterator[Tensor], first: int, frames: Tensor, size: int) -> Iterator[Tensor]:
+    """The frames of these numbers, never decreasing, out of batches that begin with frame `first`."""
+    for batch in batches:
+        ready = int(torch.searchsorted(frames, first + len(batch)))
+        for part in frames[:ready].split(size) if ready else ():
+            yield batch[part - first]
+        first, frames = first + len(batch), frames[ready:]
+        if not len(frames):
+            return
 
 
 def _warn_doubtful(moved: Tensor, name: str) -> None:
@@ -128,6 +117,29 @@ def _warn_doubtful(moved: Tensor, name: str) -> None:
             "%s: %d of %d steps go forward and %d backwards: do the corners show ground that comes nearer?",
             *(name, forward, len(moved), back),
         )
+
+
+def resampled(
+    traverse: Traverse,
+    odometry: GroundOdometry | None,
+    batch_size: int = 64,
+    step: float | None = None,
+    progress: bool = False,
+) -> Traverse:
+    """A traverse at even steps along the ground; as it is without odometry, or where it is so already.
+
+    Args:
+        step: pixels of ground; None is the odometry's own. Queries need the map's: of them a single frame,
+            and ready features, stay as they are.
+
+    Raises:
+        InputError: as `ResampledTraverse`.
+    """
+    if odometry is None or isinstance(traverse, ResampledTraverse):
+        return traverse
+    if step is not None and (traverse.length == 1 or len(traverse.frame_shape) == 1):
+        return traverse
+    return ResampledTraverse(traverse, odometry, batch_size, step, progress)
 
 
 def source_of(traverse: Traverse) -> Traverse:

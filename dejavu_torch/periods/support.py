@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from functools import cache
 from itertools import combinations, count
 from typing import NamedTuple
 
@@ -132,42 +131,19 @@ def supportive_periods(places: int, corrects: int = 1, smallest: int = 4) -> tup
         support = support_of(chosen, max(places, 3))
         return support.code_distance, support.torus_distance, chosen
 
-    totals = (list(_co_prime_sets(total, places, 2 * corrects + 1, smallest)) for total in count(smallest))
+    def tells(chosen: tuple[int, ...]) -> bool:
+        """Whether any but 2 * corrects of them, at worst the smallest, tell the places apart."""
+        core = len(chosen) - 2 * corrects
+        return core > 0 and math.prod(chosen[:core]) >= places
+
+    totals = (list(filter(tells, _co_prime_sets(total, smallest))) for total in count(smallest))
     return max(next(filter(None, totals)), key=quality)
 
 
-def _co_prime_sets(total: int, places: int, distance: int, smallest: int) -> Iterator[tuple[int, ...]]:
-    """Pairwise co-prime sets with this sum and at least this code distance over the places."""
-    for length in range(distance, total // smallest + 1):
-        # where distance - 1 layers agree, the rest must tell the places apart; so many 2s always do
-        core = min(length - distance + 1, places.bit_length())
-        if (total / length) ** core >= places:
-            yield from _summing_to(total, range(smallest, total + 1), length, core, places)
-
-
-def _summing_to(
-    total: int, candidates: Sequence[int], length: int, core: int, places: int
-) -> Iterator[tuple[int, ...]]:
-    """Pairwise co-prime choices of rising candidates whose `core` smallest multiply to `places` or more."""
-    if length == 1:
-        if total in candidates and (not core or total >= places):
-            yield (total,)
-        return
-    # no two of a choice share their least prime factor: it sums to no less than the first of each
-    firsts = sorted({_least_factor(period): period for period in reversed(candidates)}.values())
-    if len(firsts) < length or sum(firsts[:length]) > total:
-        return
-    for position, period in enumerate(candidates):
-        rest = total - period
-        if period * length > total:
-            return
-        if core and period * (rest / (length - 1)) ** (core - 1) < places:
-            continue  # even all equal, the others would multiply to too little
-        others = [other for other in candidates[position + 1 :] if math.gcd(period, other) == 1]
-        for more in _summing_to(rest, others, length - 1, max(core - 1, 0), -(-places // period)):
-            yield (period, *more)
-
-
-@cache
-def _least_factor(number: int) -> int:
-    return next((factor for factor in range(2, math.isqrt(number) + 1) if number % factor == 0), number)
+def _co_prime_sets(total: int, smallest: int, chosen: tuple[int, ...] = ()) -> Iterator[tuple[int, ...]]:
+    """Rising pairwise co-prime sets that begin with those chosen and go on with some of this total."""
+    if not total:
+        yield chosen
+    for period in (*range(smallest, (total + 1) // 2), total):  # the last one, or one that leaves a larger
+        if period >= smallest and all(math.gcd(period, other) == 1 for other in chosen):
+            yield from _co_prime_sets(total - period, period + 1, (*chosen, period))

@@ -17,9 +17,8 @@ from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_plac
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.memory import concatenate
-from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of
+from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
@@ -167,7 +166,7 @@ class RouteData(LightningDataModule):
             self.sets.clear()
             self._wanted = wanted
         if "reference" not in self.sets:
-            self.reference = self._resampled(_open(self.sources["source"]))
+            self.reference = resampled(_open(self.sources["source"]), self.velocity, self.batch_size)
             values = store(self.reference, self._size)
             self._check_length(self.reference.name, len(values))
             self.sets["reference"] = StoredFrames(
@@ -190,7 +189,7 @@ class RouteData(LightningDataModule):
     def _read(self, name: str) -> StoredFrames:
         reference = self.sets["reference"].values
         step = self.reference.step if isinstance(self.reference, ResampledTraverse) else None
-        traverse = self._resampled(_open(self.sources[name]), step)
+        traverse = resampled(_open(self.sources[name]), self.velocity, self.batch_size, step)
         values = store(traverse, self._size)
         self._check_length(traverse.name, len(values))
         if values.shape[1:] != reference.shape[1:]:
@@ -209,9 +208,6 @@ class RouteData(LightningDataModule):
         if isinstance(self.reference, ResampledTraverse):
             known = ground_truth_in_places(known, self.reference.place_of)
         return StoredFrames([values], known)
-
-    def _resampled(self, traverse: Traverse, step: float | None = None) -> Traverse:
-        return DejaVu(velocity=self.velocity, batch_size=self.batch_size).resample(traverse, step)
 
     def _check_length(self, name: str, frames: int) -> None:
         if frames <= max(1, self.tolerance):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.features.embedding import Coder, Embedding, to_length
-from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames
 from dejavu_torch.training.losses import Losses, place_cross_entropy
 from dejavu_torch.types import InputError
@@ -240,15 +239,3 @@ def stored_features(
         name = task.data.reference.name
         raise InputError(f"{maker} makes NaN or infinite features of {name}; expected finite numbers")
     return features
-
-
-@contextmanager
-def in_mode(module: nn.Module, training: bool) -> Iterator[None]:
-    """The module in training or eval mode; afterwards every part is in its own mode again."""
-    modes = [(part, part.training) for part in module.modules()]
-    module.train(training)
-    try:
-        yield
-    finally:
-        for part, before in modes:
-            part.training = before

@@ -20,7 +20,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from dejavu_torch.database.mapfile import read_map
 from dejavu_torch.database.template_map import TemplateMap, TemplateMapper, log_posterior
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
@@ -29,7 +29,7 @@ from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.datamodule import Batch, RouteData
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.training.stages import CodeStage, Stage, Views, in_mode, stages_of, stored_features
+from dejavu_torch.training.stages import CodeStage, Stage, Views, stages_of, stored_features
 from dejavu_torch.types import InputError, Plan, Training
 
 log = logging.getLogger("dejavu_torch")

@@ -94,9 +94,7 @@ def test_any_right_place_will_do_and_minus_one_is_none(
 
 @given(st.lists(st.lists(st.integers(0, 9), max_size=4), min_size=1, max_size=8))
 def test_padded_holds_each_row_in_order(rows: list[list[int]]) -> None:
-    row = torch.tensor([i for i, places in enumerate(rows) for _ in places], dtype=torch.int64)
-    place = torch.tensor([p for places in rows for p in places], dtype=torch.int64)
-    table = padded(row, place, len(rows))
+    table = padded(torch.tensor(places, dtype=torch.int64) for places in rows)
     assert table.dtype == torch.int64
     assert table.shape == (len(rows), max(map(len, rows)))
     assert [[p for p in line if p >= 0] for line in table.tolist()] == rows

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.data.positions import NEAR, first_reached, look_up, nearest_places, shown_frames
+from dejavu_torch.data.positions import NEAR, look_up, nearest_places, shown_frames
 
 WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
     lambda steps: torch.tensor([0.0, *steps]).cumsum(0)
@@ -15,17 +15,15 @@ WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
 
 @given(WAYS)
 def test_each_place_is_taken_where_it_is_first_reached(positions: torch.Tensor) -> None:
-    low, high, share = first_reached(positions)
-    exact = positions.double()
-    assert len(low) == int(exact.max() + NEAR) + 1
-    for place, (a, b, part) in enumerate(zip(low.tolist(), high.tolist(), share.tolist(), strict=True)):
-        assert (exact[:b] + NEAR < place + 1e-9).all()
-        assert exact[b] + NEAR >= place - 1e-9
-        assert b - a == min(b, 1)
-        assert abs(exact[a] + part * (exact[b] - exact[a]) - place) <= NEAR + 1e-9
-    assert (low.diff() >= 0).all()
-    shown = shown_frames(positions)
-    assert ((shown == low) | (shown == high)).all()
+    shown, exact = shown_frames(positions), positions.double()
+    assert len(shown) == int(exact.max() + NEAR) + 1
+    for place, frame in enumerate(shown.tolist()):
+        high = int((exact + NEAR >= place - 1e-9).nonzero()[0])
+        low = max(high - 1, 0)
+        assert frame in (low, high)
+        away = (exact - place).abs()
+        assert away[frame] <= min(away[low], away[high]) + NEAR + 1e-9
+    assert (shown.diff() >= 0).all()
 
 
 @given(WAYS)

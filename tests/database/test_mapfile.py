@@ -524,7 +524,7 @@ def test_features_from_elsewhere_get_their_weights_from_the_file(small_map: tupl
 
 
 def test_features_from_elsewhere_must_be_given(small_map: tuple[Path, DejaVu]) -> None:
-    with refused("Small", "--features"):
+    with refused("Small", "`features`"):
         DejaVu.load(small_map[0])
 
 
@@ -628,7 +628,7 @@ def test_learnt_features_of_this_package_load_by_themselves(path: Path, make: An
 def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> None:
     torch.manual_seed(0)
     model, query = learnt_with(embedding(Patch()), path), pictures(5)
-    with refused(str(path), "Patch", "only the caller can load", "--features", "features=... in Python"):
+    with refused(str(path), "Patch", "only the caller can load", "`features`"):
         DejaVu.load(path)
     torch.manual_seed(1)
     given = embedding(Patch())

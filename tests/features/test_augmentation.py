@@ -16,8 +16,7 @@ from dejavu_torch.features.augmentation import LARGEST, Augmentation
 
 OFF: dict[str, Any] = {name: 0.0 if len(most) == 1 else (0.0, 0.0) for name, most in LARGEST.items()}
 DEFAULTS = {name: argument.default for name, argument in signature(Augmentation).parameters.items()}
-ALONE: dict[str, Any] = {**DEFAULTS, "perspective": 0.1}
-EACH = pytest.mark.parametrize("name", ALONE)
+EACH = pytest.mark.parametrize("name", DEFAULTS)
 
 
 def only(**strengths: Any) -> Augmentation:
@@ -60,8 +59,8 @@ def test_eval_gives_the_input_itself_and_training_leaves_it_alone() -> None:
 @EACH
 def test_each_alone_acts_on_some_or_all_clips(name: str) -> None:
     frames = torch.rand(300, 1, 16, 16) * 0.5 + 0.25
-    share = changed(frames, only(**{name: ALONE[name]})(frames)).float().mean().item()
-    half, most = ("perspective", "illumination", "blur"), ("rotation", "shift", "scale")
+    share = changed(frames, only(**{name: DEFAULTS[name]})(frames)).float().mean().item()
+    half, most = ("illumination", "blur"), ("rotation", "shift", "scale")
     often = ("gamma", "occlusion", "noise")
     chance = 0.5 if name in half else 0.9 if name in most else 0.7 if name in often else 1.0
     assert share == pytest.approx(chance, abs=0.1)
@@ -70,13 +69,13 @@ def test_each_alone_acts_on_some_or_all_clips(name: str) -> None:
 @EACH
 def test_a_clip_of_equal_frames_stays_one_but_for_noise(name: str) -> None:
     clips = torch.rand(8, 1, 3, 16, 16).expand(8, 4, 3, 16, 16)
-    after = only(**{name: ALONE[name]})(clips)
+    after = only(**{name: DEFAULTS[name]})(clips)
     assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6) == (name != "noise")
 
 
 def test_a_clip_is_one_day_and_clips_differ() -> None:
     clips = torch.rand(1, 1, 3, 16, 16).expand(6, 5, 3, 16, 16)
-    after = Augmentation(**{**ALONE, "noise": 0.0})(clips)
+    after = Augmentation(**{**DEFAULTS, "noise": 0.0})(clips)
     assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6)
     first = after[:, 0].flatten(1)
     assert (torch.cdist(first, first) > 0.1).sum() == 6 * 5
@@ -198,17 +197,6 @@ def test_rotation_turns_and_scale_stretches_by_at_most_theirs() -> None:
     assert (y - 30).abs().max() < 1e-3
 
 
-def test_perspective_moves_corners_by_at_most_its_fraction() -> None:
-    ramp = torch.linspace(0, 1, 41).expand(200, 1, 41, 41)
-    move = only(perspective=0.1)(ramp) - ramp  # in fractions of the side
-    corners = move[:, 0, ::40, ::40]
-    assert 0.08 < corners.abs().max() < 0.13  # what is looked up lies a little beyond
-    assert (corners[:, 0] - corners[:, 1]).abs().max() > 0.03
-    assert only(perspective=1e-6)(ramp).sub(ramp).abs().max() < 1e-3
-    moved = only(rotation=30.0, shift=(0.3, 0.3), scale=0.5, perspective=0.3)(flat(0.7))
-    assert torch.allclose(moved, flat(0.7), atol=1e-5)  # nothing black comes in
-
-
 @pytest.mark.parametrize("most", [0.01, 0.15, 0.6])
 def test_occlusion_covers_one_rectangle_of_at_most_its_fraction(most: float) -> None:
     side, levels = 60, torch.arange(1.0, 201.0) / 201
@@ -237,7 +225,7 @@ def test_a_clip_alone_is_covered_with_black() -> None:
 
 
 def test_it_is_plain_numbers_with_nothing_to_save() -> None:
-    strengths = json.loads(json.dumps(ALONE))
+    strengths = json.loads(json.dumps(DEFAULTS))
     frames, augmentation = torch.rand(3, 3, 16, 16), Augmentation(**strengths)
     augmentation(frames)
     assert not augmentation.state_dict()
@@ -248,7 +236,7 @@ def test_it_is_plain_numbers_with_nothing_to_save() -> None:
 @EACH
 @pytest.mark.parametrize("wrong", [-0.01, float("nan"), 181.0, "much", None])
 def test_a_wrong_strength_is_refused(name: str, wrong: object) -> None:
-    pair = isinstance(ALONE[name], tuple)
+    pair = isinstance(DEFAULTS[name], tuple)
     with refused(f"{name} is", "expected a number from 0 to"):
         only(**{name: (wrong, 0.0) if pair else wrong})
     with refused(f"{name} is"):

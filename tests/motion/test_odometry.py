@@ -479,17 +479,6 @@ def test_going_back_and_forth_adds_no_places() -> None:
     assert not shown & set(range(14, 27))  # the way back, and again up to where it turned
 
 
-def test_a_blend_lies_between_its_neighbours() -> None:
-    even = ResampledTraverse(short(), GroundOdometry(step=2.0, blend=True))
-    place = even.place
-    assert place is not None
-    torch.testing.assert_close(place, 2.0 * torch.arange(even.length).double(), rtol=0, atol=0.5)
-    share = (place / 5).frac().float()
-    low = (place / 5).long().clamp(max=10)
-    mixed = short().frames[low].lerp(short().frames[low + 1], share.view(-1, 1, 1, 1))
-    torch.testing.assert_close(all_of(even), mixed, rtol=0, atol=1e-4)
-
-
 def test_the_median_step_of_moving_frames_is_the_default() -> None:
     position = travelled((5, 5, 11), (0, 0, 30))
     even = ResampledTraverse(Shown(drive(position)), GroundOdometry())
@@ -505,10 +494,9 @@ def test_a_camera_that_looks_back() -> None:
     assert even.frame[0] == 0
 
 
-@pytest.mark.parametrize("blend", [False, True])
 @pytest.mark.parametrize("step", [1.5, 14.0])
-def test_any_batch_size_any_number_of_times(blend: bool, step: float) -> None:
-    even = ResampledTraverse(short(), GroundOdometry(step=step, blend=blend))
+def test_any_batch_size_any_number_of_times(step: float) -> None:
+    even = ResampledTraverse(short(), GroundOdometry(step=step))
     frames = all_of(even, 100)
     for size in (1, 2, 5, 12):
         batches = list(even.batches(size))
@@ -523,7 +511,7 @@ def test_any_batch_size_any_number_of_times(blend: bool, step: float) -> None:
 def test_few_frames_are_in_memory(largest_tensor: type) -> None:
     traverse = journey()
     with largest_tensor() as seen:
-        even = ResampledTraverse(traverse, GroundOdometry(step=8.0, blend=True), batch_size=4)
+        even = ResampledTraverse(traverse, GroundOdometry(step=8.0), batch_size=4)
         for _ in even.batches(4):
             pass
     assert seen.numel < traverse.frames.numel() / 8
@@ -572,7 +560,7 @@ def test_settings_out_of_range_are_refused(choice: dict, words: tuple[str, ...])
 
 
 def test_its_attributes_build_the_same_module() -> None:
-    module = GroundOdometry(size=(64, 48), step=3.0, blend=True, flow="phase")
+    module = GroundOdometry(size=(64, 48), step=3.0, still=0.2, flow="phase")
     arguments = {name: getattr(module, name) for name in signature(GroundOdometry).parameters}
     assert repr(GroundOdometry(**arguments)) == repr(module)
 
