@@ -181,7 +181,7 @@ class SpectralMap(PlaceMap):
         ]
         products = torch.cat(parts, 1)
         if self.metric == "cosine":
-            return 1 - products * self.per_norm.to(products)
+            return torch.rsub(products * self.per_norm.to(products), 1)
         return (length.square() - 2 * products + self.norms.to(products).square()).clamp(min=0)
 
     def extend(self, features: Tensor) -> None:

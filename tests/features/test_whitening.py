@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from dejavu_torch.features.embedding import Coder
-from dejavu_torch.features.whitening import SHRINKAGE, learned_whitening
+from dejavu_torch.features.whitening import Whitening, learned_whitening, principal_components
 
 
 def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -22,13 +22,13 @@ def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
     return places + torch.randn(n, k, generator=random) * torch.linspace(3, 0.5, k), places
 
 
-@given(st.integers(0, 99), st.integers(1, 6))
-def test_changes_are_alike_in_all_directions(seed: int, kept: int) -> None:
+@given(st.integers(0, 99), st.integers(1, 6), st.sampled_from([0.03, 0.5, 1.0]))
+def test_changes_are_alike_in_all_directions(seed: int, kept: int, shrinkage: float) -> None:
     views, places = pairs(seed=seed)
-    mean, projection = learned_whitening(views, places, kept)
+    mean, projection = learned_whitening(views, places, kept, shrinkage)
     change = (views - places).double() / 2
     within = change.T @ change / len(change)
-    shrunk = within + SHRINKAGE * within.diagonal().mean() * torch.eye(6)
+    shrunk = (1 - shrinkage) * within + shrinkage * within.diagonal().mean() * torch.eye(6)
     p = projection.double()
     torch.testing.assert_close(p.T @ shrunk @ p, torch.eye(kept).double(), rtol=0, atol=1e-5)
     middle = (views + places).double() / 2 - mean
@@ -43,7 +43,7 @@ def test_in_closed_form_where_the_numbers_are_independent() -> None:
     places = torch.tensor([[-4.0, 2.0], [4.0, 2.0], [-4.0, -2.0], [4.0, -2.0]])
     mean, projection = learned_whitening(views, places, 1)
     assert mean.tolist() == [0, 0]
-    expected = 1 / math.sqrt(1 + SHRINKAGE * (16 + 1) / 2)
+    expected = 1 / math.sqrt((1 + (16 + 1) / 2) / 2)
     torch.testing.assert_close(projection.abs(), torch.tensor([[0.0], [expected]]), rtol=0, atol=1e-6)
 
 
@@ -83,3 +83,122 @@ def test_what_cannot_be_whitened(views: Tensor, places: Tensor, kept: int, words
             coder.whiten(views, places)
         assert not coder.whitened
         assert torch.equal(coder.projection, torch.eye(2))
+
+
+# the module -------------------------------------------------------------------------------------------
+
+
+def route(places: int = 600, features: int = 40, rank: int = 12) -> tuple[Tensor, Tensor]:
+    """Descriptors of a route and of another visit, whose light adds far more than places differ by."""
+    random = torch.Generator().manual_seed(0)
+    basis = torch.randn(rank, features, generator=random)
+    own = torch.randn(places, rank, generator=random)
+    light = 6 * torch.randn(places, 2, generator=random) @ torch.randn(2, features, generator=random)
+    return own @ basis + 3, own @ basis + 3 + light
+
+
+def found(whitening: Whitening, views: Tensor, places: Tensor) -> float:
+    similar = whitening(views) @ whitening(places).T
+    return float((similar.argmax(1) == torch.arange(len(places))).float().mean())
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
+    places, views = route()
+    plain, whitening = Whitening(bits=bits), Whitening(numbers=10, bits=bits)
+    plain.learn(places)
+    whitening.learn(
+        places[:300], [(views[:100], torch.arange(100)), (views[100:300], torch.arange(100, 300))]
+    )
+    assert found(whitening, views[300:], places[300:]) > 0.95 > 0.5 > found(plain, views[300:], places[300:])
+    torch.testing.assert_close(whitening(views).norm(dim=1), torch.ones(600))
+    assert whitening.projection.dtype == (torch.int8 if bits == 8 else torch.int16)
+
+
+def test_without_views_components_keep_their_variances() -> None:
+    places, _ = route()
+    whitening = Whitening(bits=16)
+    whitening.learn(places)
+    described = whitening(places)
+    assert described.shape == (600, 13)  # the rank, and one constant number
+    constant = described[:, -1]
+    torch.testing.assert_close(constant, constant[:1].expand(600))
+    distances = torch.cdist(described, described)
+    torch.testing.assert_close(distances, torch.cdist(places, places), rtol=1e-2, atol=5e-2)
+    length = (places - places.mean(0)).square().sum(1).mean().sqrt()
+    torch.testing.assert_close(constant[0], length, rtol=1e-3, atol=0)
+
+
+def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogCaptureFixture) -> None:
+    places, views = route()
+    whitening = Whitening()
+    whitening.learn(places[:40], [(views[:40], torch.arange(40))])
+    assert len(whitening.scale) == 10  # a quarter of the places
+    assert not caplog.text
+    whitening.learn(places, [(views, torch.arange(600))])
+    assert len(whitening.scale) == 12
+    assert "rank 12" in caplog.text
+    with refused("numbers is 20", "rank 12"):
+        Whitening(numbers=20).learn(places, [(views, torch.arange(600))])
+
+
+def test_a_state_of_any_size_is_loaded() -> None:
+    places, views = route()
+    one, other = Whitening(), Whitening()
+    one.learn(places, [(views, torch.arange(600))])
+    other.learn(places[:, :9])
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(other(views), one(views))
+    assert not Whitening().learned
+    assert torch.equal(Whitening()(views), views)
+
+
+def test_gradients_reach_the_features() -> None:
+    places, views = route(200, 6, 4)
+    for own in ([(views, torch.arange(200))], None):
+        whitening = Whitening(numbers=3)
+        whitening.learn(places, own)
+        some = views[:3].double().requires_grad_()
+        assert torch.autograd.gradcheck(whitening, (some,))
+
+
+@pytest.mark.parametrize("features", [30, 300])
+def test_principal_components_are_those_of_the_covariance(features: int) -> None:
+    random = torch.Generator().manual_seed(0)
+    rows = torch.randn(500, features, generator=random, dtype=torch.float64) * 0.9 ** torch.arange(features)
+    mean, basis, variances = principal_components(rows.float(), 10)
+    centred = rows - rows.mean(0)
+    values, vectors = torch.linalg.eigh(centred.T @ centred / 500)
+    torch.testing.assert_close(mean, rows.mean(0).float(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(variances, values.flip(0)[:10].float(), rtol=1e-3, atol=0)
+    agreement = (basis.double() * vectors.flip(1)[:, :10]).sum(0).abs()
+    assert agreement.min() > 0.99
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"numbers": 0}, ("numbers=0", "at least 1")),
+        ({"numbers": 500}, ("numbers=500", "components=400")),
+        ({"views": 0}, ("views=0",)),
+        ({"shrinkage": 0.0}, ("shrinkage=0.0", "above 0")),
+        ({"bits": 4}, ("bits=4", "8 or 16")),
+    ],
+)
+def test_whitening_settings_out_of_range(settings: dict[str, float], words: tuple[str, ...]) -> None:
+    with refused("Whitening got", *words):
+        Whitening(**settings)  # type: ignore[arg-type]
+
+
+def test_a_route_that_cannot_be_whitened() -> None:
+    places, views = route()
+    with refused("600 descriptors", "all alike"):
+        Whitening().learn(torch.ones(600, 4))
+    with refused("(1, 40)", "N at least 2"):
+        Whitening().learn(places[:1])
+    with refused("views", "augmentation"):
+        Whitening().learn(places, [(places, torch.arange(600))])
+    whitening = Whitening()
+    whitening.learn(places)
+    with refused("(600, 7)", "(B, 40)"):
+        whitening(views[:, :7])

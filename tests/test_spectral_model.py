@@ -1,0 +1,158 @@
+"""`DejaVu` with whitening and a spectral map, from frames to places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import all_of, refused
+from torch import Tensor
+
+from dejavu_torch import DejaVu, TemplateMapper, open_source
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.views import AugmentedTraverse, Views
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.types import Traverse
+
+FRAMES = 300
+
+
+@pytest.fixture(scope="module")
+def reference() -> Traverse:
+    return open_source(f"sim:aerial?frames={FRAMES}")
+
+
+@pytest.fixture(scope="module")
+def second() -> Traverse:
+    return open_source(f"sim:aerial?frames={FRAMES}&traverse=1")
+
+
+def spectral(**settings: object) -> DejaVu:
+    return DejaVu(whitening=Whitening(**settings), mapper=SpectralMapper())  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def model(reference: Traverse) -> DejaVu:
+    return spectral().learn(reference)
+
+
+def test_a_second_traverse_is_found_at_five_bytes_a_place(model: DejaVu, second: Traverse) -> None:
+    found = model.localize(second).index
+    assert ((found - torch.arange(FRAMES)).abs() <= 5).float().mean() > 0.95
+    summary = model.summary()
+    assert 4.8 * FRAMES <= summary.route_bytes <= 5 * FRAMES
+    assert summary.fixed["whitening"] > 1764 * 75  # a byte for each number of the projection
+
+
+def test_two_runs_give_the_same_map(model: DejaVu, reference: Traverse) -> None:
+    torch.manual_seed(5)  # of the caller: not of the copies
+    again, other = spectral().learn(reference), spectral(seed=1).learn(reference)
+    states = [one.state_dict() for one in (model, again, other)]
+    assert torch.equal(states[0]["whitening.projection"], states[1]["whitening.projection"])
+    assert torch.equal(states[0]["map.levels"], states[1]["map.levels"])
+    assert not torch.equal(states[0]["whitening.projection"], states[2]["whitening.projection"])
+
+
+def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Traverse) -> None:
+    frames = next(iter(second.batches(8)))
+    scores = model(frames)
+    descriptors = model.whitened(model.describe(frames))
+    assert torch.allclose(model.map.scores(descriptors), scores)
+    assert torch.equal(model.localize_descriptors(descriptors).index, scores.argmin(1))
+    assert torch.allclose(next(model.extract(ArrayTraverse(frames, "eight"))), descriptors)
+
+
+def test_gradients_reach_the_frames(model: DejaVu, second: Traverse) -> None:
+    frames = next(iter(second.batches(4))).requires_grad_()
+    model(frames).amin(1).sum().backward()
+    assert frames.grad is not None
+    assert frames.grad.isfinite().all()
+    assert frames.grad.abs().max() > 0
+
+
+def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
+    model.save(tmp_path / "m.safetensors")
+    again = DejaVu.load(tmp_path / "m.safetensors")
+    assert isinstance(again.map, SpectralMap)
+    assert repr(again.whitening) == repr(model.whitening)
+    assert torch.equal(again.localize(second).index, model.localize(second).index)
+    assert again.summary().map_bytes == (tmp_path / "m.safetensors").stat().st_size
+    fresh = spectral()
+    fresh.load_state_dict(model.state_dict())
+    frames = next(iter(second.batches(8)))
+    assert torch.equal(fresh(frames), model(frames))
+
+
+def test_the_model_is_exported(model: DejaVu, second: Traverse) -> None:
+    frames = torch.cat(list(second.batches(100)))[:100]
+    dims = {"queries": {0: torch.export.Dim("batch")}}
+    program = torch.export.export(model.eval(), (frames[:3],), dynamic_shapes=dims).module()
+    for batch in (1, 8, 100):
+        assert torch.allclose(program(frames[:batch]), model(frames[:batch]), atol=1e-4)
+
+
+def test_whitening_by_a_second_traverse(reference: Traverse, second: Traverse) -> None:
+    learned = spectral().learn(reference, second=Views(second, torch.arange(FRAMES)))
+    plain = spectral().learn(reference)
+    assert learned.whitening is not None
+    assert not torch.equal(learned.whitening.projection, plain.whitening.projection)  # type: ignore[union-attr]
+    other = open_source(f"sim:aerial?frames={FRAMES}&traverse=2")
+    found = learned.localize(other).index
+    assert ((found - torch.arange(FRAMES)).abs() <= 5).float().mean() > 0.95
+
+
+def test_a_fixed_whitening_is_kept(model: DejaVu, second: Traverse) -> None:
+    assert model.whitening is not None
+    whitening = Whitening()
+    whitening.load_state_dict(model.whitening.state_dict())
+    whitening.fixed = True
+    DejaVu(whitening=whitening, mapper=SpectralMapper()).learn(second)
+    assert torch.equal(whitening.projection, model.whitening.projection)
+
+
+def test_two_features_beside_a_larger_drift_are_localized() -> None:
+    """Neighbouring frames are no views: they would rank what repeats fast last."""
+    time = torch.arange(720.0)
+    wave = torch.stack([time % 8, time % 9, 30 * torch.sin(time / 300)], 1)
+    found = spectral().learn(wave).localize(wave + 0.05 * torch.randn(wave.shape)).index
+    assert (found == torch.arange(720)).float().mean() > 0.9
+
+
+def test_a_whitening_goes_with_templates_as_well(reference: Traverse, second: Traverse) -> None:
+    model = DejaVu(whitening=Whitening(), mapper=TemplateMapper()).learn(reference)
+    assert model.map.dimension == 75  # a quarter of the frames
+    assert model.localize(second).index.shape == (FRAMES,)
+
+
+def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
+    copies = AugmentedTraverse(reference, FRAMES, copies=3, most=90, seed=4)
+    assert copies.length == 90
+    assert copies.views.places.tolist() == [i for i in range(0, FRAMES, 10) for _ in range(3)]
+    frames = all_of(copies, 12)
+    assert frames.shape == (90, *reference.frame_shape)
+    assert torch.equal(all_of(copies, 12), frames)
+    own = all_of(reference)[copies.views.places]
+    strangers = own.roll(30, 0)
+    assert (
+        (frames - own).abs().mean((1, 2, 3)) < (frames - strangers).abs().mean((1, 2, 3))
+    ).float().mean() > 0.7
+    with refused("ready features", "frames to augment"):
+        AugmentedTraverse(ArrayTraverse(torch.rand(9, 2), "nine"), 9, 1, 9)
+
+
+def test_networks_are_described_in_eval_mode() -> None:
+    route = ArrayTraverse(torch.rand(40, 3, 32, 32), "noise")
+    network = SmallCNN(16, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4).train()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    DejaVu(network, whitening=Whitening(), mapper=SpectralMapper(20.0)).learn(route)
+    assert network.training
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("frames", [torch.zeros(20, 1, 32, 32), torch.rand(1, 1, 32, 32)])
+def test_routes_that_cannot_be_whitened_are_refused(frames: Tensor) -> None:
+    with refused("expected"):
+        spectral().learn(frames)
