@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.positions import unit_of
 from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.activation import activation_rates, best_phases, layer_distances
 from dejavu_torch.evaluation.contenders import Contender, distinct
@@ -33,7 +34,7 @@ from dejavu_torch.evaluation.score_plots import plot_auc, plot_curves
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
-from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Traverse
@@ -47,6 +48,8 @@ class Localization(NamedTuple):
 
     reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None where there is none.
     tolerance: distance from a right place, in places, up to which a reported one is right.
+
+    Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
 
     model: DejaVu
@@ -57,6 +60,26 @@ class Localization(NamedTuple):
     match: Match
     truth: GroundTruth | None
     tolerance: int
+
+    @property
+    def borders(self) -> Tensor:
+        """(N+1,) the reference frame with which each place begins, and the number of frames."""
+        return self.model.map.borders.cpu()
+
+    @property
+    def query_frames(self) -> Tensor:
+        """(Q,) the frame of its source that each query shows."""
+        return self.query.frame if isinstance(self.query, ResampledTraverse) else torch.arange(self.queries)
+
+    @property
+    def queries(self) -> int:
+        """Q, how many there are."""
+        return len(self.query_features)
+
+    @property
+    def unit(self) -> str:
+        """What periods and the tolerance count."""
+        return unit_of(self.model.map.positions)
 
 
 def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dict[str, Picture]:
@@ -71,22 +94,22 @@ def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dic
     """
     pictures = draw_pairs(run)
     pictures["coverage"] = Picture(
-        plot_coverage(run.match, run.truth, run.tolerance, run.model.map.places),
+        plot_coverage(run.match, run.truth, run.tolerance, run.borders, run.query_frames, run.unit),
         "places reported",
         "Where along the route each query was found."
         + (" A query in its right place is green, in a wrong one red." if run.truth is not None else ""),
     )
-    pictures |= draw_scores(run) | draw_curves(contenders, run.tolerance) | draw_motion(run)
+    pictures |= draw_scores(run) | draw_curves(contenders, f"{run.tolerance} {run.unit}") | draw_motion(run)
     if isinstance(run.model.map, TemplateMap):
-        pictures |= draw_chunks(run.model.map)
+        pictures |= draw_chunks(run, run.model.map)
         pictures |= draw_features(run, run.model.map) | draw_activations(run, run.model.map)
     return pictures
 
 
-def draw_chunks(route: TemplateMap) -> dict[str, Picture]:
+def draw_chunks(run: Localization, route: TemplateMap) -> dict[str, Picture]:
     """The layers of a map along the route."""
     picture = Picture(
-        plot_chunks(route.plan, route.places),
+        plot_chunks(route.plan, run.borders, run.unit),
         "the map's periods along the route",
         "Dotted lines cut the route into chunks. Each bar is a layer: the features that repeat with one "
         "period in one chunk; the wider, the more features.",
@@ -126,11 +149,9 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
 
 def frame_label(run: Localization, kind: str, number: int) -> str:
     """A query or a place by what matches.csv calls it: the frame of its source, and the frame's name."""
-    traverse = run.query if kind == "query" else run.reference
-    if isinstance(traverse, ResampledTraverse):
-        number, traverse = int(traverse.frame[number]), traverse.traverse
-    what = "query frame" if kind == "query" else "frame"
-    return f"{what} {number} {traverse.frame_name(number)}".strip()
+    traverse, table = (run.query, run.query_frames) if kind == "query" else (run.reference, run.borders)
+    frame = int(table[number])
+    return f"frame {frame} {source_of(traverse).frame_name(frame)}".strip()
 
 
 def draw_scores(run: Localization) -> dict[str, Picture]:
@@ -142,13 +163,13 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
     if matrix is None:
         return {}
     shares = []
-    if len(matrix.query) < len(run.match.index):
+    if len(matrix.query) < run.queries:
         shares.append(f"{len(matrix.query)} of the queries")
     if matrix.block > 1:
         shares.append(f"of {matrix.block} neighbouring places the one that fits best")
     return {
         "scores": Picture(
-            plot_score_matrix(matrix, run.match, run.truth),
+            plot_score_matrix(matrix, run.match, run.truth, run.borders, run.query_frames),
             "how well each place fits each query",
             "Dark: the place fits the query about as well as its best one does. What repeats shows as lines "
             "beside the right places." + (f" Drawn: {'; '.join(shares)}." if shares else ""),
@@ -156,15 +177,19 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
     }
 
 
-def draw_curves(contenders: Mapping[str, Contender], tolerance: int) -> dict[str, Picture]:
-    """Precision-recall curves and their areas; nothing where no contender has a curve."""
+def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
+    """Precision-recall curves and their areas; nothing where no contender has a curve.
+
+    Args:
+        tolerance: with its unit.
+    """
     # leave_out has other queries
     curves = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
     if not curves:
         return {}
     return {
         "pr": Picture(
-            plot_curves(curves, f"right within {tolerance} places"),
+            plot_curves(curves, f"right within {tolerance}"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises. The higher and the further to the right, the better.",
@@ -172,8 +197,9 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: int) -> dict[str
         "auc": Picture(
             plot_auc(curves),
             "area under each curve",
-            "The curves above in one number each: this map, baselines that store frames, and nulls, in which "
-            "nothing repeats. A curve starts at the queries of the best score; nothing counts to its left.",
+            "The curves above in one number each: this map, baselines that store features as they are, and "
+            "nulls, in which nothing repeats. A curve starts at the queries of the best score; nothing "
+            "counts to its left.",
         ),
     }
 
@@ -228,28 +254,29 @@ def draw_features(run: Localization, route: TemplateMap) -> dict[str, Picture]:
             for start, stop, _ in spectra
         ]
         pictures["spectrogram"] = Picture(
-            plot_spectrogram(values[:, 0], spectra, kept, periods.min_period, feature),
+            plot_spectrogram(values[:, 0], spectra, kept, periods.min_period, feature, run.borders, run.unit),
             "a feature and its spectrogram",
-            "One feature of each frame along the route, and how its power is spread over periods in each "
+            "One feature along the route, and how its power is spread over periods in each "
             "chunk. The map keeps the strongest periods, circled: they put the feature into a layer each.",
         )
     made = "the trained template" if model.trained else "their mean"
     pictures["templates"] = Picture(
-        plot_templates(layer, values[layer.start : layer.stop, 0], templates, chosen, made),
-        "frames of equal phase become templates",
+        plot_templates(layer, values[layer.start : layer.stop, 0], templates, chosen, run.unit, made),
+        "places of equal phase become templates",
         "Above, the same feature cut into cycles of one period and laid over each other, and "
         + ("the template that training made of it" if model.trained else "their mean, which the map stores")
         + ". Below, the templates of the layer's features, a row each.",
     )
-    number = (layer.start + layer.stop) // 2
+    middle = (layer.start + layer.stop) // 2
     if type(model.features) is HOG and len(run.reference.frame_shape) == 3:
-        frame = as_hog_sees(model, frame_at(run.reference, number))
+        frame = as_hog_sees(model, frame_at(run.reference, middle))
         layout = model.features.orientations, model.features.cell, model.features.block
         pictures["features"] = Picture(
             plot_features(frame, [plan[j] for j in leading], *layout),
             "where the features of a layer look",
-            f"The HOG features that take part in each layer, drawn on frame {number} as the edges they "
-            "respond to; the stronger a line, the more of the overlapping blocks have it in the layer.",
+            "The HOG features that take part in each layer, drawn on frame "
+            f"{run.borders[middle]} as the edges they respond to; the stronger a line, the more "
+            "of the overlapping blocks have it in the layer.",
         )
     return pictures
 
@@ -266,7 +293,7 @@ def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture
         return {}
     layers = [plan[j] for j in chosen]
     start, stop = layers[0].start, layers[0].stop
-    query, places, rates = len(queries) // 2, [], None
+    query, places, rates = run.queries // 2, [], None
     if truth is not None:
         query = nearest_query(truth, (start + stop) / 2)
         right = truth.positives[query].tolist() if truth.judged[query] else []
@@ -277,15 +304,17 @@ def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture
     scores = [layer_distances(route, one, j)[0, plan[j].place_phases] for j in chosen]
     with torch.no_grad():
         fused = route.scores(one.to(route.templates.device))[0, start:stop].cpu()
-    strip = slit_scan(run.reference, start, stop)
+    borders = run.borders
+    strip = slit_scan(source_of(run.reference), int(borders[start]), int(borders[stop]))
+    number = int(run.query_frames[query])
     covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
     explained = (
-        f" Right: within {run.tolerance} places, for a layer in phase. Elsewhere: queries from other chunks, "
-        "the layer's phase counted on; near chance where its period ends with the chunk. All layers fused "
-        "choose from the whole route."
+        f" Right: within {run.tolerance} {run.unit}, for a layer in phase. Elsewhere: queries from other "
+        "chunks, the layer's phase counted on; near chance where its period ends with the chunk. All layers "
+        "fused choose from the whole route."
     )
     picture = Picture(
-        plot_activations(layers, scores, fused, query, places, strip, rates),
+        plot_activations(layers, scores, fused, number, borders, places, strip, rates),
         "two layers, and all layers fused",
         "How much one query differs from each place of a chunk: a layer alone fits one place a period, all "
         f"{covering} of the chunk together one." + (explained if rates else ""),
@@ -300,11 +329,12 @@ def paper_pictures(run: Localization) -> dict[str, Picture]:
     if run.truth is not None and (run.truth.positives >= 0).any() and has_frames(run):
         middles = [len(run.reference_features) * (k + 0.5) / EXAMPLES for k in range(EXAMPLES)]
         queries = [nearest_query(run.truth, middle) for middle in middles]
-        places = run.truth.positives[queries].amax(1).tolist()
-        first = torch.stack([frame_at(run.reference, place) for place in places])
+        places = run.truth.positives[queries].amax(1)
+        first = torch.stack([frame_at(run.reference, place) for place in places.tolist()])
         second = torch.stack([frame_at(run.query, query) for query in queries])
+        numbers = zip(run.borders[places].tolist(), run.query_frames[queries].tolist(), strict=True)
         pictures["frames"] = Picture(
-            plot_frames(first, second, places),
+            plot_frames(first, second, list(numbers)),
             "the route",
             "The same places on the reference and on the second traverse.",
         )
@@ -317,13 +347,13 @@ def paper_pictures(run: Localization) -> dict[str, Picture]:
         kept = [float(p.period) for p in chunk if feature in p.features]
         values = run.reference_features[layer.start : layer.stop, feature].cpu()
         pictures["autocorrelogram"] = Picture(
-            plot_autocorrelogram(values, kept, feature),
+            plot_autocorrelogram(values, kept, feature, run.unit),
             "a feature against itself",
-            "How alike a feature is to itself so many frames later: where it repeats, it is high at every "
+            "How alike a feature is to itself so many places later: where it repeats, it is high at every "
             "multiple of its period.",
         )
         pictures["layers"] = Picture(
-            plot_layers(chunk),
+            plot_layers(chunk, run.borders, run.unit),
             "layers and their phases",
             "One chunk of the map: a row a layer, the colour its phase. A column of phases names a place; "
             "the next place where all are the same is the least common multiple of the periods away.",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import find_ground_truth
-from dejavu_torch.data.positions import NEAR, first_reached, look_up, nearest_places, shown_frames
+from dejavu_torch.data.positions import NEAR, first_reached, shown_frames
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
@@ -81,10 +81,6 @@ class ResampledTraverse(Traverse):
         if traverse.place is not None:
             place = traverse.place.double()
             self.place = place[self._low].lerp(place[self._high], self._share)
-
-    def place_of(self, frames: Tensor) -> Tensor:
-        """The step nearest to each frame of the other traverse; -1 behind the first, and for -1."""
-        return look_up(nearest_places(self.positions), frames)
 
     def frame_name(self, i: int) -> str:
         return self.traverse.frame_name(int(self.frame[i]))
