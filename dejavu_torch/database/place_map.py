@@ -88,6 +88,10 @@ class PlaceMap(nn.Module, ABC):
             )
         return place_of(self.positions, frames) if len(self.positions) else frames
 
+    def scored(self, places: Tensor) -> Tensor:
+        """Of the places that show one frame, the one nearest to it: what a ground truth in frames counts."""
+        return self.place_of(self.frame_of(places))
+
     @property
     def borders(self) -> Tensor:
         """(N+1,) int64, the reference frame with which each place begins, and the number of frames."""

@@ -108,7 +108,7 @@ def plot_activations(
     """
     where = borders[layers[0].start : layers[0].stop]
     start, stop = int(where[0]), int(borders[layers[0].stop])
-    figure, rows = canvas(4.4 if strip is None else 5.2, len(layers) + 1 + (strip is not None), sharex=True)
+    figure, rows = canvas(4.2 if strip is None else 5, len(layers) + 1 + (strip is not None), sharex=True)
     axes = rows[-len(layers) - 1 :]
     if strip is not None:
         rows[0].imshow(pixels(strip), extent=(start, stop, 0, 1), aspect="auto")

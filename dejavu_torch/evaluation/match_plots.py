@@ -145,7 +145,7 @@ def plot_pairs(
     figure, axes = empty(sum(heights)), []
     parts = figure.subfigures(len(examples), 1, squeeze=False, height_ratios=heights)[:, 0]
     for part, heading, texts, shown in zip(parts, headings, titles, frames, strict=True):
-        part.suptitle(heading, x=0, ha="left", fontsize=9, weight="bold")
+        part.suptitle(heading, x=0.01, ha="left", fontsize=9, weight="bold")
         axes.append(part.subplots(1, columns, squeeze=False)[0])
         for axis, text, frame in zip(axes[-1], texts, shown, strict=False):
             show_frame(axis, frame, text)

@@ -62,6 +62,11 @@ class Localization(NamedTuple):
     tolerance: int
 
     @property
+    def scored(self) -> Match:
+        """The matches as the scores count them."""
+        return self.match._replace(index=self.model.map.scored(self.match.index))
+
+    @property
     def borders(self) -> Tensor:
         """(N+1,) the reference frame with which each place begins, and the number of frames."""
         return self.model.map.borders.cpu()
@@ -69,12 +74,9 @@ class Localization(NamedTuple):
     @property
     def query_frames(self) -> Tensor:
         """(Q,) the frame of its source that each query shows."""
-        return self.query.frame if isinstance(self.query, ResampledTraverse) else torch.arange(self.queries)
-
-    @property
-    def queries(self) -> int:
-        """Q, how many there are."""
-        return len(self.query_features)
+        if isinstance(self.query, ResampledTraverse):
+            return self.query.frame
+        return torch.arange(len(self.query_features))
 
     @property
     def unit(self) -> str:
@@ -94,7 +96,7 @@ def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dic
     """
     pictures = draw_pairs(run)
     pictures["coverage"] = Picture(
-        plot_coverage(run.match, run.truth, run.tolerance, run.borders, run.query_frames, run.unit),
+        plot_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit),
         "places reported",
         "Where along the route each query was found."
         + (" A query in its right place is green, in a wrong one red." if run.truth is not None else ""),
@@ -121,7 +123,7 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     """Some queries beside the frames found for them; nothing for ready features, or where none is found."""
     if not has_frames(run):
         return {}
-    examples = example_matches(run.match, run.truth, run.tolerance)
+    examples = example_matches(run.scored, run.truth, run.tolerance)
     frames = [
         [
             frame_at(run.query, one.query),
@@ -163,13 +165,13 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
     if matrix is None:
         return {}
     shares = []
-    if len(matrix.query) < run.queries:
+    if len(matrix.query) < len(run.query_features):
         shares.append(f"{len(matrix.query)} of the queries")
     if matrix.block > 1:
         shares.append(f"of {matrix.block} neighbouring places the one that fits best")
     return {
         "scores": Picture(
-            plot_score_matrix(matrix, run.match, run.truth, run.borders, run.query_frames),
+            plot_score_matrix(matrix, run.scored, run.truth, run.borders, run.query_frames),
             "how well each place fits each query",
             "Dark: the place fits the query about as well as its best one does. What repeats shows as lines "
             "beside the right places." + (f" Drawn: {'; '.join(shares)}." if shares else ""),
@@ -293,13 +295,13 @@ def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture
         return {}
     layers = [plan[j] for j in chosen]
     start, stop = layers[0].start, layers[0].stop
-    query, places, rates = run.queries // 2, [], None
+    query, places, rates = len(queries) // 2, [], None
     if truth is not None:
         query = nearest_query(truth, (start + stop) / 2)
         right = truth.positives[query].tolist() if truth.judged[query] else []
         places = [place for place in right if start <= place < stop]
         best = [best_phases(route, queries, j) for j in chosen]
-        rates = activation_rates(layers, best, run.match.index, truth, run.tolerance, route.places)
+        rates = activation_rates(layers, best, run.scored.index, truth, run.tolerance, route.places)
     one = queries[query : query + 1]
     scores = [layer_distances(route, one, j)[0, plan[j].place_phases] for j in chosen]
     with torch.no_grad():
