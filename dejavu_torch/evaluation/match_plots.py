@@ -26,8 +26,8 @@ from dejavu_torch.evaluation.plots import (
     Plot,
     canvas,
     empty,
+    pixels,
     show_cells,
-    show_frame,
 )
 from dejavu_torch.types import GroundTruth, Match
 
@@ -48,6 +48,17 @@ class Example(NamedTuple):
     right: int = -1
 
 
+class Row(NamedTuple):
+    """Frames (C,H,W) beside each other, and what stands above them.
+
+    heading: above all of them, or nothing. titles: above each; one more says what is missing.
+    """
+
+    heading: str
+    titles: Sequence[str]
+    frames: Sequence[Tensor]
+
+
 class ScoreMatrix(NamedTuple):
     """Scores of queries at places, small enough to draw.
 
@@ -60,26 +71,34 @@ class ScoreMatrix(NamedTuple):
     block: int
 
 
-def plot_frames(first: Tensor, second: Tensor, numbers: Sequence[tuple[int, int]]) -> Plot:
-    """Frames of both traverses at the same places (figures 5 to 7 of the paper).
-
-    Shape: first, second (K,C,H,W) in [0,1]; numbers: of each frame, K pairs.
-    """
-    height, width = first.shape[-2:]
-    most = max(1, min(len(numbers), round(1 + height / width)))  # wide frames need room
-    columns = next(n for n in range(most, 0, -1) if len(numbers) % n == 0)
-    rows = -(-len(numbers) // columns)
-    side = WIDTH / columns * height / width
-    figure, axes = canvas(2 * rows * (side + 1.5 * LINE), 2 * rows, columns, squeeze=False)
-    for k, pair in enumerate(numbers):
-        names = zip((first, second), ("reference", "second"), pair, strict=True)
-        for below, (frames, name, number) in enumerate(names):
-            show_frame(axes[2 * (k // columns) + below, k % columns], frames[k], f"{name}, frame {number}")
-    return figure, axes
+def plot_rows(rows: Sequence[Row]) -> Plot:
+    """Rows of frames, such as queries beside what was found."""
+    columns = max(len(row.titles) for row in rows)
+    letters, heights, texts = LETTERS // columns, [], []
+    for heading, titles, frames in rows:
+        wrapped = ["\n".join(fill(line, letters) for line in title.split("\n")) for title in titles]
+        lines = max(text.count("\n") for text in wrapped)
+        texts.append([text + "\n" * (lines - text.count("\n")) for text in wrapped])
+        lines += 1 + bool(heading) * len(fill(heading, LETTERS).split("\n"))
+        side = max(frame.shape[1] / frame.shape[2] for frame in frames)
+        heights.append(WIDTH / columns * side + lines * LINE)
+    figure, axes = empty(sum(heights)), []
+    parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for part, row, titles in zip(parts, rows, texts, strict=True):
+        if row.heading:
+            part.suptitle(fill(row.heading, LETTERS), x=0.01, ha="left", fontsize=9, weight="bold")
+        axes.append(part.subplots(1, columns, squeeze=False)[0])
+        for axis in axes[-1]:
+            axis.set_axis_off()
+        for axis, title in zip(axes[-1], titles, strict=False):
+            axis.set_title(title, loc="left", fontsize=9, pad=3)
+        for axis, frame in zip(axes[-1], row.frames, strict=False):
+            axis.imshow(pixels(frame))
+    return figure, np.stack(axes)
 
 
 def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> list[Example]:
-    """The queries that `plot_pairs` shows: the surest right, the surest wrong, and one at the threshold.
+    """The queries that a report shows: the surest right, the surest wrong, and one at the threshold.
 
     The last is the surest that the threshold rejects, or, where it rejects none, the least sure of all.
     Without ground truth the surest of all stands for the first two. A query that is several of these is one
@@ -119,48 +138,6 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
         text = f"{', '.join(whys)}, score {float(match.score[query]):.3g}"
         examples.append(Example(text, query, place, nearest))
     return examples
-
-
-def plot_pairs(
-    examples: Sequence[Example],
-    frames: Sequence[Sequence[Tensor]],
-    label: Callable[[str, int], str] = lambda kind, number: f"{kind} {number}",
-) -> Plot:
-    """Queries beside the reference frames that were reported for them, and those that are right.
-
-    Args:
-        examples: see `example_matches`; a row each.
-        frames: for each the frames (C,H,W) of the query, of the reported place and, where it is known, of the
-            right place.
-        label: what to call a query or a place, from its kind ("query" or "place") and number.
-    """
-    columns = max(len(row) for row in frames)
-    sides = [max(frame.shape[1] / frame.shape[2] for frame in row) for row in frames]
-    headings = [fill(one.why, LETTERS) for one in examples]
-    titles = [_titles(one, label, LETTERS // columns) for one in examples]
-    heights = [
-        WIDTH / columns * side + (2 + heading.count("\n") + row[0].count("\n")) * LINE
-        for side, heading, row in zip(sides, headings, titles, strict=True)
-    ]
-    figure, axes = empty(sum(heights)), []
-    parts = figure.subfigures(len(examples), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for part, heading, texts, shown in zip(parts, headings, titles, frames, strict=True):
-        part.suptitle(heading, x=0.01, ha="left", fontsize=9, weight="bold")
-        axes.append(part.subplots(1, columns, squeeze=False)[0])
-        for axis, text, frame in zip(axes[-1], texts, shown, strict=False):
-            show_frame(axis, frame, text)
-        for axis in axes[-1][len(shown) :]:
-            axis.set_axis_off()
-    return figure, np.stack(axes)
-
-
-def _titles(one: Example, label: Callable[[str, int], str], letters: int) -> list[str]:
-    """What stands above the query, the place reported and the right one, in equally many lines."""
-    right = "none is known" if one.right < 0 else label("place", one.right)
-    names = {"query": label("query", one.query), "reported": label("place", one.place), "right": right}
-    texts = [f"{what}:\n{fill(name, letters)}" for what, name in names.items()]
-    most = max(text.count("\n") for text in texts)
-    return [text + "\n" * (most - text.count("\n")) for text in texts]
 
 
 def score_matrix(

@@ -21,10 +21,10 @@ from dejavu_torch.evaluation.feature_plots import (
 )
 from dejavu_torch.evaluation.map_plots import plot_activations, plot_chunks, plot_layers
 from dejavu_torch.evaluation.match_plots import (
+    Row,
     example_matches,
     plot_coverage,
-    plot_frames,
-    plot_pairs,
+    plot_rows,
     plot_score_matrix,
     score_matrix,
 )
@@ -124,15 +124,19 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     if not has_frames(run):
         return {}
     examples = example_matches(run.scored, run.truth, run.tolerance)
-    frames = [
-        [
-            frame_at(run.query, one.query),
-            *(frame_at(run.reference, place) for place in (one.place, one.right) if place >= 0),
-        ]
-        for one in examples
-    ]
     if not examples:
         return {}
+    rows = []
+    for one in examples:
+        titles = [f"query:\n{_name(run.query, run.query_frames[one.query])}"]
+        titles.append(f"reported:\n{_name(run.reference, run.borders[one.place])}")
+        frames = [frame_at(run.query, one.query), frame_at(run.reference, one.place)]
+        if one.right >= 0:
+            titles.append(f"right:\n{_name(run.reference, run.borders[one.right])}")
+            frames.append(frame_at(run.reference, one.right))
+        elif run.truth is not None:
+            titles.append("right:\nnone is known")
+        rows.append(Row(one.why, titles, frames))
     known = "" if run.truth is None else ", and at the right what it should have been"
     last = (
         "First above the threshold: the best match that the threshold rejects."
@@ -141,7 +145,7 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     )
     return {
         "pairs": Picture(
-            plot_pairs(examples, frames, lambda kind, number: frame_label(run, kind, number)),
+            plot_rows(rows),
             "queries and what was found",
             f"A query, beside it the reference frame of the place reported{known}. The lower the score, the "
             f"surer the match. {last}",
@@ -149,11 +153,9 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     }
 
 
-def frame_label(run: Localization, kind: str, number: int) -> str:
+def _name(traverse: Traverse, frame: Tensor) -> str:
     """A query or a place by what matches.csv calls it: the frame of its source, and the frame's name."""
-    traverse, table = (run.query, run.query_frames) if kind == "query" else (run.reference, run.borders)
-    frame = int(table[number])
-    return f"frame {frame} {source_of(traverse).frame_name(frame)}".strip()
+    return f"frame {frame} {source_of(traverse).frame_name(int(frame))}".strip()
 
 
 def draw_scores(run: Localization) -> dict[str, Picture]:
@@ -332,11 +334,13 @@ def paper_pictures(run: Localization) -> dict[str, Picture]:
         middles = [len(run.reference_features) * (k + 0.5) / EXAMPLES for k in range(EXAMPLES)]
         queries = [nearest_query(run.truth, middle) for middle in middles]
         places = run.truth.positives[queries].amax(1)
-        first = torch.stack([frame_at(run.reference, place) for place in places.tolist()])
-        second = torch.stack([frame_at(run.query, query) for query in queries])
-        numbers = zip(run.borders[places].tolist(), run.query_frames[queries].tolist(), strict=True)
+        rows = []
+        for place, query in zip(places.tolist(), queries, strict=True):
+            numbers = run.borders[place], run.query_frames[query]
+            titles = [f"{name}, frame {n}" for name, n in zip(("reference", "second"), numbers, strict=True)]
+            rows.append(Row("", titles, [frame_at(run.reference, place), frame_at(run.query, query)]))
         pictures["frames"] = Picture(
-            plot_frames(first, second, list(numbers)),
+            plot_rows(rows),
             "the route",
             "The same places on the reference and on the second traverse.",
         )

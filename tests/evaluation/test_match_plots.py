@@ -8,10 +8,10 @@ from drawn import matched, render, texts
 
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
+    Row,
     example_matches,
     plot_coverage,
-    plot_frames,
-    plot_pairs,
+    plot_rows,
     plot_score_matrix,
     score_matrix,
 )
@@ -61,9 +61,14 @@ def test_coverage_without_truth_or_of_one_query() -> None:
 
 @pytest.mark.parametrize(("channels", "height", "width"), [(1, 32, 32), (3, 32, 64), (3, 20, 100)])
 def test_frames_of_any_shape(channels: int, height: int, width: int) -> None:
-    frames = torch.rand(4, channels, height, width)
-    figure, _ = plot_frames(frames, 1 - frames, [(1, 2), (5, 5), (9, 8), (13, 13)])
-    assert {"reference, frame 1", "second, frame 2", "second, frame 8"} <= set(texts(figure))
+    frames = torch.rand(2, channels, height, width)
+    titles = ["reference, frame 1", "second, frame 2"]
+    figure, axes = plot_rows([Row("", titles, list(frames))] * 3)
+    assert axes.shape == (3, 2)
+    assert set(titles) <= set(texts(figure))
+    image = render(figure)
+    shown = image.width * 3 * height / (2 * width)
+    assert shown < image.height < 1.2 * shown + 300  # little room that is empty
 
 
 def found(index: list[int], score: list[float], below: float = 10.0) -> Match:
@@ -106,18 +111,21 @@ def test_the_right_place_shown_is_the_nearest_to_the_one_reported() -> None:
     assert example.right == 90
 
 
-def test_pairs_show_query_reported_and_right_place_side_by_side() -> None:
-    examples = example_matches(found([0, 9], [0.1, 0.2]), as_ground_truth(torch.arange(2)[:, None]), 0)
-    frames = [[torch.rand(3, 8, 12), torch.rand(1, 16, 16), torch.rand(1, 16, 16)] for _ in examples]
-    figure, axes = plot_pairs(examples, frames)
-    assert {"query:\nquery 0", "reported:\nplace 9", "right:\nplace 1"} <= {
+def test_rows_show_frames_side_by_side_under_their_titles() -> None:
+    frames = [torch.rand(3, 8, 12), torch.rand(1, 16, 16), torch.rand(1, 16, 16)]
+    titles = ["query:\nframe 0", "reported:\nframe 9 of_a_long_name_0009.png", "right:\nframe 1"]
+    missing = [*titles[:2], "right:\nnone is known"]
+    figure, axes = plot_rows([Row("surest answer", titles, frames), Row("other", missing, frames[:2])])
+    assert {"surest answer", "other", "query:\nframe 0", "right:\nnone is known"} <= {
         text.strip() for text in texts(figure)
     }
-    for row, shown in zip(axes, frames, strict=True):
-        for axis, frame in zip(row, shown, strict=True):
-            pixels = torch.as_tensor(axis.images[0].get_array())
-            assert torch.equal(pixels, frame.expand(3, -1, -1).permute(1, 2, 0))
-    assert plot_pairs(examples, [row[:2] for row in frames])[1].shape == (2, 2)
+    for axis, frame in zip(axes[0], frames, strict=True):
+        assert torch.equal(
+            torch.as_tensor(axis.images[0].get_array()), frame.expand(3, -1, -1).permute(1, 2, 0)
+        )
+    assert not axes[1, 2].images
+    assert len({axis.get_title(loc="left").count("\n") for axis in axes[0]}) == 1
+    assert "".join(axes[0, 1].get_title(loc="left").split()) == "".join(titles[1].split())  # wrapped
 
 
 def test_the_score_matrix_holds_block_minima_of_scaled_scores() -> None:
