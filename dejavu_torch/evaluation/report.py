@@ -96,7 +96,7 @@ def text_table(rows: list[list[str]]) -> str:
 def headline(report: Report) -> str:
     """What was done and how good it is, in plain words."""
     facts, scores = report.facts, report.ours.scores
-    text = f"{facts['queries']} query frames were looked up"
+    text = f"{facts['queries']} queries were looked up"
     text += f" on a map of {facts['frames']} places" if "frames" in facts else ""
     if scores is None:
         return f"{text}. There is no ground truth, so nothing is scored: see the matches and the pictures."
@@ -107,9 +107,7 @@ def headline(report: Report) -> str:
     baseline = report.contenders.get("uncompressed")
     if baseline and baseline.scores and baseline.bytes and report.ours.bytes and "frames" in facts:
         ours, full = (size / facts["frames"] for size in (report.ours.bytes, baseline.bytes))
-        text += (
-            f" The map takes {ours:.0f} bytes per place. The features of all frames would take {full:.0f} "
-        )
+        text += f" The map takes {ours:.0f} bytes per place. The features as they are would take {full:.0f} "
         text += f"and find {percent(baseline.scores.recall_at_1)}."
     return text
 

@@ -207,7 +207,7 @@ def _check_places(route: PlaceMap, name: str, places: int) -> None:
 
 def of_shown_frames(match: Match, route: PlaceMap) -> Match:
     """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
-    return match._replace(index=route.place_of(route.frame_of(match.index)))
+    return match._replace(index=route.scored(match.index))
 
 
 def _contenders(run: Localization, seed: int, leave_out: int | None, progress: bool) -> dict[str, Contender]:

@@ -102,7 +102,9 @@ def evaluate_file(
         "torch": torch.__version__,
     }
     ours = contend(matches.name, match, known, tolerance)
-    pictures = _pictures(ours, queries, match, known, tolerance, places, unit)
+    seen = places or 1 + max(int(table.max()) for table in (match.index, known.positives))
+    borders = torch.arange(seen + 1) if place_map is None else place_map.borders
+    pictures = _pictures(ours, queries, match, known, tolerance, borders, unit)
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
 
 
@@ -112,11 +114,9 @@ def _pictures(
     match: Match,
     truth: GroundTruth,
     tolerance: int,
-    places: int | None,
+    borders: Tensor,
     unit: str,
 ) -> dict[str, Picture]:
-    if places is None:
-        places = 1 + max(int(table.max()) for table in (match.index, truth.positives))
     return {
         "pr": Picture(
             plot_curves({"map": ours}, f"right within {tolerance} {unit}"),
@@ -125,7 +125,7 @@ def _pictures(
             "as the threshold rises.",
         ),
         "coverage": Picture(
-            plot_coverage(match, truth, tolerance, places, queries),
+            plot_coverage(match, truth, tolerance, borders, queries, unit),
             "places reported",
             "Where along the route each query was found. In its right place it is green, in a wrong one red.",
         ),

@@ -199,16 +199,16 @@ class GivenChunks(SpectrogramAnalysis):
         super().__init__(**settings)
         self.cuts = list(cuts)
 
-    def chunks(self, frames: int) -> list[tuple[int, int]]:
-        """The chunks [start, stop) of a traverse of `frames` frames."""
+    def chunks(self, places: int) -> list[tuple[int, int]]:
+        """The chunks [start, stop) of a route of so many places."""
         shortest = 2 * self.min_period
-        if frames < shortest:
-            raise InputError(f"the traverse has {frames} frames; expected at least {shortest}, two periods")
+        if places < shortest:
+            raise InputError(f"the route has {places} places; expected at least {shortest}, two periods")
         edges = [0]
         for cut in self.cuts:
-            if edges[-1] + shortest <= cut <= frames - shortest:
+            if edges[-1] + shortest <= cut <= places - shortest:
                 edges.append(cut)
-        return list(pairwise([*edges, frames]))
+        return list(pairwise([*edges, places]))
 
 
 class BoundaryEffect(NamedTuple):

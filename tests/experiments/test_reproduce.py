@@ -263,7 +263,7 @@ def test_given_chunks_end_at_the_cuts() -> None:
     assert GivenChunks([40, 100], min_period=8).chunks(160) == [(0, 40), (40, 100), (100, 160)]
     # pieces under two of the shortest periods join the piece before
     assert GivenChunks([5, 40, 50, 150], min_period=8).chunks(160) == [(0, 40), (40, 160)]
-    with refused("10 frames", "at least 16"):
+    with refused("10 places", "at least 16"):
         GivenChunks([5], min_period=8).chunks(10)
 
 
