@@ -7,9 +7,11 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import NoReturn
+
+from dejavu_torch import __version__
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -17,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     Environment: OMP_NUM_THREADS, how many threads torch computes with. Unless OMP_WAIT_POLICY says otherwise
         they sleep while they wait for each other: spinning, which is the default of most builds, takes the
-        cores from the work where other programs run too, and makes small operations many times slower.
+        cores from other programs.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
     logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
@@ -32,13 +34,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(given: Sequence[str]) -> None:
     """Run a command line; what it gets wrong is one line on stderr and exit status 2."""
     from dejavu_torch.cli.commands import COMMANDS
-    from dejavu_torch.cli.parser import COMMAND, UsageError, overview, parse
+
+    if not given or given[0] not in COMMANDS:
+        overview(given[0] if given else "--help", COMMANDS)
+    from dejavu_torch.cli.parser import COMMAND, UsageError, parse  # torch, which takes seconds to import
     from dejavu_torch.cli.presets import with_configs
     from dejavu_torch.types import InputError
 
     try:
-        if not given or given[0] not in COMMANDS:
-            overview(COMMANDS).parse_args(given or ["--help"])  # helps or refuses, and exits
         name, words = given[0], with_configs(given[1:])
         if name == "train":  # Lightning's own command line
             from dejavu_torch.cli.train import run_train
@@ -58,6 +61,20 @@ def run(given: Sequence[str]) -> None:
     except KeyboardInterrupt:
         print("dejavu: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def overview(word: str, commands: Mapping[str, Callable[..., None]]) -> NoReturn:
+    """What there is, where the first word is no command, and exit."""
+    if word == "--version":
+        print(f"dejavu_torch {__version__}")
+    elif word in ("--help", "-h"):
+        print("usage: dejavu COMMAND ...\n\nPlace recognition from repeating features.\n\ncommands:")
+        for name, function in commands.items():
+            print(f"  {name:<10}  {(function.__doc__ or '').partition(chr(10))[0]}")
+        print("\n`dejavu COMMAND --help` shows its options, `dejavu --version` the version.")
+    else:
+        fail(f"{word} is no command; expected one of {', '.join(commands)} (see --help)")
+    raise SystemExit(0)
 
 
 def _spelt_out(words: Sequence[str]) -> list[str]:

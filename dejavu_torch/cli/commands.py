@@ -1,6 +1,6 @@
 """What the commands do: each a thin skin over functions, whose docstring is its help.
 
-Only what every command needs is imported above: the rest, such as matplotlib, when a command runs.
+Each imports what it needs when it runs: `dejavu --help` loads not even torch.
 """
 
 from __future__ import annotations
@@ -10,20 +10,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch import nn
-
-from dejavu_torch.data.files import check_output_file, make_output_folder
-from dejavu_torch.data.source import open_source
-from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.ground_plane import check_corners
-from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.types import InputError, Match, Traverse
-
 if TYPE_CHECKING:
+    from torch import nn
+
     from dejavu_torch.evaluation.report import Report
     from dejavu_torch.experiments.compare import Comparison
-
-KEPT_MAP = "map.safetensors"  # in the folder of a report
+    from dejavu_torch.model import DejaVu
+    from dejavu_torch.types import Match, Traverse
 
 
 def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, command: str) -> None:
@@ -33,14 +26,15 @@ def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, c
         out: folder for report and pictures
         seed: which route
     """
+    from dejavu_torch.data.files import check_output_folder
+    from dejavu_torch.data.source import open_source
     from dejavu_torch.experiments.compare import compare
 
-    make_output_folder(out)
+    check_output_folder(out)
     reference = open_source(f"sim:aerial?seed={seed}")
     query = open_source(f"sim:aerial?seed={seed}&traverse=1")
     print(f"learning {reference.name}, then finding {query.name} on it")
     result = compare(reference, query, model=model, progress=True)
-    result.model.save(out / KEPT_MAP)
     _publish(result, out, "dejavu demo: the built-in route", command)
 
 
@@ -52,6 +46,12 @@ def run_learn(source: str, *, map: Path, model: DejaVu) -> None:
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
         map: map file to write (.safetensors)
     """
+    from dejavu_torch.data.files import check_output_file
+    from dejavu_torch.data.source import open_source
+    from dejavu_torch.types import InputError
+
+    if map.suffix != ".safetensors":
+        raise InputError(f"--map {map} is no name of a map; expected {map.with_suffix('.safetensors')}")
     check_output_file(map)
     traverse = model.resample(open_source(source), progress=True)
     _print_steps(traverse)
@@ -85,6 +85,12 @@ def run_localize(
         as_is: take the frames as they are, though the map's are resampled
         features: class of the map's features, if not ours
     """
+    from dejavu_torch.data.files import check_output_file
+    from dejavu_torch.data.source import open_source
+    from dejavu_torch.model import DejaVu
+    from dejavu_torch.motion.ground_plane import check_corners
+    from dejavu_torch.types import InputError
+
     check_output_file(out)
     model = DejaVu.load(map, features)
     if corners is not None:
@@ -136,15 +142,17 @@ def run_compare(
         leave_out: diagnostic, the reference on itself with this many frames to each side left out
         map: evaluate this map of the reference, with its own settings, instead of learning one
     """
+    from dejavu_torch.data.source import open_source
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
+    from dejavu_torch.model import DejaVu
 
     if map is not None:
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
         model.threshold = model.threshold if given.threshold is None else given.threshold
     sources = open_source(reference), open_source(query)
-    _make_report_folder(out, reference, query)
+    _check_report_folder(out, reference, query)
     result = compare(
         *sources,
         truth,
@@ -154,9 +162,7 @@ def run_compare(
         interpolate=interpolate,
         progress=True,
     )
-    if map is None or map.resolve() != (out / KEPT_MAP).resolve():
-        result.model.save(out / KEPT_MAP)
-    _publish(result, out, f"{query} found on {reference}", command)
+    _publish(result, out, f"{query} found on {reference}", command, map)
 
 
 def run_evaluate(
@@ -183,12 +189,15 @@ def run_evaluate(
         query: as --reference, of the queries
         map: says how many frames there are, and which place each of them is where the map's are resampled
     """
+    from dejavu_torch.data.files import make_output_folder
+    from dejavu_torch.data.source import open_source
     from dejavu_torch.evaluation.report import write_report
     from dejavu_torch.experiments.evaluate import evaluate_file
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
-    _make_report_folder(out, reference, query)
+    _check_report_folder(out, reference, query)
     result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map)
+    make_output_folder(out)
     write_report(out, result.report, result.pictures, f"{matches} evaluated by {truth}", command)
     _print_scores(result.report, out)
 
@@ -204,6 +213,7 @@ def run_reproduce(
         seed: which routes
         tolerance: right within this many places, inclusive
     """
+    from dejavu_torch.data.files import check_output_folder, make_output_folder
     from dejavu_torch.evaluation.report import text_table, write_index, write_report
     from dejavu_torch.experiments.paper_tables import (
         FOOTAGE,
@@ -213,17 +223,21 @@ def run_reproduce(
         section_five,
     )
     from dejavu_torch.experiments.reproduce import lengths_picture, reproduce
+    from dejavu_torch.types import InputError
 
+    if dataset not in ("all", *PUBLISHED):
+        raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(PUBLISHED)} or all")
     names = list(PUBLISHED) if dataset == "all" else [dataset]
-    make_output_folder(out)
+    check_output_folder(out)
     reports: dict[str, Report] = {}
     for name in names:
         print(f"{name}: a second traverse, the database itself, chunks of other lengths", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
         make_output_folder(out / name)
-        title, plan = f"dejavu reproduce: {name}", str(result.model.summary())
+        run, title = result.run, f"dejavu reproduce: {name}"
+        plan = str(run.model.summary())
         write_report(out / name, result.report, result.pictures, title, command, plan)
-        _write_matches(out / name / "matches.csv", [result.match], result.query, result.model)
+        _write_matches(out / name / "matches.csv", [run.match], run.query, run.model)
         reports[name] = result.report
     rows, notes = section_five(reports), [*route_lines(reports), *boundary_lines(reports), FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
@@ -257,6 +271,7 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
         features: class of the map's features, if not ours
     """
     from dejavu_torch.database.l1 import l1_backend
+    from dejavu_torch.model import DejaVu
     from dejavu_torch.periods.stft import BACKEND
 
     model = DejaVu.load(map, features)
@@ -298,14 +313,19 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
-def _make_report_folder(out: Path, *sources: str | None) -> None:
-    """Make the folder of a report, which must not be where images lie."""
+def _check_report_folder(out: Path, *sources: str | None) -> None:
+    """Refuse early a folder that cannot be made or written in, or where images lie."""
+    from dejavu_torch.data.files import check_output_folder
+    from dejavu_torch.types import InputError
+
     if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
         raise InputError(f"{out} holds the images; expected another folder for the report")
-    make_output_folder(out)
+    check_output_folder(out)
 
 
 def _print_steps(traverse: Traverse) -> None:
+    from dejavu_torch.motion.resampling import ResampledTraverse
+
     if isinstance(traverse, ResampledTraverse):
         steps = f"even steps of {traverse.step:.4g} pixels of ground"
         print(f"{len(traverse.positions)} frames make {traverse.length} {steps}")
@@ -322,21 +342,31 @@ def _print_next(*words: str | Path) -> None:
     print(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
 
-def _publish(result: Comparison, out: Path, title: str, command: str) -> None:
-    """Write matches and report of a comparison, and print its scores."""
+def _publish(result: Comparison, out: Path, title: str, command: str, given: Path | None = None) -> None:
+    """Write map, matches and report of a comparison, and print its scores.
+
+    Args:
+        given: file of the map, where it was not learned.
+    """
+    from dejavu_torch.data.files import make_output_folder
     from dejavu_torch.evaluation.report import write_report
 
-    _print_map(result.model)
-    if result.report.ours.scores is None:
+    run, kept = result.run, out / "map.safetensors"
+    _print_map(run.model)
+    if run.truth is None:
         print("nothing tells which places are right, see --truth: matches and pictures, no scores")
-    _write_matches(out / "matches.csv", [result.match], result.query, result.model)
-    write_report(out, result.report, result.pictures, title, command, str(result.model.summary()))
+    make_output_folder(out)
+    if given is None or given.resolve() != kept.resolve():
+        run.model.save(kept)
+    _write_matches(out / "matches.csv", [run.match], run.query, run.model)
+    write_report(out, result.report, result.pictures, title, command, str(run.model.summary()))
     _print_scores(result.report, out)
 
 
 def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model: DejaVu) -> tuple[int, int]:
     """Write the matches of a query that the map was asked for; returns how many (queries, accepted)."""
     from dejavu_torch.evaluation.matches import write_matches
+    from dejavu_torch.motion.resampling import ResampledTraverse
 
     frames, source = None, query
     if isinstance(query, ResampledTraverse):
@@ -347,7 +377,8 @@ def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model:
 def _print_scores(report: Report, out: Path) -> None:
     from dejavu_torch.evaluation.report import score_table, summary, text_table
 
-    if report.ours.scores is not None:
-        print(text_table(score_table(report)))
+    rows = score_table(report)
+    if rows:
+        print(text_table(rows))
     print(summary(report))
     print(f"next: open {out / 'index.html'}")

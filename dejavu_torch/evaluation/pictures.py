@@ -70,12 +70,7 @@ def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dic
         activations those that can be drawn, in this order.
     """
     pictures = draw_pairs(run)
-    pictures["coverage"] = Picture(
-        plot_coverage(run.match, run.truth, run.tolerance, run.model.map.places),
-        "places reported",
-        "Where along the route each query was found."
-        + (" A query in its right place is green, in a wrong one red." if run.truth is not None else ""),
-    )
+    pictures |= draw_coverage(run.match, run.truth, run.tolerance, run.model.map.places)
     pictures |= draw_scores(run) | draw_curves(contenders, run.tolerance) | draw_motion(run)
     if isinstance(run.model.map, TemplateMap):
         pictures |= draw_chunks(run.model.map)
@@ -133,6 +128,23 @@ def frame_label(run: Localization, kind: str, number: int) -> str:
     return f"{what} {number} {traverse.frame_name(number)}".strip()
 
 
+def draw_coverage(
+    match: Match, truth: GroundTruth | None, tolerance: int, places: int, queries: Tensor | None = None
+) -> dict[str, Picture]:
+    """The places reported, of `places` there are.
+
+    Args:
+        queries: (Q,) the number of each query; None is 0..Q-1.
+    """
+    picture = Picture(
+        plot_coverage(match, truth, tolerance, places, queries),
+        "places reported",
+        "Where along the route each query was found."
+        + (" A query in its right place is green, in a wrong one red." if truth is not None else ""),
+    )
+    return {"coverage": picture}
+
+
 def draw_scores(run: Localization) -> dict[str, Picture]:
     """The score matrix; nothing where the map has no layers."""
     model = run.model
@@ -156,26 +168,28 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
     }
 
 
-def draw_curves(contenders: Mapping[str, Contender], tolerance: int) -> dict[str, Picture]:
-    """Precision-recall curves and their areas; nothing where no contender has a curve."""
+def draw_curves(
+    contenders: Mapping[str, Contender], tolerance: int, unit: str = "places"
+) -> dict[str, Picture]:
+    """Precision-recall curves, and their areas side by side; nothing where no contender has a curve."""
     # leave_out has other queries
     curves = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
-    if not curves:
-        return {}
-    return {
-        "pr": Picture(
-            plot_curves(curves, f"right within {tolerance} places"),
+    pictures = {}
+    if curves:
+        pictures["pr"] = Picture(
+            plot_curves(curves, f"right within {tolerance} {unit}"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises. The higher and the further to the right, the better.",
-        ),
-        "auc": Picture(
+        )
+    if len(curves) > 1:
+        pictures["auc"] = Picture(
             plot_auc(curves),
             "area under each curve",
             "The curves above in one number each: this map, baselines that store frames, and nulls, in which "
             "nothing repeats. A curve starts at the queries of the best score; nothing counts to its left.",
-        ),
-    }
+        )
+    return pictures
 
 
 def draw_motion(run: Localization) -> dict[str, Picture]:
