@@ -17,7 +17,7 @@ from command_line import fails, frames, report_of, run, write_images
 from PIL import Image
 
 from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
-from dejavu_torch.cli.commands import COMMANDS
+from dejavu_torch.cli import COMMANDS
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.types import Training
 

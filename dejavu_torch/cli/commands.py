@@ -1,22 +1,27 @@
 """What the commands do: each a thin skin over functions, whose docstring is its help.
 
-Each imports what it needs when it runs: `dejavu --help` loads not even torch.
+Only what every command needs is imported above: the rest, such as matplotlib, when a command runs.
 """
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from torch import nn
+from torch import nn
 
+from dejavu_torch.data.files import check_output_file, check_output_folder, make_output_folder
+from dejavu_torch.data.source import open_source
+from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.ground_plane import check_corners
+from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.types import InputError, Match, Traverse
+
+if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report
     from dejavu_torch.experiments.compare import Comparison
-    from dejavu_torch.model import DejaVu
-    from dejavu_torch.types import Match, Traverse
 
 
 def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, command: str) -> None:
@@ -26,8 +31,6 @@ def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, c
         out: folder for report and pictures
         seed: which route
     """
-    from dejavu_torch.data.files import check_output_folder
-    from dejavu_torch.data.source import open_source
     from dejavu_torch.experiments.compare import compare
 
     check_output_folder(out)
@@ -46,10 +49,6 @@ def run_learn(source: str, *, map: Path, model: DejaVu) -> None:
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
         map: map file to write (.safetensors)
     """
-    from dejavu_torch.data.files import check_output_file
-    from dejavu_torch.data.source import open_source
-    from dejavu_torch.types import InputError
-
     if map.suffix != ".safetensors":
         raise InputError(f"--map {map} is no name of a map; expected {map.with_suffix('.safetensors')}")
     check_output_file(map)
@@ -85,12 +84,6 @@ def run_localize(
         as_is: take the frames as they are, though the map's are resampled
         features: class of the map's features, if not ours
     """
-    from dejavu_torch.data.files import check_output_file
-    from dejavu_torch.data.source import open_source
-    from dejavu_torch.model import DejaVu
-    from dejavu_torch.motion.ground_plane import check_corners
-    from dejavu_torch.types import InputError
-
     check_output_file(out)
     model = DejaVu.load(map, features)
     if corners is not None:
@@ -142,10 +135,8 @@ def run_compare(
         leave_out: diagnostic, the reference on itself with this many frames to each side left out
         map: evaluate this map of the reference, with its own settings, instead of learning one
     """
-    from dejavu_torch.data.source import open_source
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
-    from dejavu_torch.model import DejaVu
 
     if map is not None:
         given = model
@@ -189,8 +180,6 @@ def run_evaluate(
         query: as --reference, of the queries
         map: says how many frames there are, and which place each of them is where the map's are resampled
     """
-    from dejavu_torch.data.files import make_output_folder
-    from dejavu_torch.data.source import open_source
     from dejavu_torch.evaluation.report import write_report
     from dejavu_torch.experiments.evaluate import evaluate_file
 
@@ -213,7 +202,6 @@ def run_reproduce(
         seed: which routes
         tolerance: right within this many places, inclusive
     """
-    from dejavu_torch.data.files import check_output_folder, make_output_folder
     from dejavu_torch.evaluation.report import text_table, write_index, write_report
     from dejavu_torch.experiments.paper_tables import (
         FOOTAGE,
@@ -223,7 +211,6 @@ def run_reproduce(
         section_five,
     )
     from dejavu_torch.experiments.reproduce import lengths_picture, reproduce
-    from dejavu_torch.types import InputError
 
     if dataset not in ("all", *PUBLISHED):
         raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(PUBLISHED)} or all")
@@ -271,7 +258,6 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
         features: class of the map's features, if not ours
     """
     from dejavu_torch.database.l1 import l1_backend
-    from dejavu_torch.model import DejaVu
     from dejavu_torch.periods.stft import BACKEND
 
     model = DejaVu.load(map, features)
@@ -293,39 +279,14 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
     _print_next("localize", map, "QUERY", "--out", "matches.csv")
 
 
-def run_train(*arguments: str) -> None:
-    """Train features that repeat, end to end: fit, validate or test; see `dejavu train fit --help`."""
-    from dejavu_torch.cli import train  # Lightning, which takes seconds to import
-
-    train.run_train(arguments)
-
-
-COMMANDS: dict[str, Callable[..., None]] = {
-    "demo": run_demo,
-    "learn": run_learn,
-    "localize": run_localize,
-    "compare": run_compare,
-    "evaluate": run_evaluate,
-    "reproduce": run_reproduce,
-    "train": run_train,
-    "bench": run_bench,
-    "info": run_info,
-}
-
-
 def _check_report_folder(out: Path, *sources: str | None) -> None:
     """Refuse early a folder that cannot be made or written in, or where images lie."""
-    from dejavu_torch.data.files import check_output_folder
-    from dejavu_torch.types import InputError
-
     if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
         raise InputError(f"{out} holds the images; expected another folder for the report")
     check_output_folder(out)
 
 
 def _print_steps(traverse: Traverse) -> None:
-    from dejavu_torch.motion.resampling import ResampledTraverse
-
     if isinstance(traverse, ResampledTraverse):
         steps = f"even steps of {traverse.step:.4g} pixels of ground"
         print(f"{len(traverse.positions)} frames make {traverse.length} {steps}")
@@ -348,7 +309,6 @@ def _publish(result: Comparison, out: Path, title: str, command: str, given: Pat
     Args:
         given: file of the map, where it was not learned.
     """
-    from dejavu_torch.data.files import make_output_folder
     from dejavu_torch.evaluation.report import write_report
 
     run, kept = result.run, out / "map.safetensors"
@@ -366,7 +326,6 @@ def _publish(result: Comparison, out: Path, title: str, command: str, given: Pat
 def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model: DejaVu) -> tuple[int, int]:
     """Write the matches of a query that the map was asked for; returns how many (queries, accepted)."""
     from dejavu_torch.evaluation.matches import write_matches
-    from dejavu_torch.motion.resampling import ResampledTraverse
 
     frames, source = None, query
     if isinstance(query, ResampledTraverse):

@@ -8,7 +8,6 @@ from typing import Any, NoReturn
 
 import docstring_parser
 import jsonargparse
-from torch import nn
 
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
@@ -104,8 +103,7 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
     text = docstring_parser.parse(inspect.getdoc(function) or "")
     helps = {one.arg_name: one.description for one in text.params}
     parser = Parser(prog=f"dejavu {name}", description=text.description)
-    signature = inspect.signature(function, eval_str=True, locals={"DejaVu": DejaVu, "nn": nn})
-    for key, parameter in signature.parameters.items():
+    for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if key == COMMAND:
             continue
         if key == MODEL:

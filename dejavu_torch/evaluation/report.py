@@ -104,8 +104,8 @@ def headline(report: Report) -> str:
     text += f" on a map of {facts['frames']} places" if "frames" in facts else ""
     if scores is None:
         return (
-            f"{text}. There is no ground truth, so nothing is scored: see the matches and the pictures, or give "
-            "one, such as --truth 12 (place = query + 12) or --truth truth.csv (rows of query,place)."
+            f"{text}. There is no ground truth, so nothing is scored: see the matches and the pictures, or "
+            "give one, such as --truth 12 (place = query + 12) or --truth truth.csv (rows of query,place)."
         )
     text += (
         f": {percent(scores.recall_at_1)} were found in their right place (recall@1). Sorted by score, the "
