@@ -104,7 +104,7 @@ def test_compare_reports_any_kind() -> None:
     )
     report = result.report.as_json()
     assert (report["kind"], report["recall_at_1"], report["templates"]) == ("stored", 1.0, 0)
-    assert report["map_bytes"] == result.model.summary().map_bytes > report["route_bytes"] == 30 * 4 * 4
+    assert report["map_bytes"] == result.run.model.summary().map_bytes > report["route_bytes"] == 30 * 4 * 4
     assert {"uncompressed", "stride", "null"} <= report.keys()
     assert "null_same_plan" not in report
     assert {"pr", "coverage"} <= result.pictures.keys()

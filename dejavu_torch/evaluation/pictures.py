@@ -95,12 +95,7 @@ def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dic
         activations those that can be drawn, in this order.
     """
     pictures = draw_pairs(run)
-    pictures["coverage"] = Picture(
-        plot_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit),
-        "places reported",
-        "Where along the route each query was found."
-        + (" A query in its right place is green, in a wrong one red." if run.truth is not None else ""),
-    )
+    pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
     pictures |= draw_scores(run) | draw_curves(contenders, f"{run.tolerance} {run.unit}") | draw_motion(run)
     if isinstance(run.model.map, TemplateMap):
         pictures |= draw_chunks(run, run.model.map)
@@ -158,6 +153,19 @@ def _name(traverse: Traverse, frame: Tensor) -> str:
     return f"frame {frame} {source_of(traverse).frame_name(int(frame))}".strip()
 
 
+def draw_coverage(
+    match: Match, truth: GroundTruth | None, tolerance: int, borders: Tensor, queries: Tensor, unit: str
+) -> dict[str, Picture]:
+    """The places reported; see `plot_coverage`."""
+    picture = Picture(
+        plot_coverage(match, truth, tolerance, borders, queries, unit),
+        "places reported",
+        "Where along the route each query was found."
+        + (" A query in its right place is green, in a wrong one red." if truth is not None else ""),
+    )
+    return {"coverage": picture}
+
+
 def draw_scores(run: Localization) -> dict[str, Picture]:
     """The score matrix; nothing where the map has no layers."""
     model = run.model
@@ -182,30 +190,30 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
 
 
 def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
-    """Precision-recall curves and their areas; nothing where no contender has a curve.
+    """Precision-recall curves, and their areas side by side; nothing where no contender has a curve.
 
     Args:
         tolerance: with its unit.
     """
     # leave_out has other queries
     curves = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
-    if not curves:
-        return {}
-    return {
-        "pr": Picture(
+    pictures = {}
+    if curves:
+        pictures["pr"] = Picture(
             plot_curves(curves, f"right within {tolerance}"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises. The higher and the further to the right, the better.",
-        ),
-        "auc": Picture(
+        )
+    if len(curves) > 1:
+        pictures["auc"] = Picture(
             plot_auc(curves),
             "area under each curve",
             "The curves above in one number each: this map, baselines that store features as they are, and "
             "nulls, in which nothing repeats. A curve starts at the queries of the best score; nothing "
             "counts to its left.",
-        ),
-    }
+        )
+    return pictures
 
 
 def draw_motion(run: Localization) -> dict[str, Picture]:

@@ -155,13 +155,11 @@ class SpectrogramAnalysis(PeriodFinder):
                 f"two periods of {self.min_period}"
             )
         window = min(self.window, places)
-        if window < self.window:
-            if self.short == "refuse":
-                raise InputError(
-                    f"the route has {places} places; expected at least {self.window}, the window, "
-                    "or a shorter window, or short='shrink'"
-                )
-            self._warn_once(f"window shrunk from {self.window} to {places} places, the whole route")
+        if window < self.window and self.short == "refuse":
+            raise InputError(
+                f"the route has {places} places; expected at least {self.window}, the window, "
+                "or a shorter window, or short='shrink'"
+            )
         hop = min(self.hop or window, window)
         chunks = [(start, start + window) for start in range(0, places - window + 1, hop)]
         rest = chunks[-1][0] + hop
@@ -180,9 +178,13 @@ class SpectrogramAnalysis(PeriodFinder):
         Shape: features (N,D) -> plan, ordered by chunk and then by period.
         """
         check_features(features)
+        places = len(features)
+        chunks = self.chunks(places)
+        if chunks == [(0, places)] and places < self.window:
+            self._warn_once(f"window shrunk from {self.window} to {places} places, the whole route")
         layers = []
         with torch.no_grad():
-            for start, stop in self.chunks(len(features)):
+            for start, stop in chunks:
                 bins, share = self._strongest(features[start:stop])
                 if self._stands_out(share, start, stop):
                     layers += layers_of(bins, start, stop)
