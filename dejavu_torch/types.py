@@ -93,13 +93,14 @@ class FrequencyLayer:
     """Features that repeat with one period inside one chunk of the route (section III-A).
 
     Args:
-        period: tau, in frames; any positive rational, for example 93 or Fraction(195, 2).
+        period: tau, in places; any positive rational, for example 93 or Fraction(195, 2).
         phases: P, the number of templates per feature. The paper's case is phases = period.
-        start, stop: the chunk [start, stop) in reference frames.
+        start, stop: the chunk [start, stop) in places.
         features: the indices of the features that take part, increasing.
 
-    Convention: frames count from 0 and phase(i) = floor((i mod period) * phases / period)
-    counts from absolute frame 0, not from the start of the chunk.
+    Convention: a place is a frame of the reference, or an even step where frames were resampled
+    (section IV-B). phase(i) = floor((i mod period) * phases / period) counts from absolute place 0,
+    not from the start of the chunk.
     """
 
     period: Fraction
@@ -122,14 +123,14 @@ class FrequencyLayer:
                 "a layer's feature indices must be non-empty, non-negative and strictly increasing"
             )
 
-    def phase(self, frames: Tensor) -> Tensor:
-        """Phase of each frame, in exact integer arithmetic. (n,) int64 -> (n,) int64 in 0..P-1."""
+    def phase(self, places: Tensor) -> Tensor:
+        """Phase of each place, in exact integer arithmetic. (n,) int64 -> (n,) int64 in 0..P-1."""
         a, b = self.period.numerator, self.period.denominator
-        return (frames * b).remainder(a) * self.phases // a
+        return (places * b).remainder(a) * self.phases // a
 
     @property
     def place_phases(self) -> Tensor:
-        """Phase of every frame of the chunk, (stop - start,) int64."""
+        """Phase of every place of the chunk, (stop - start,) int64."""
         return self.phase(torch.arange(self.start, self.stop))
 
 

@@ -76,6 +76,7 @@ def test_evaluate_writes_a_report_and_says_what_was_judged(
     assert "AUC" in out
     assert "right within 2 frames" in out
     assert "3 of the queries are in the truth" in out
+    assert "2 of the queries have a right answer" in out
     report = report_of(tmp_path / "out")
     assert (report["queries"], report["judged"], report["unknown"], report["with_answer"]) == (84, 3, 81, 2)
     page = (tmp_path / "out" / "index.html").read_text()
@@ -262,22 +263,22 @@ def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -
     [
         ("compare a b --tolerance 5.0 --out x", ["tolerance", "5.0", "int"]),
         ("compare a b --threshold high --out x", ["threshold", "high", "float"]),
-        ("learn a --map b --preprocess.contrast high", ["contrast", "high", "patch", "clahe"]),
-        ("learn a --map b --preprocess.grid 2,2", ["grid", "2,2", "tuple"]),
-        ("learn a --map b --mapper.reduction avg", ["reduction", "avg", "mean", "sum"]),
-        ("learn a --map b --mapper.metric manhattan", ["manhattan", "l1", "l2", "cosine"]),
-        ("learn a --map b --mapper.periods.windw 3", ["windw"]),
-        ("learn a --map b --mapper.periods.window x", ["window", "x", "int"]),
-        ("learn a --map b --mapper.periods.window 3", ["window=3", "min_period"]),
-        ("learn a --map b --mapper Nowhere", ["mapper", "Nowhere"]),
-        ("learn a --map b --features nowhere.Net", ["features", "'nowhere'"]),
-        ("learn a --map b --features 3", ["features", "3", "import path"]),
-        ("learn a --map b --features torch.nn.Linear", ["features", "in_features"]),
-        ("learn a --map b --periods.window 3", ["--periods.window"]),
+        ("learn a --map b.safetensors --preprocess.contrast high", ["contrast", "high", "patch", "clahe"]),
+        ("learn a --map b.safetensors --preprocess.grid 2,2", ["grid", "2,2", "tuple"]),
+        ("learn a --map b.safetensors --mapper.reduction avg", ["reduction", "avg", "mean", "sum"]),
+        ("learn a --map b.safetensors --mapper.metric manhattan", ["manhattan", "l1", "l2", "cosine"]),
+        ("learn a --map b.safetensors --mapper.periods.windw 3", ["windw"]),
+        ("learn a --map b.safetensors --mapper.periods.window x", ["window", "x", "int"]),
+        ("learn a --map b.safetensors --mapper.periods.window 3", ["window=3", "min_period"]),
+        ("learn a --map b.safetensors --mapper Nowhere", ["mapper", "Nowhere"]),
+        ("learn a --map b.safetensors --features nowhere.Net", ["features", "'nowhere'"]),
+        ("learn a --map b.safetensors --features 3", ["features", "3", "import path"]),
+        ("learn a --map b.safetensors --features torch.nn.Linear", ["features", "in_features"]),
+        ("learn a --map b.safetensors --periods.window 3", ["--periods.window"]),
         ("learn a b --map c", ["b"]),
-        ("learn a", ["required", "map"]),
-        ("localize a", ["required", "source", "out"]),
-        ("evaluate", ["required", "matches", "truth", "out"]),
+        ("learn a", ["required: --map"]),
+        ("localize a", ["required: source, --out"]),
+        ("evaluate", ["required: matches, --truth, --out"]),
         ("reproduce mars --out x", ["'mars'", "aerial", "outdoor", "underground"]),
         ("bench dance --out x", ["'dance'", "matcher"]),
     ],

@@ -75,7 +75,7 @@ def test_compare_of_a_single_query_frame() -> None:
     one = ArrayTraverse(footage(torch.tensor([300])))
     there = int((REFERENCE - 300).abs().argmin())
     result = compare(ArrayTraverse(footage(REFERENCE)), one, str(there), model)
-    assert result.match.index.tolist() == [50]
+    assert result.run.match.index.tolist() == [50]
     assert result.report.as_json()["recall_at_1"] == 1.0
 
 

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from dejavu_torch import DejaVu, InputError
-from dejavu_torch.cli.commands import COMMANDS
+from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import find_config, preset_names, with_configs
 from dejavu_torch.database.recipe import recipe_of
@@ -26,7 +26,7 @@ PRESETS = ["default", "paper"]
 
 
 def model_of(name: str) -> DejaVu:
-    model = parse("learn", COMMANDS["learn"], with_configs(["x", "--map", "y", "--config", name]))["model"]
+    model = parse("learn", run_learn, with_configs(["x", "--map", "y", "--config", name]))["model"]
     assert isinstance(model, DejaVu)
     return model
 

@@ -421,12 +421,12 @@ def test_without_a_map(use: Any) -> None:
 @pytest.mark.parametrize("frames", [1, 2, 7])
 @pytest.mark.parametrize("make", [waves, pictures])
 def test_a_traverse_of_few_frames_is_refused(make: Any, frames: int) -> None:
-    with refused(f"{frames} frame", "expected at least 8"):
+    with refused(f"{frames} place", "expected at least 8"):
         wave_model().learn(make(frames))
 
 
 def test_the_paper_refuses_a_traverse_shorter_than_its_window() -> None:
-    with refused("72 frames", "1024"):
+    with refused("72 places", "1024"):
         template_model(periods=SpectrogramAnalysis(short="refuse")).learn(waves())
 
 

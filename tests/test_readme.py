@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
-from dejavu_torch.cli import train
-from dejavu_torch.cli.commands import COMMANDS
+from dejavu_torch.cli import commands, train
 from dejavu_torch.cli.parser import UsageError, command_parser
 from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features.cnn import SmallCNN
@@ -75,7 +74,7 @@ def understand(line: str) -> None:
         patch.chdir(ROOT)  # where the configs lie
         words = with_configs(words)
         if name != "train":
-            command_parser(name, COMMANDS[name]).parse_args(words)
+            command_parser(name, getattr(commands, f"run_{name}")).parse_args(words)
             return
         patch.setattr(train, "TrainCLI", ParseOnly)
         with pytest.raises(Understood):

@@ -11,13 +11,27 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NoReturn
 
+from dejavu_torch import __version__
+
+COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of commands.py, or train.py
+    "demo": "learn the built-in route, localize a second traverse of it, report",
+    "learn": "learn a map",
+    "localize": "find the frames of a source on a map",
+    "compare": "learn, localize and evaluate, beside baselines and null control",
+    "evaluate": "evaluate the matches in a csv, whatever found them",
+    "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
+    "train": "train features that repeat: fit, validate, test or export",
+    "bench": "time this package beside what a user would pick instead",
+    "info": "what is in a map",
+}
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `dejavu` command.
 
     Environment: OMP_NUM_THREADS, how many threads torch computes with. Unless OMP_WAIT_POLICY says otherwise
         they sleep while they wait for each other: spinning, which is the default of most builds, takes the
-        cores from the work where other programs run too, and makes small operations many times slower.
+        cores from other programs.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
     logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
@@ -26,26 +40,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # a user's own classes, as `python -m` finds them
-    run(given)
+    try:
+        run(given)
+    except KeyboardInterrupt:
+        print("dejavu: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def run(given: Sequence[str]) -> None:
     """Run a command line; what it gets wrong is one line on stderr and exit status 2."""
-    from dejavu_torch.cli.commands import COMMANDS
-    from dejavu_torch.cli.parser import COMMAND, UsageError, overview, parse
+    if not given or given[0] not in COMMANDS:
+        overview(given[0] if given else "--help")
+    from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
+    from dejavu_torch.cli.parser import COMMAND, UsageError, parse
     from dejavu_torch.cli.presets import with_configs
     from dejavu_torch.types import InputError
 
     try:
-        if not given or given[0] not in COMMANDS:
-            overview(COMMANDS).parse_args(given or ["--help"])  # helps or refuses, and exits
         name, words = given[0], with_configs(given[1:])
         if name == "train":  # Lightning's own command line
             from dejavu_torch.cli.train import run_train
 
             run_train([*words[:1], *_config_first(words[1:])])
             return
-        function = COMMANDS[name]
+        function = getattr(commands, f"run_{name}")
         chosen = parse(name, function, _config_first(_spelt_out(words)))
         if COMMAND in function.__annotations__:
             chosen[COMMAND] = shlex.join(["dejavu", *given])
@@ -55,9 +73,20 @@ def run(given: Sequence[str]) -> None:
         fail(f"{error} (with --config {' --config '.join(config)})" if config else f"{error} (see --help)")
     except (InputError, OSError) as error:
         fail(str(error))
-    except KeyboardInterrupt:
-        print("dejavu: interrupted", file=sys.stderr)
-        raise SystemExit(130) from None
+
+
+def overview(word: str) -> NoReturn:
+    """What there is, where the first word is no command, and exit."""
+    if word == "--version":
+        print(f"dejavu_torch {__version__}")
+    elif word in ("--help", "-h"):
+        print("usage: dejavu COMMAND ...\n\nPlace recognition from repeating features.\n\ncommands:")
+        for name, text in COMMANDS.items():
+            print(f"  {name:<10}  {text}")
+        print("\n`dejavu COMMAND --help` shows its options, `dejavu --version` the version.")
+    else:
+        fail(f"{word} is no command; expected one of {', '.join(COMMANDS)} (see --help)")
+    raise SystemExit(0)
 
 
 def _spelt_out(words: Sequence[str]) -> list[str]:

@@ -6,13 +6,13 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import nn
 
-from dejavu_torch.data.files import check_output_file, make_output_folder
+from dejavu_torch.data.files import check_output_file, check_output_folder, make_output_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
@@ -22,8 +22,6 @@ from dejavu_torch.types import InputError, Match, Traverse
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report
     from dejavu_torch.experiments.compare import Comparison
-
-KEPT_MAP = "map.safetensors"  # in the folder of a report
 
 
 def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, command: str) -> None:
@@ -35,12 +33,11 @@ def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, c
     """
     from dejavu_torch.experiments.compare import compare
 
-    make_output_folder(out)
+    check_output_folder(out)
     reference = open_source(f"sim:aerial?seed={seed}")
     query = open_source(f"sim:aerial?seed={seed}&traverse=1")
     print(f"learning {reference.name}, then finding {query.name} on it")
     result = compare(reference, query, model=model, progress=True)
-    result.model.save(out / KEPT_MAP)
     _publish(result, out, "dejavu demo: the built-in route", command)
 
 
@@ -52,6 +49,8 @@ def run_learn(source: str, *, map: Path, model: DejaVu) -> None:
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
         map: map file to write (.safetensors)
     """
+    if map.suffix != ".safetensors":
+        raise InputError(f"--map {map} is no name of a map; expected {map.with_suffix('.safetensors')}")
     check_output_file(map)
     traverse = model.resample(open_source(source), progress=True)
     _print_steps(traverse)
@@ -144,7 +143,7 @@ def run_compare(
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
         model.threshold = model.threshold if given.threshold is None else given.threshold
     sources = open_source(reference), open_source(query)
-    _make_report_folder(out, reference, query)
+    _check_report_folder(out, reference, query)
     result = compare(
         *sources,
         truth,
@@ -154,9 +153,7 @@ def run_compare(
         interpolate=interpolate,
         progress=True,
     )
-    if map is None or map.resolve() != (out / KEPT_MAP).resolve():
-        result.model.save(out / KEPT_MAP)
-    _publish(result, out, f"{query} found on {reference}", command)
+    _publish(result, out, f"{query} found on {reference}", command, map)
 
 
 def run_evaluate(
@@ -187,8 +184,9 @@ def run_evaluate(
     from dejavu_torch.experiments.evaluate import evaluate_file
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
-    _make_report_folder(out, reference, query)
+    _check_report_folder(out, reference, query)
     result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map)
+    make_output_folder(out)
     write_report(out, result.report, result.pictures, f"{matches} evaluated by {truth}", command)
     _print_scores(result.report, out)
 
@@ -214,16 +212,19 @@ def run_reproduce(
     )
     from dejavu_torch.experiments.reproduce import lengths_picture, reproduce
 
+    if dataset not in ("all", *PUBLISHED):
+        raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(PUBLISHED)} or all")
     names = list(PUBLISHED) if dataset == "all" else [dataset]
-    make_output_folder(out)
+    check_output_folder(out)
     reports: dict[str, Report] = {}
     for name in names:
         print(f"{name}: a second traverse, the database itself, chunks of other lengths", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
         make_output_folder(out / name)
-        title, plan = f"dejavu reproduce: {name}", str(result.model.summary())
+        run, title = result.run, f"dejavu reproduce: {name}"
+        plan = str(run.model.summary())
         write_report(out / name, result.report, result.pictures, title, command, plan)
-        _write_matches(out / name / "matches.csv", [result.match], result.query, result.model)
+        _write_matches(out / name / "matches.csv", [run.match], run.query, run.model)
         reports[name] = result.report
     rows, notes = section_five(reports), [*route_lines(reports), *boundary_lines(reports), FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
@@ -278,31 +279,11 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
     _print_next("localize", map, "QUERY", "--out", "matches.csv")
 
 
-def run_train(*arguments: str) -> None:
-    """Train features that repeat, end to end: fit, validate or test; see `dejavu train fit --help`."""
-    from dejavu_torch.cli import train  # Lightning, which takes seconds to import
-
-    train.run_train(arguments)
-
-
-COMMANDS: dict[str, Callable[..., None]] = {
-    "demo": run_demo,
-    "learn": run_learn,
-    "localize": run_localize,
-    "compare": run_compare,
-    "evaluate": run_evaluate,
-    "reproduce": run_reproduce,
-    "train": run_train,
-    "bench": run_bench,
-    "info": run_info,
-}
-
-
-def _make_report_folder(out: Path, *sources: str | None) -> None:
-    """Make the folder of a report, which must not be where images lie."""
+def _check_report_folder(out: Path, *sources: str | None) -> None:
+    """Refuse early a folder that cannot be made or written in, or where images lie."""
     if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
         raise InputError(f"{out} holds the images; expected another folder for the report")
-    make_output_folder(out)
+    check_output_folder(out)
 
 
 def _print_steps(traverse: Traverse) -> None:
@@ -322,15 +303,23 @@ def _print_next(*words: str | Path) -> None:
     print(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
 
-def _publish(result: Comparison, out: Path, title: str, command: str) -> None:
-    """Write matches and report of a comparison, and print its scores."""
+def _publish(result: Comparison, out: Path, title: str, command: str, given: Path | None = None) -> None:
+    """Write map, matches and report of a comparison, and print its scores.
+
+    Args:
+        given: file of the map, where it was not learned.
+    """
     from dejavu_torch.evaluation.report import write_report
 
-    _print_map(result.model)
-    if result.report.ours.scores is None:
+    run, kept = result.run, out / "map.safetensors"
+    _print_map(run.model)
+    if run.truth is None:
         print("nothing tells which places are right, see --truth: matches and pictures, no scores")
-    _write_matches(out / "matches.csv", [result.match], result.query, result.model)
-    write_report(out, result.report, result.pictures, title, command, str(result.model.summary()))
+    make_output_folder(out)
+    if given is None or given.resolve() != kept.resolve():
+        run.model.save(kept)
+    _write_matches(out / "matches.csv", [run.match], run.query, run.model)
+    write_report(out, result.report, result.pictures, title, command, str(run.model.summary()))
     _print_scores(result.report, out)
 
 
@@ -347,7 +336,8 @@ def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model:
 def _print_scores(report: Report, out: Path) -> None:
     from dejavu_torch.evaluation.report import score_table, summary, text_table
 
-    if report.ours.scores is not None:
-        print(text_table(score_table(report)))
+    rows = score_table(report)
+    if rows:
+        print(text_table(rows))
     print(summary(report))
     print(f"next: open {out / 'index.html'}")

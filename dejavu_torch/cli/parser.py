@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn
 
 import docstring_parser
 import jsonargparse
 
-from dejavu_torch import __version__
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
 
@@ -78,23 +77,20 @@ class Parser(jsonargparse.ArgumentParser):
         return super().parse_args(words, *rest, **settings)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        head, required, names = message.partition("required: ")
+        if required:
+            positional = [action.dest for action in self._actions if not action.option_strings]
+            needed = [
+                name if name in positional else f"--{name.partition('.')[2] or name}"  # behind fit.
+                for name in names.split(", ")
+            ]
+            message = f"{head}{required}{', '.join(needed)}"
         told = one_line(message)
         if ex is not None and len(told) > LONGEST // 2:  # a complaint for every type that could be meant
             *_, first = causes(ex)
             part = next((cause for cause in causes(ex) if isinstance(cause, UsageError)), first)
             told = one_line(f"{message.splitlines()[0]} {part}")
         raise UsageError(told if len(told) < LONGEST else f"{told[:LONGEST]} ...") from ex
-
-
-def overview(commands: Mapping[str, Callable[..., None]]) -> Parser:
-    """The parser of `dejavu` alone, which lists the commands."""
-    parser = Parser(prog="dejavu", description="Place recognition from repeating features.")
-    parser.add_argument("--version", action="version", version=f"dejavu_torch {__version__}")
-    subcommands = parser.add_subcommands(dest="command", metavar="COMMAND")
-    for name, function in commands.items():
-        text = docstring_parser.parse(function.__doc__ or "").short_description
-        subcommands.add_subcommand(name, Parser(), help=text)
-    return parser
 
 
 def command_parser(name: str, function: Callable[..., None]) -> Parser:
@@ -152,9 +148,11 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     if MODEL in function.__annotations__:
         settings = list(inspect.signature(DejaVu).parameters)
         changed = [one for one in settings if parsed[one] != parser.get_defaults()[one]]
-        kept = {"features", "threshold"}  # a map has all but these itself
-        if name == "compare" and arguments["map"] and not kept.issuperset(changed):
-            raise UsageError(f"--{min(set(changed) - kept)}: a --map has its own settings")
+        lost = set(changed) - {"features", "threshold"}  # a map has all but these itself
+        if name == "compare" and arguments["map"] and lost:
+            told = (word.lstrip("-").partition("=")[0].partition(".")[0] for word in words)
+            one = next((one for one in told if one in lost), "config")
+            raise UsageError(f"--{one}: a --map has its own settings; expected one or the other")
         arguments.pop("config")
         arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
     return arguments

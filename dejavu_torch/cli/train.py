@@ -8,15 +8,15 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, NoReturn
+from typing import Any
 
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning import Trainer
 from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
-from dejavu_torch.cli.parser import Parser, UsageError, refusal
-from dejavu_torch.data.files import make_output_folder
+from dejavu_torch.cli.parser import Parser, refusal
+from dejavu_torch.data.files import check_output_folder, make_output_folder
 from dejavu_torch.database.summary import describe
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport, load_weights
@@ -88,13 +88,6 @@ class MapTrainer(Trainer):
 class TrainParser(Parser, LightningArgumentParser):
     """Lightning's parser, whose errors are one line."""
 
-    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        head, required, names = message.partition("required: ")
-        if required:
-            needed = ["--" + name.partition(".")[2] for name in names.split(", ")]  # behind fit.
-            raise UsageError(f"{head}{required}{', '.join(needed)}") from ex
-        super().error(message, ex)
-
 
 class TrainCLI(LightningCLI):
     """fit writes DIR/map.safetensors; validate, test and export take a checkpoint."""
@@ -119,6 +112,11 @@ class TrainCLI(LightningCLI):
         parser.add_lightning_class_args(RouteData, "data")
         parser.add_lightning_class_args(MapTrainer, "trainer")
         parser.set_defaults({f"trainer.{name}": value for name, value in TRAINER.items()} | PARTS)
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Keep the words, for what to do next."""
+        self.words = list(args)
+        super().parse_arguments(parser, args)
 
     def before_instantiate_classes(self) -> None:
         """Validation is by steps, unless it is asked for by epochs or otherwise."""
@@ -162,7 +160,7 @@ class TrainCLI(LightningCLI):
         if asked["overfit_batches"]:
             raise InputError("trainer.overfit_batches does not fit; expected trainer.limit_train_batches")
         root = Path(self.trainer.default_root_dir)
-        make_output_folder(root)
+        check_output_folder(root)
         resumed = self.config[self.subcommand].get("ckpt_path")
         if not asked["fast_dev_run"] and (root / "map.safetensors").exists() and not resumed:
             log.warning("%s holds an earlier run, which this one replaces", root)
@@ -175,32 +173,59 @@ class TrainCLI(LightningCLI):
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, MapExport):
                     print_written(callback, self.datamodule)
+            last = self._last_checkpoint()
+            if self.trainer.interrupted and last is not None:
+                print(f"to go on: {shlex.join(['dejavu', 'train', *self.words, '--ckpt_path', str(last)])}")
 
     def before_validate(self) -> None:
         """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""
-        chosen = self.config[self.subcommand]
+        chosen, last = self.config_init[self.subcommand], self._last_checkpoint()
         if chosen.get("ckpt_path"):
             return
-        folder = Path(self.trainer.default_root_dir) / "checkpoints"
-        found = sorted(folder.glob("*.ckpt"), key=lambda path: path.stat().st_mtime)
-        if not found:
+        if last is None:
             raise InputError(
-                f"there is no checkpoint in {folder}; expected --ckpt_path, or the "
+                f"there is no checkpoint in {self._checkpoints}; expected --ckpt_path, or the "
                 "trainer.default_root_dir of a training"
             )
-        self.config_init[self.subcommand]["ckpt_path"] = str(found[-1])
+        chosen["ckpt_path"] = str(last)
 
     before_test = before_export = before_validate
+
+    def after_validate(self) -> None:
+        """Say what the figures are of, and what to do next."""
+        checkpoint = self.config_init[self.subcommand]["ckpt_path"]
+        written = Path(self.trainer.default_root_dir) / "map.safetensors"
+        print(f"figures of {checkpoint}")
+        if written.is_file():
+            print_next(written, self.datamodule)
+        else:
+            words = ["export", *self.words[1:], "--ckpt_path", checkpoint]
+            print(f"next: {shlex.join(['dejavu', 'train', *words])}")
+
+    after_test = after_validate
+
+    @property
+    def _checkpoints(self) -> Path:
+        return Path(self.trainer.default_root_dir) / "checkpoints"
+
+    def _last_checkpoint(self) -> Path | None:
+        found = self._checkpoints.glob("*.ckpt")
+        return max(found, key=lambda path: path.stat().st_mtime, default=None)
 
 
 def print_written(export: MapExport, data: RouteData) -> None:
     """What was written, and what to do next."""
     if export.written is not None:
         path, summary = export.written
-        known = [data.sources[name] for name in ("validation", "query") if data.sources[name]]
-        reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], [*known, "SECOND"][0]))
         print(f"{describe(summary)}\nwritten to {path}; only a second traverse shows what it is worth:")
-        print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")
+        print_next(path, data)
+
+
+def print_next(path: Path, data: RouteData) -> None:
+    """How to see what a map is worth."""
+    known = [data.sources[name] for name in ("validation", "query") if data.sources[name]]
+    reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], [*known, "SECOND"][0]))
+    print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")
 
 
 def run_train(arguments: Sequence[str]) -> None:

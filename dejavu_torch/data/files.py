@@ -55,18 +55,30 @@ def check_output_file(path: Path) -> None:
         raise InputError(f"{path} cannot be written: no permission to write in {path.parent}")
 
 
+def check_output_folder(path: Path) -> None:
+    """Refuse early, before long work, a folder that could not be made or written in.
+
+    Raises:
+        InputError: a file is in the way, or there is no permission.
+    """
+    there = next(folder for folder in (path, *path.parents) if folder.exists())
+    if not there.is_dir():
+        raise InputError(f"{path} cannot be made a folder: {there} is a file; expected a new path")
+    if not os.access(there, os.W_OK):
+        raise InputError(f"no permission to write in the folder {there}")
+
+
 def make_output_folder(path: Path) -> None:
     """Create the folder and its parents.
 
     Raises:
-        InputError: the path is a file, or the folder cannot be made or written in.
+        InputError: see `check_output_folder`, or the system refuses it.
     """
+    check_output_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path} cannot be made a folder: {error.strerror}; expected a new path") from error
-    if not os.access(path, os.W_OK):
-        raise InputError(f"no permission to write in the folder {path}")
 
 
 @contextmanager

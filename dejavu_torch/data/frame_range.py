@@ -59,11 +59,11 @@ class FrameRange(Traverse):
         length = traverse.length
         stops = stop == 0 or start < stop
         if start < 0 or step < 1 or not stops or (length is not None and max(start + 1, stop) > length):
-            frames = "frames" if length is None else f"{length} frames"
-            raise InputError(
-                f"{traverse.name}: start={start}, stop={stop}, step={step}; expected start < stop within its "
-                f"{frames}, and step of at least 1"
-            )
+            given = (("start", start, 0), ("stop", stop, 0), ("step", step, 1))
+            told = ", ".join(f"{name}={value}" for name, value, default in given if value != default)
+            part = f"a part of its {'' if length is None else f'{length} '}frames"
+            expected = "a step of at least 1" if step < 1 else part
+            raise InputError(f"{traverse.name}: {told}; expected {expected}")
         self.traverse = traverse
         self.frames = range(start, stop or length or 2**62, step)
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"

@@ -36,6 +36,19 @@ def shown_frames(positions: Tensor) -> Tensor:
     return torch.where((places - positions[low]) / step < 0.5, low, high)
 
 
+def borders(positions: Tensor) -> Tensor:
+    """The frame with which each place begins, and behind the last place the number of frames.
+
+    Shape: (F,) -> (M + 1,) int64, not decreasing: place p is shown from frame borders[p] to borders[p + 1].
+
+    Example:
+        >>> borders(torch.tensor([0.0, 1.0, 1.0, 1.0, 2.0, 2.0])).tolist()
+        [0, 1, 4, 6]
+    """
+    shown = shown_frames(positions)
+    return torch.cat([shown, shown.new_tensor([len(positions)])])
+
+
 def nearest_places(positions: Tensor) -> Tensor:
     """The place nearest to each frame, -1 for one behind the first: (F,) -> (F,) int64."""
     last = int(float(positions.max()) + NEAR)
@@ -43,10 +56,15 @@ def nearest_places(positions: Tensor) -> Tensor:
 
 
 def unit_of(positions: Tensor) -> str:
-    """What a tolerance counts: frames, or the places of a map that has such a table; (0,) is none."""
+    """What tolerances and periods count: frames, or the places of a map with such a table; (0,) is none."""
     return "places at even steps" if len(positions) else "frames"
 
 
 def look_up(table: Tensor, index: Tensor) -> Tensor:
     """Entries of a table by their index, int64 of any shape; -1 stays -1."""
-    return torch.where(index >= 0, table[index.clamp(min=0)], -1)
+    return torch.where(index >= 0, table.to(index.device)[index.clamp(min=0)], -1)
+
+
+def place_of(positions: Tensor, frames: Tensor) -> Tensor:
+    """The place nearest to each frame; -1 for one behind the first place, and for -1. int64 of any shape."""
+    return look_up(nearest_places(positions), frames)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.positions import nearest_places, shown_frames
+from dejavu_torch.data.positions import borders, look_up, place_of, shown_frames
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.types import InputError
 
@@ -71,13 +71,12 @@ class PlaceMap(nn.Module, ABC):
 
     def frame_of(self, places: Tensor) -> Tensor:
         """The reference frame that each place shows; -1, no place, stays -1. int64 of any shape."""
-        if not len(self.positions):
-            return places
-        frames = shown_frames(self.positions).to(places.device)
-        return torch.where(places >= 0, frames[places], -1)
+        return look_up(shown_frames(self.positions), places) if len(self.positions) else places
 
     def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each reference frame; -1, no frame, stays -1. int64 of any shape.
+        """The place nearest to each reference frame; -1 for one behind the first place, and for -1.
+
+        Shape: int64 of any shape.
 
         Raises:
             InputError: a frame that the reference does not have.
@@ -87,9 +86,16 @@ class PlaceMap(nn.Module, ABC):
             raise InputError(
                 f"frame {int(frames.max())} of the reference; expected frames from 0 to {count - 1}"
             )
-        if not len(self.positions):
-            return frames
-        return torch.where(frames >= 0, nearest_places(self.positions).to(frames.device)[frames], -1)
+        return place_of(self.positions, frames) if len(self.positions) else frames
+
+    def scored(self, places: Tensor) -> Tensor:
+        """Of the places that show one frame, the one nearest to it: what a ground truth in frames counts."""
+        return self.place_of(self.frame_of(places))
+
+    @property
+    def borders(self) -> Tensor:
+        """(N+1,) int64, the reference frame with which each place begins, and the number of frames."""
+        return borders(self.positions) if len(self.positions) else torch.arange(self.places + 1)
 
     def check(self) -> None:
         """Refuse buffers that do not fit together.

@@ -18,7 +18,7 @@ LARGE = 10**9  # a common period beyond it is no figure that a person compares
 class ChunkSummary(NamedTuple):
     """One chunk [start, stop): its periods, how many places they can tell apart, and what they share.
 
-    common_period: the least common multiple of the periods, in frames; the capacity.
+    common_period: the least common multiple of the periods, in places; the capacity.
     shared_factors: greatest common divisor of each pair of periods, in the order of
         itertools.combinations(periods, 2).
     features: number of features of each layer; () in a spectral map, whose periods are those of its ten

@@ -76,8 +76,8 @@ def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int
 
     Shape: best (Q,) int64, places (Q,R) int64 with -1 as padding -> (Q,) bool.
 
-    Convention: the distance of two phases is counted around the cycle, in frames, and may be at most
-        the tolerance. Phases count from absolute frame 0, so a place outside the layer's chunk has
+    Convention: the distance of two phases is counted around the cycle, in places, and may be at most
+        the tolerance. Phases count from absolute place 0, so a place outside the layer's chunk has
         the phase it would have if the layer went on.
 
     Example:
@@ -118,7 +118,7 @@ def activation_rates(
     Args:
         layers: layers of one chunk. best: for each (Q,) the best phase of each query.
         index: (Q,) the place reported when all layers are fused.
-        tolerance: frames, inclusive. places: N.
+        tolerance: places, inclusive. places: N.
     """
     start, stop = layers[0].start, layers[0].stop
     right = torch.where(truth.judged[:, None], truth.positives, -1)

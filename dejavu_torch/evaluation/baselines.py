@@ -15,6 +15,7 @@ from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import InputError, Match, Traverse
@@ -106,11 +107,12 @@ def baselines_of(
     fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
     strides = {"uncompressed": 1, "stride": fair, "stride_coarsest": max(1, 2 * tolerance)}
     of = "" if isinstance(model.features, HOG) else "same features, "
+    one = "place" if len(model.map.positions) else "frame"
     skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
     names = {
-        "uncompressed": f"{of}all {frames} frames{skipped}",
-        "stride": f"{of}{_every(fair)} (at least the map's bytes)",
-        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'])} (2 x tolerance)",
+        "uncompressed": f"{of}all {frames} {one}s{skipped}",
+        "stride": f"{of}{_every(fair, one)} (at least the map's bytes)",
+        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'], one)} (2 x tolerance)",
     }
     metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
     text = "baselines: frames stored as they are" if progress else None
@@ -125,13 +127,13 @@ def baselines_of(
         log.warning("no null control learned anew: what found the map's periods is not of this package")
     if model.trained is None and not foreign:
         anew = null_control(model, reference, query, seed, progress=text)
-        found["null"] = Baseline("null: everything learned from shuffled frames", anew)
+        found["null"] = Baseline(f"null: everything learned from shuffled {one}s", anew)
     if isinstance(model.map, TemplateMap):
         same = null_control(model, reference, query, seed, same_plan=True, progress=text)
         if model.trained is None:
-            found["null_same_plan"] = Baseline("null: this map's layers, shuffled frames", same)
+            found["null_same_plan"] = Baseline(f"null: this map's layers, shuffled {one}s", same)
         else:  # training anew is a run of its own
-            found["null"] = Baseline("null: templates of shuffled frames", same)
+            found["null"] = Baseline(f"null: templates of shuffled {one}s", same)
     if leave_out is not None:
         itself = leave_out_match(model, reference, leave_out)
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
@@ -154,17 +156,19 @@ def hog_baselines(
     except InputError as error:
         log.info("no HOG to compare with: %s", error)
         return {}
+    one = "place" if isinstance(reference, ResampledTraverse) else "frame"
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     text = "baselines: HOG of all frames" if progress else None
     nearest = nearest_frames(stored, queries, tuple(strides.values()), progress=text)
     frames, dimension = stored.shape
     return {
         key: Baseline(
-            f"HOG, {_every(k)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
+            f"HOG, {_every(k, one)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
         )
         for (key, k), match in zip(strides.items(), nearest, strict=True)
     }
 
 
-def _every(k: int) -> str:
-    return "every frame" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } frame"
+def _every(k: int, one: str) -> str:
+    """In words: every k-th frame, or place where these are not frames."""
+    return f"every {one}" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } {one}"

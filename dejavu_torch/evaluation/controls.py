@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import copy
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -66,9 +69,22 @@ def null_control(
     if same_plan:
         null.map = _same_layers(template_map_of(model, "the null of the same layers"), shuffled)
     else:
-        null.learn_features(shuffled)
+        with without_warnings():
+            null.learn_features(shuffled)
     match = null.localize(query, progress)
     return match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """Silence what learning warns of: of a null the user asked nothing, and the map's own was told of."""
+    log = logging.getLogger("dejavu_torch")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 def _same_layers(route: TemplateMap, features: Tensor) -> TemplateMap:

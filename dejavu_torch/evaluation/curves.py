@@ -117,9 +117,9 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
 
     Args:
         truth: (Q,R) int64, every right place of each query, -1 as padding; or a GroundTruth. Queries of which
-            nothing is known, and queries that report a soft place, are left out, as if they were never
+            nothing is known, and queries that report an ignored place, are left out, as if they were never
             asked: of precision, of recall, and of the count of queries.
-        tolerance: frames, inclusive.
+        tolerance: places, inclusive.
 
     Raises:
         InputError: a truth of another length than the matches, a negative tolerance, or no query left
@@ -152,8 +152,8 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
 def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> dict[str, int]:
     """How many queries there are, and how many of them the scores count; the keys are keys of report.json.
 
-    queries = judged + unknown + ignored: unknown to the truth, or ignored because a soft place is
-    reported. with_answer are those of the judged that have a right answer; accepted those that are
+    queries = judged + unknown + ignored: unknown to the truth, or ignored because an ignored
+    place is reported. with_answer are those of the judged that have a right answer; accepted those that are
     accepted; accepted_right those accepted in a right place.
 
     Raises:
@@ -186,7 +186,7 @@ def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> No
         raise InputError(f"the truth is {tuple(right.shape)}; expected ({queries}, R), a row a query")
     if others and (others[0].shape != (queries,) or others[1].ndim != 2 or len(others[1]) != queries):
         shapes = " and ".join(str(tuple(other.shape)) for other in others)
-        raise InputError(f"known and soft places are {shapes}; expected ({queries},) and ({queries}, S)")
+        raise InputError(f"judged and ignored are {shapes}; expected ({queries},) and ({queries}, S)")
     if tolerance < 0:
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
 
@@ -199,6 +199,6 @@ def _judged(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> tuple[
     if not kept.any():
         raise InputError(
             f"of {len(kept)} queries {int(truth.judged.sum())} are in the truth and none is left to judge; "
-            "expected at least one in the truth that does not report a soft place"
+            "expected at least one in the truth that does not report an ignored place"
         )
     return Match(*(column[kept] for column in match)), GroundTruth(*(column[kept] for column in truth))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from matplotlib.collections import LineCollection
@@ -12,7 +12,18 @@ from matplotlib.colors import PowerNorm
 from torch import Tensor
 
 from dejavu_torch.evaluation.contenders import COLOURS
-from dejavu_torch.evaluation.plots import DARK, GREY, LABELLED, LAYERS, WIDTH, Plot, canvas, period_axis
+from dejavu_torch.evaluation.plots import (
+    DARK,
+    GREY,
+    LABELLED,
+    LAYERS,
+    LINE,
+    PLACE,
+    WIDTH,
+    Plot,
+    canvas,
+    period_axis,
+)
 from dejavu_torch.periods.spectrogram import Spectrum
 from dejavu_torch.types import FrequencyLayer, InputError
 
@@ -26,38 +37,23 @@ _BESIDE = {  # a number next to a mark, readable on any colour
 _DOTS = 4000  # along a picture; a longer line is drawn as the range it covers
 
 
-class HogParts(NamedTuple):
-    """What each feature of a HOG vector looks at.
-
-    block_row, block_column: its block. cell_row, cell_column: its cell, counted over the whole image.
-    orientation: its bin; bin o holds gradients of about (o + 1/2) * 180 / orientations degrees.
-    """
-
-    block_row: Tensor
-    block_column: Tensor
-    cell_row: Tensor
-    cell_column: Tensor
-    orientation: Tensor
-
-
-def hog_parts(
+def edges_seen(
     features: Tensor, size: tuple[int, int], orientations: int = 9, cell: int = 8, block: int = 2
-) -> HogParts:
-    """Take feature indices of `hog` apart.
+) -> tuple[Tensor, Tensor]:
+    """The edges that HOG features respond to, as line segments, and how many of the features share each.
 
     Args:
         features: indices. size: (height, width) of the frames that HOG saw, in pixels, after its resize.
         orientations, cell, block: as HOG has them.
 
-    Shape: (F,) int64 -> five of (F,) int64.
+    Shape: (F,) int64 -> (E,2,2) end points (x, y) in pixels, where (0, 0) is the middle of the first pixel;
+        (E,) int64, in how many (overlapping) blocks the features have this cell and orientation.
+
+    Convention: an edge lies across its gradient, through the middle of its cell. Bin o holds gradients of
+        about (o + 1/2) * 180 / orientations degrees.
 
     Raises:
         InputError: an index that HOG of such frames does not have.
-
-    Example:
-        >>> hog_parts(torch.tensor([0, 1763]), (64, 64))
-        HogParts(block_row=tensor([0, 6]), block_column=tensor([0, 6]), cell_row=tensor([0, 7]),
-            cell_column=tensor([0, 7]), orientation=tensor([0, 8]))
     """
     rows, columns = (max(0, pixels // cell - block + 1) for pixels in size)
     shape = (rows, columns, block, block, orientations)
@@ -67,23 +63,8 @@ def hog_parts(
             f"{size[1]} pixels has {math.prod(shape)}"
         )
     row, column, down, right, orientation = torch.unravel_index(features, shape)
-    return HogParts(row, column, row + down, column + right, orientation)
-
-
-def edges_seen(
-    features: Tensor, size: tuple[int, int], orientations: int = 9, cell: int = 8, block: int = 2
-) -> tuple[Tensor, Tensor]:
-    """The edges that HOG features respond to, as line segments, and how many of the features share each.
-
-    Args: as `hog_parts`.
-
-    Shape: (F,) -> (E,2,2) end points (x, y) in pixels, where (0, 0) is the middle of the first pixel;
-        (E,) int64, in how many (overlapping) blocks the features have this cell and orientation.
-
-    Convention: an edge lies across its gradient, through the middle of its cell.
-    """
-    _, _, row, column, orientation = hog_parts(features, size, orientations, cell, block)
-    distinct, count = torch.stack([row, column, orientation], 1).unique(dim=0, return_counts=True)
+    cells = torch.stack([row + down, column + right, orientation], 1)
+    distinct, count = cells.unique(dim=0, return_counts=True)
     middle = (distinct[:, :2].flip(1) + 0.5) * cell - 0.5
     angle = (distinct[:, 2] + 0.5) * math.pi / orientations  # of the gradient, from x towards y
     along = torch.stack([-angle.sin(), angle.cos()], 1) * (0.45 * cell)
@@ -94,26 +75,28 @@ def plot_spectrogram(
     values: Tensor,
     spectra: Sequence[Spectrum],
     kept: Sequence[Sequence[float]],
-    shortest: float = 2,
-    feature: int = 0,
+    shortest: float,
+    feature: int,
+    borders: Tensor,
+    unit: str,
 ) -> Plot:
     """One feature through time, and its spectrogram, a column a chunk (figure 3 of the paper).
 
     Args:
         values: (N,) the feature. spectra: its spectrum in each chunk, power (K,1).
-        kept: for each chunk the periods kept, in frames; they are marked.
-        shortest: the shortest period shown, frames.
+        kept: for each chunk the periods kept; they are marked. shortest: the shortest period shown.
         feature: its number.
+        borders: (N+1,) see `PlaceMap.borders`. unit: of the periods.
 
     Convention: where chunks overlap, each column ends where the next begins.
     """
-    figure, (above, below) = canvas(5.4, 2, sharex=True, height_ratios=(1, 1.7))
+    figure, (above, below) = canvas(4.4, 2, sharex=True, height_ratios=(1, 1.7))
     if len(values) > _DOTS:
         step = -(-len(values) // (_DOTS // 2))
         low, high = zip(*((float(part.min()), float(part.max())) for part in values.split(step)), strict=True)
-        above.fill_between(range(0, len(values), step), low, high, color=DARK, linewidth=0.5)
+        above.fill_between(borders[:-1:step], low, high, color=DARK, linewidth=0.5)
     else:
-        above.plot(values, color=DARK, linewidth=0.7)
+        above.plot(borders[:-1], values, color=DARK, linewidth=0.7)
     above.set_title(f"feature {feature} through time", loc="left", fontsize=10)
     above.set(ylabel="value")
     shares = [(power[2:] / power[1:].sum()).nan_to_num() for _, _, power in spectra]
@@ -122,41 +105,41 @@ def plot_spectrogram(
     ends = [*(spectrum.start for spectrum in spectra[1:]), spectra[-1].stop]
     mesh: Any = None
     for (start, stop, _), share, end, periods in zip(spectra, shares, ends, kept, strict=True):
-        right = min(stop, end)
-        borders = (stop - start) / (torch.arange(len(share) + 1) + 1.5)  # between two bins
-        mesh = below.pcolormesh([start, right], borders.numpy(), share.numpy() * 100, norm=norm, cmap="Blues")
+        left, right = int(borders[start]), int(borders[min(stop, end)])
+        between = (stop - start) / (torch.arange(len(share) + 1) + 1.5)  # two bins
+        mesh = below.pcolormesh([left, right], between.numpy(), share.numpy() * 100, norm=norm, cmap="Blues")
         for axis in (above, below):
-            axis.axvline(start, color=GREY, linewidth=0.8, linestyle=":")
+            axis.axvline(left, color=GREY, linewidth=0.8, linestyle=":")
         for period in periods:
-            middle = (start + right) / 2
+            middle = (left + right) / 2
             size = 11 if len(spectra) <= LABELLED else 3
             below.plot(middle, period, "o", color=LAYERS[0], markersize=size, markerfacecolor="none")
             if len(spectra) <= LABELLED:
                 below.annotate(f"{period:.4g}", (middle, period), (10, 0), **_BESIDE)
     figure.colorbar(mesh, ax=below, label="% of its power", pad=0.01, aspect=30)
-    period_axis(below, shortest, max((stop - start) / 1.5 for start, stop, _ in spectra))
-    below.set(xlim=(0, len(values)), xlabel="place")
-    below.set_title("power at each period, chunk by chunk; circles: kept", loc="left", fontsize=10)
+    period_axis(below, shortest, max((stop - start) / 1.5 for start, stop, _ in spectra), unit)
+    below.set(xlim=(0, int(borders[-1])), xlabel=PLACE)
+    below.set_title("power at each period; circles: kept", loc="left", fontsize=10)
     return figure, (above, below)
 
 
-def plot_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int = 0) -> Plot:
-    """How alike a feature is to itself some frames later (figure 1 (c) of the paper).
+def plot_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int, unit: str) -> Plot:
+    """How alike a feature is to itself some places later (figure 1 (c) of the paper).
 
     Args:
-        values: (n,) the feature along one chunk. periods: those the map keeps of it, frames.
-        feature: its number.
+        values: (n,) the feature along one chunk. periods: those the map keeps of it.
+        feature: its number. unit: of the periods.
 
     Convention: the biased autocorrelation of the feature minus its mean, 1 at lag 0.
     """
-    figure, axis = canvas(3.4)
+    figure, axis = canvas(3)
     spectrum = torch.fft.rfft(values.double() - values.double().mean(), n=2 * len(values)).abs().square()
     correlation = torch.fft.irfft(spectrum)[: len(values)]
     axis.plot(correlation / correlation[0].clamp(min=1e-30), color=DARK, linewidth=1)
     for period, colour in zip(periods, LAYERS, strict=False):
         lags = [k * period for k in range(1, MARKED) if k * period < len(values)]
         axis.vlines(lags, -1, 1, color=colour, linewidth=0.9, linestyle=":", label=f"multiples of {period:g}")
-    axis.set(xlim=(0, len(values)), ylim=(-1, 1.02), xlabel="lag (frames)", ylabel="autocorrelation")
+    axis.set(xlim=(0, len(values)), ylim=(-1, 1.02), xlabel=f"lag ({unit})", ylabel="autocorrelation")
     axis.set_title(f"feature {feature} against itself", loc="left", fontsize=10)
     if periods:
         axis.legend(loc="upper right", ncols=2, frameon=False, fontsize=9)
@@ -164,34 +147,40 @@ def plot_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int 
 
 
 def plot_templates(
-    layer: FrequencyLayer, values: Tensor, templates: Tensor, chosen: int, thick: str = "their mean"
+    layer: FrequencyLayer,
+    values: Tensor,
+    templates: Tensor,
+    chosen: int,
+    unit: str,
+    thick: str = "their mean",
 ) -> Plot:
-    """The frames of equal phase averaged into templates (figure 4 of the paper).
+    """The places of equal phase averaged into templates (figure 4 of the paper).
 
     Args:
         layer: its features and period.
-        values: (n,) one feature at the frames of the layer's chunk.
+        values: (n,) one feature at the places of the layer's chunk.
         templates: (P,F) of the layer.
         chosen: position of that feature among the layer's.
+        unit: of the period.
         thick: what the templates are, for the title.
 
     Convention: of more than 100 cycles every k-th is drawn. Of more than 64 features those are drawn that
         vary most from phase to phase; rows are ordered by where in the cycle they are high, each from
         its lowest (white) to its highest (dark).
     """
-    figure, (above, below) = canvas(5.8, 2, sharex=True, height_ratios=(1, 1.4))
+    figure, (above, below) = canvas(4.8, 2, sharex=True, height_ratios=(1, 1.4))
     period, number = float(layer.period), layer.features[chosen]
-    frames = torch.arange(layer.start, layer.stop)
-    cycle = frames * layer.period.denominator // layer.period.numerator
-    within = frames - cycle.double() * period
+    places = torch.arange(layer.start, layer.stop)
+    cycle = places * layer.period.denominator // layer.period.numerator
+    within = places - cycle.double() * period
     parts = torch.unique_consecutive(cycle, return_counts=True)[1].tolist()
     cycles = list(zip(within.split(parts), values.split(parts), strict=True))
     for x, y in cycles[:: -(-len(cycles) // CYCLES)]:
         above.plot(x, y, color=GREY, linewidth=0.6, alpha=0.6)
-    # phase k holds the frames that lie from k to k + 1 phases into their cycle
+    # phase k holds the places that lie from k to k + 1 phases into their cycle
     phase = (torch.arange(layer.phases) + 0.5) * period / layer.phases - 0.5
     above.plot(phase, templates[:, chosen], color=COLOURS["map"], linewidth=2.2)
-    text = f"feature {number}, {len(cycles)} cycles of {period:.4g} frames; thick: {thick}"
+    text = f"feature {number}, {len(cycles)} cycles; thick: {thick}"
     above.set_title(text, loc="left", fontsize=10)
     above.set(ylabel="value")
     rows = templates.var(0, correction=0).argsort(descending=True, stable=True)[:ROWS]
@@ -204,10 +193,12 @@ def plot_templates(
     below.imshow(picture.numpy(), aspect="auto", extent=extent, cmap="Blues", interpolation="nearest")
     total = len(layer.features)
     text = f"{total} features" if len(rows) == total else f"{len(rows)} of {total} features"
-    below.set_title(f"templates of {text}; white: lowest, dark: highest", loc="left", fontsize=10)
+    below.set_title(f"templates of {text}; dark: highest", loc="left", fontsize=10)
     mark = (rows == chosen).nonzero().flatten().tolist()
     below.set_yticks(mark, [str(number)] * len(mark))
-    below.set(xlabel="phase (frames into the cycle)", ylabel="feature", xlim=(-0.5, period - 0.5))
+    below.set(
+        xlabel=f"phase, of a period of {period:.4g} ({unit})", ylabel="feature", xlim=(-0.5, period - 0.5)
+    )
     return figure, (above, below)
 
 
@@ -232,7 +223,9 @@ def plot_features(
     beside = width <= 1.6 * height and width <= 12 * cell
     rows, columns = (1, len(layers)) if beside else (len(layers), 1)
     wide = 0.97 * WIDTH / columns
-    figure, axes = canvas((min(2 * WIDTH, wide * height / width) + 0.36) * rows, rows, columns, squeeze=False)
+    figure, axes = canvas(
+        (min(2 * WIDTH, wide * height / width) + 2 * LINE) * rows, rows, columns, squeeze=False
+    )
     points = 72 * wide * cell / width  # a cell's side
     grey = frame.mean(0)
     if grey.min() < 0 or grey.max() > 1:
@@ -252,5 +245,5 @@ def plot_features(
             )
         )
         axis.set_axis_off()
-        axis.set_title(f"period {float(layer.period):.4g}, {len(layer.features)} features", fontsize=10)
+        axis.set_title(f"period {float(layer.period):.4g},\n{len(layer.features)} features", fontsize=10)
     return figure, axes

@@ -14,11 +14,13 @@ from dejavu_torch.evaluation.plots import (
     GREY,
     LABELLED,
     LAYERS,
+    PLACE,
     WRONG,
     Plot,
     canvas,
     period_axis,
     pixels,
+    show_cells,
 )
 from dejavu_torch.types import FrequencyLayer, Plan
 
@@ -26,10 +28,14 @@ SHOWN = 12  # layers of a chunk
 BLUE = COLOURS["map"]
 
 
-def plot_chunks(plan: Plan, places: int) -> Plot:
-    """Chunks along the route and the periods found in each; the wider a bar, the more features."""
-    figure, axis = canvas(4.2)
-    axis.set(xlim=(0, places), xlabel="place", ylabel="period (frames)")
+def plot_chunks(plan: Plan, borders: Tensor, unit: str) -> Plot:
+    """Chunks along the route and the periods found in each; the wider a bar, the more features.
+
+    Args:
+        borders: (N+1,) see `PlaceMap.borders`. unit: of the periods.
+    """
+    figure, axis = canvas(3.6)
+    axis.set(xlim=(0, int(borders[-1])), xlabel=PLACE, ylabel=f"period ({unit})")
     if not plan:
         axis.set(yticks=[])
         axis.text(0.5, 0.5, "this route does not repeat: no layers", ha="center", transform=axis.transAxes)
@@ -37,28 +43,32 @@ def plot_chunks(plan: Plan, places: int) -> Plot:
     most = max(len(layer.features) for layer in plan)
     chunks = sorted({(layer.start, layer.stop) for layer in plan})
     for start, stop in chunks:
+        first, last = (int(borders[edge]) for edge in (start, stop))
         members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
         for layer in members:
             share = len(layer.features) / most
             style = {"linewidth": 0.6 + 7 * share, "alpha": 0.35 + 0.65 * share}
-            axis.hlines(float(layer.period), start, stop, color=BLUE, **style)
+            axis.hlines(float(layer.period), first, last, color=BLUE, **style)
         leading = sorted(members, key=lambda layer: -len(layer.features))[:2]
         for layer, along in zip(leading, (0.3, 0.7), strict=False):
             if len(chunks) <= LABELLED:
                 text = f"{float(layer.period):.4g}"
                 box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
-                where = start + along * (stop - start), float(layer.period)
+                where = first + along * (last - first), float(layer.period)
                 axis.text(*where, text, fontsize=9, ha="center", va="center_baseline", bbox=box)
     for edge in {edge for chunk in chunks for edge in chunk}:
-        axis.axvline(edge, color=GREY, linewidth=0.8, linestyle=":")
+        axis.axvline(int(borders[edge]), color=GREY, linewidth=0.8, linestyle=":")
     periods = [float(layer.period) for layer in plan]
-    period_axis(axis, min(periods) / 1.2, max(periods) * 1.2)
+    period_axis(axis, min(periods) / 1.2, max(periods) * 1.2, unit)
     axis.set_title(f"widest bar: {most} features", fontsize=10, loc="left")
     return figure, axis
 
 
-def plot_layers(layers: Sequence[FrequencyLayer]) -> Plot:
+def plot_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) -> Plot:
     """Layers of one chunk and their phases along it (figure 2 of the paper).
+
+    Args:
+        borders: (N+1,) see `PlaceMap.borders`. unit: of the periods.
 
     Convention: one row a layer, those of most features, by period; the colour is the phase, so that a
     column of colours is what names a place.
@@ -67,12 +77,11 @@ def plot_layers(layers: Sequence[FrequencyLayer]) -> Plot:
     start, stop = shown[0].start, shown[0].stop
     figure, axis = canvas(0.24 * len(shown) + 1.5)
     phases = torch.stack([layer.place_phases / layer.phases for layer in shown])
-    extent = (start - 0.5, stop - 0.5, len(shown) - 0.5, -0.5)
-    image = axis.imshow(
-        phases.numpy(), aspect="auto", extent=extent, cmap="twilight", vmin=0, vmax=1, interpolation="nearest"
-    )
+    x, y = borders[start : stop + 1] - 0.5, torch.arange(len(shown) + 1) - 0.5
+    image = show_cells(axis, x, y, phases, cmap="twilight", vmin=0, vmax=1)
+    axis.invert_yaxis()
     axis.set_yticks(range(len(shown)), [f"{float(layer.period):.4g}" for layer in shown])
-    axis.set(xlabel="place", ylabel="period (frames)")
+    axis.set(xlabel=PLACE, ylabel=f"period ({unit})")
     axis.set_title(f"phase in {len(shown)} of {len(layers)} layers", loc="left", fontsize=10)
     figure.colorbar(image, ax=axis, label="phase / period", pad=0.01, aspect=20)
     return figure, axis
@@ -83,6 +92,7 @@ def plot_activations(
     scores: Sequence[Tensor],
     fused: Tensor,
     query: int,
+    borders: Tensor,
     places: Sequence[int] = (),
     strip: Tensor | None = None,
     rates: ActivationRates | None = None,
@@ -92,12 +102,13 @@ def plot_activations(
     Args:
         layers: two layers of one chunk. scores: for each (n,) eq. 3 at the chunk's places.
         fused: (n,) eq. 4 at the same places. query: number of the query frame.
-        places: its right places, marked.
-        strip: (C,H,n) one image column for each place, drawn above; None leaves it out.
+        borders: (N+1,) see `PlaceMap.borders`. places: the right places of the query, marked.
+        strip: (C,H,n) one image column for each frame of the chunk, drawn above; None leaves it out.
         rates: how often each is right, written above it; None leaves it out.
     """
-    start, stop = layers[0].start, layers[0].stop
-    figure, rows = canvas(4.7 if strip is None else 5.8, len(layers) + 1 + (strip is not None), sharex=True)
+    where = borders[layers[0].start : layers[0].stop]
+    start, stop = int(where[0]), int(borders[layers[0].stop])
+    figure, rows = canvas(4.2 if strip is None else 5, len(layers) + 1 + (strip is not None), sharex=True)
     axes = rows[-len(layers) - 1 :]
     if strip is not None:
         rows[0].imshow(pixels(strip), extent=(start, stop, 0, 1), aspect="auto")
@@ -113,20 +124,19 @@ def plot_activations(
         [*LAYERS[: len(layers)], BLUE],
         strict=True,
     )
-    where = torch.arange(start, stop)
     for axis, name, text, values, colour in drawn:
         axis.plot(where, values, color=colour, linewidth=1.1)
         best = int(values.argmin())
         style = {"color": WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
         axis.plot(where[best], values[best], "v", **style)
-        axis.set_title(f"{name}: {text}" if text else name, loc="left", fontsize=10)
+        axis.set_title(f"{name}:\n{text}" if text else name, loc="left", fontsize=9)
         axis.set_yticks([])
     for axis in rows:
         for place in places:
-            axis.axvline(place, color=DARK, linewidth=0.9, linestyle="--", label="true place")
+            axis.axvline(int(borders[place]), color=DARK, linewidth=0.9, linestyle="--", label="true place")
     handles, labels = axes[-1].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
     figure.supylabel(f"difference of query {query} (lower is better)", fontsize=10)
-    rows[-1].set(xlabel="place", xlim=(start, stop))
+    rows[-1].set(xlabel=PLACE, xlim=(start, stop))
     return figure, rows

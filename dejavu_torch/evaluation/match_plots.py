@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from textwrap import fill
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
+from dejavu_torch.data.positions import look_up
 from dejavu_torch.evaluation.contenders import COLOURS
-from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, WIDTH, WRONG, Plot, canvas, pixels, show_frame
+from dejavu_torch.evaluation.plots import (
+    DARK,
+    GREY,
+    LETTERS,
+    LINE,
+    PLACE,
+    QUERY,
+    RIGHT,
+    WIDTH,
+    WRONG,
+    Plot,
+    canvas,
+    empty,
+    pixels,
+    show_cells,
+)
 from dejavu_torch.types import GroundTruth, Match
 
 CELLS = 400  # rows and columns of a score matrix, at most
@@ -30,38 +48,57 @@ class Example(NamedTuple):
     right: int = -1
 
 
+class Row(NamedTuple):
+    """Frames (C,H,W) beside each other, and what stands above them.
+
+    heading: above all of them, or nothing. titles: above each; one more says what is missing.
+    """
+
+    heading: str
+    titles: Sequence[str]
+    frames: Sequence[Tensor]
+
+
 class ScoreMatrix(NamedTuple):
     """Scores of queries at places, small enough to draw.
 
     query: (h,) the number of each row's query. values: (h,w) in [0,1], 0 at the query's best score, 1 at its
-    median and above, NaN where nothing covers; each the least of `block` neighbouring places. places: N.
+    median and above, NaN where nothing covers; each the least of `block` neighbouring places.
     """
 
     query: Tensor
     values: Tensor
     block: int
-    places: int
 
 
-def plot_frames(first: Tensor, second: Tensor, numbers: Sequence[int]) -> Plot:
-    """Frames of both traverses at the same places (figures 5 to 7 of the paper).
-
-    Shape: first, second (K,C,H,W) in [0,1]; numbers: K places.
-    """
-    height, width = first.shape[-2:]
-    most = max(1, min(len(numbers), round(2 + 2 * height / width)))  # wide frames need room
-    columns = next(n for n in range(most, 0, -1) if len(numbers) % n == 0)
-    rows = -(-len(numbers) // columns)
-    side = WIDTH / columns * height / width
-    figure, axes = canvas(2 * rows * (side + 0.28), 2 * rows, columns, squeeze=False)
-    for k, number in enumerate(numbers):
-        for below, frames, name in ((0, first, "reference"), (1, second, "second")):
-            show_frame(axes[2 * (k // columns) + below, k % columns], frames[k], f"{name}, place {number}")
-    return figure, axes
+def plot_rows(rows: Sequence[Row]) -> Plot:
+    """Rows of frames, such as queries beside what was found."""
+    columns = max(len(row.titles) for row in rows)
+    letters, heights, texts = LETTERS // columns, [], []
+    for heading, titles, frames in rows:
+        wrapped = ["\n".join(fill(line, letters) for line in title.split("\n")) for title in titles]
+        lines = max(text.count("\n") for text in wrapped)
+        texts.append([text + "\n" * (lines - text.count("\n")) for text in wrapped])
+        lines += 1 + bool(heading) * len(fill(heading, LETTERS).split("\n"))
+        side = max(frame.shape[1] / frame.shape[2] for frame in frames)
+        heights.append(WIDTH / columns * side + lines * LINE)
+    figure, axes = empty(sum(heights)), []
+    parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for part, row, titles in zip(parts, rows, texts, strict=True):
+        if row.heading:
+            part.suptitle(fill(row.heading, LETTERS), x=0.01, ha="left", fontsize=9, weight="bold")
+        axes.append(part.subplots(1, columns, squeeze=False)[0])
+        for axis in axes[-1]:
+            axis.set_axis_off()
+        for axis, title in zip(axes[-1], titles, strict=False):
+            axis.set_title(title, loc="left", fontsize=9, pad=3)
+        for axis, frame in zip(axes[-1], row.frames, strict=False):
+            axis.imshow(pixels(frame))
+    return figure, np.stack(axes)
 
 
 def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> list[Example]:
-    """The queries that `plot_pairs` shows: the surest right, the surest wrong, and one at the threshold.
+    """The queries that a report shows: the surest right, the surest wrong, and one at the threshold.
 
     The last is the surest that the threshold rejects, or, where it rejects none, the least sure of all.
     Without ground truth the surest of all stands for the first two. A query that is several of these is one
@@ -103,40 +140,6 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
     return examples
 
 
-def plot_pairs(
-    examples: Sequence[Example],
-    frames: Sequence[Sequence[Tensor]],
-    label: Callable[[str, int], str] = lambda kind, number: f"{kind} {number}",
-) -> Plot:
-    """Queries beside the reference frames that were reported for them, and those that are right.
-
-    Args:
-        examples: see `example_matches`; a row each.
-        frames: for each the frames (C,H,W) of the query, of the reported place and, where it is known, of the
-            right place.
-        label: what to call a query or a place, from its kind ("query" or "place") and number.
-    """
-    columns = max(len(row) for row in frames)
-    sides = [max(frame.shape[1] / frame.shape[2] for frame in row) for row in frames]
-    height = sum(WIDTH / columns * side + 0.45 for side in sides)
-    figure, axes = canvas(height, len(examples), columns, squeeze=False, height_ratios=sides)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    for row, (one, shown) in enumerate(zip(examples, frames, strict=True)):
-        right = "none is known" if one.right < 0 else label("place", one.right)
-        place = label("place", one.place)
-        titles = (label("query", one.query), f"reported: {place}", f"right: {right}")
-        for axis, title in zip(axes[row], titles, strict=False):
-            axis.set_title(f"\n{title}", loc="left", fontsize=9, pad=3)  # the empty line is for the heading
-        for axis, frame in zip(axes[row], shown, strict=False):
-            axis.imshow(pixels(frame))
-        heading = axes[row, 0].annotate(
-            one.why, (0, 1), (0, 15), "axes fraction", "offset points", weight="bold"
-        )
-        heading.set(fontsize=9, in_layout=False)
-    return figure, axes
-
-
 def score_matrix(
     scores: Callable[[Tensor], Tensor], queries: Tensor, cells: int = CELLS
 ) -> ScoreMatrix | None:
@@ -168,30 +171,36 @@ def score_matrix(
         rows.append(padded.unflatten(1, (-1, block)).amin(2))
     matrix = torch.cat(rows)
     matrix = matrix.masked_fill(matrix.isinf(), torch.nan)
-    return None if matrix.isnan().all() else ScoreMatrix(chosen, matrix, block, places)
+    return None if matrix.isnan().all() else ScoreMatrix(chosen, matrix, block)
 
 
-def plot_score_matrix(matrix: ScoreMatrix, match: Match, truth: GroundTruth | None = None) -> Plot:
-    """How much each query differs from each place, with the places reported and those that are right."""
-    figure, axis = canvas(5.6)
-    queries = len(match.index)
-    extent = (-0.5, queries - 0.5, -0.5, matrix.values.shape[1] * matrix.block - 0.5)
+def plot_score_matrix(
+    matrix: ScoreMatrix, match: Match, truth: GroundTruth | None, borders: Tensor, queries: Tensor
+) -> Plot:
+    """How much each query differs from each place, with the places reported and those that are right.
+
+    Args:
+        truth: None where nothing is known.
+        borders: (N+1,) see `PlaceMap.borders`. queries: (Q,) the frame of each query, in order.
+    """
+    figure, axis = canvas(3.8)
     axis.set_facecolor(GREY)  # where nothing covers
-    image = axis.imshow(
-        matrix.values.T.numpy(), cmap="gray", vmin=0, vmax=1, origin="lower", aspect="auto", extent=extent
-    )
+    x = torch.cat([queries[matrix.query], queries[-1:] + 1]) - 0.5
+    y = torch.cat([borders[: -1 : matrix.block], borders[-1:]]) - 0.5
+    image = show_cells(axis, x, y, matrix.values.T, cmap="gray", vmin=0, vmax=1)
     found = match.index >= 0
     style = {"color": COLOURS["map"], "markersize": 2, "label": "reported place"}
-    axis.plot(torch.arange(queries)[found], match.index[found], ".", **style)
+    axis.plot(queries[found], borders[match.index[found]], ".", **style)
     if truth is not None:
-        right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.nan)
+        known = truth.judged[:, None] & (truth.positives >= 0)
+        right = torch.where(known, look_up(borders, truth.positives), torch.nan)
         style = {"color": RIGHT, "linewidth": 1, "dashes": (4, 4)}
-        axis.plot(right[:, :: max(1, right.shape[1] // LINES)], **style)
+        axis.plot(queries, right[:, :: max(1, right.shape[1] // LINES)], **style)
         axis.plot([], [], label="right place", **style)
-    axis.set(xlim=extent[:2], ylim=(-0.5, matrix.places - 0.5), xlabel="query", ylabel="place")
+    axis.set(xlim=(float(x[0]), float(x[-1])), ylim=(float(y[0]), float(y[-1])), xlabel=QUERY, ylabel=PLACE)
     bar = figure.colorbar(image, ax=axis, pad=0.01, aspect=30, ticks=[0, 1])
     bar.ax.set_yticklabels(["best", "median"])
-    bar.set_label("score among those of the query")
+    bar.set_label("score within a query")
     figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=4)
     return figure, axis
 
@@ -200,22 +209,25 @@ def plot_coverage(
     match: Match,
     truth: Tensor | GroundTruth | None,
     tolerance: int,
-    places: int,
-    queries: Tensor | None = None,
+    borders: Tensor,
+    queries: Tensor,
+    unit: str,
 ) -> Plot:
     """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9).
 
     Args:
         truth: (Q,R) right places, or a GroundTruth, or None where nothing is known.
-        queries: (Q,) the number of each query frame; None is 0..Q-1.
+        borders: (N+1,) see `PlaceMap.borders`. queries: (Q,) the frame of each query.
+        unit: of the tolerance.
     """
-    figure, axis = canvas(5)
-    number = torch.arange(len(match.index)) if queries is None else queries
-    reported = match.index >= 0
+    figure, axis = canvas(3.8)
+    reported, frames = match.index >= 0, int(borders[-1])
 
     def dots(which: Tensor, colour: str, label: str, size: float = 3) -> None:
         if which.any():
-            axis.plot(number[which], match.index[which], ".", color=colour, markersize=size, label=label)
+            axis.plot(
+                queries[which], borders[match.index[which]], ".", color=colour, markersize=size, label=label
+            )
 
     missing = ~reported
     if truth is None:
@@ -227,13 +239,14 @@ def plot_coverage(
         wrong = scored & reported & ~right
         dots(reported & ~scored, GREY, f"{(~scored).sum()} not scored")
         dots(wrong, WRONG, f"{wrong.sum()} wrong")
-        dots(right, RIGHT, f"{right.sum()} right (within {tolerance} places)", 4)
+        dots(right, RIGHT, f"{right.sum()} right", 4)
+        axis.set_title(f"right within {tolerance} {unit}", fontsize=10)
         missing &= scored
     if missing.any():
         label = f"{missing.sum()} not reported"
-        axis.plot(number[missing], torch.zeros(int(missing.sum())), "|", color=DARK, label=label)
-    first, last = int(number.min()), int(number.max())
-    axis.set(xlabel="query", ylabel="reported place")
-    axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * places, places))
+        axis.plot(queries[missing], torch.zeros(int(missing.sum())), "|", color=DARK, label=label)
+    first, last = int(queries.min()), int(queries.max())
+    axis.set(xlabel=QUERY, ylabel=f"reported {PLACE}")
+    axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
     figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
     return figure, axis

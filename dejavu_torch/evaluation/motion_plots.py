@@ -32,7 +32,7 @@ def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:
         distances: name -> (N,) pixels of ground travelled at each frame, one or two.
         step: pixels from one place to the next.
     """
-    figure, axes = canvas(1.6 + 1.5 * len(distances), len(distances), squeeze=False, sharey=True)
+    figure, axes = canvas(1 + 1.4 * len(distances), len(distances), squeeze=False, sharey=True)
     for axis, (name, travelled), colour in zip(axes.flat, distances.items(), LAYERS, strict=False):
         axis.plot(torch.arange(1, len(travelled)), travelled.diff(), color=colour, linewidth=0.8)
         axis.axhline(0, color=GREY, linewidth=0.6)
@@ -40,5 +40,5 @@ def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:
         axis.set(xlim=(0, len(travelled)), ylabel="pixels of ground\nper frame")
         axis.set_title(name, loc="left", fontsize=9)
         axis.grid(alpha=0.25)
-    axes[-1, 0].set_xlabel("frame of the footage (dotted: the step between two places)")
+    axes[-1, 0].set_xlabel("frame (dotted: step between places)")
     return figure, axes

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.positions import unit_of
 from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.activation import activation_rates, best_phases, layer_distances
 from dejavu_torch.evaluation.contenders import Contender, distinct
@@ -20,10 +21,10 @@ from dejavu_torch.evaluation.feature_plots import (
 )
 from dejavu_torch.evaluation.map_plots import plot_activations, plot_chunks, plot_layers
 from dejavu_torch.evaluation.match_plots import (
+    Row,
     example_matches,
     plot_coverage,
-    plot_frames,
-    plot_pairs,
+    plot_rows,
     plot_score_matrix,
     score_matrix,
 )
@@ -33,7 +34,7 @@ from dejavu_torch.evaluation.score_plots import plot_auc, plot_curves
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
-from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Traverse
@@ -47,6 +48,8 @@ class Localization(NamedTuple):
 
     reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None where there is none.
     tolerance: distance from a right place, in places, up to which a reported one is right.
+
+    Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
 
     model: DejaVu
@@ -57,6 +60,28 @@ class Localization(NamedTuple):
     match: Match
     truth: GroundTruth | None
     tolerance: int
+
+    @property
+    def scored(self) -> Match:
+        """The matches as the scores count them."""
+        return self.match._replace(index=self.model.map.scored(self.match.index))
+
+    @property
+    def borders(self) -> Tensor:
+        """(N+1,) the reference frame with which each place begins, and the number of frames."""
+        return self.model.map.borders.cpu()
+
+    @property
+    def query_frames(self) -> Tensor:
+        """(Q,) the frame of its source that each query shows."""
+        if isinstance(self.query, ResampledTraverse):
+            return self.query.frame
+        return torch.arange(len(self.query_features))
+
+    @property
+    def unit(self) -> str:
+        """What periods and the tolerance count."""
+        return unit_of(self.model.map.positions)
 
 
 def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dict[str, Picture]:
@@ -70,23 +95,18 @@ def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dic
         activations those that can be drawn, in this order.
     """
     pictures = draw_pairs(run)
-    pictures["coverage"] = Picture(
-        plot_coverage(run.match, run.truth, run.tolerance, run.model.map.places),
-        "places reported",
-        "Where along the route each query was found."
-        + (" A query in its right place is green, in a wrong one red." if run.truth is not None else ""),
-    )
-    pictures |= draw_scores(run) | draw_curves(contenders, run.tolerance) | draw_motion(run)
+    pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
+    pictures |= draw_scores(run) | draw_curves(contenders, f"{run.tolerance} {run.unit}") | draw_motion(run)
     if isinstance(run.model.map, TemplateMap):
-        pictures |= draw_chunks(run.model.map)
+        pictures |= draw_chunks(run, run.model.map)
         pictures |= draw_features(run, run.model.map) | draw_activations(run, run.model.map)
     return pictures
 
 
-def draw_chunks(route: TemplateMap) -> dict[str, Picture]:
+def draw_chunks(run: Localization, route: TemplateMap) -> dict[str, Picture]:
     """The layers of a map along the route."""
     picture = Picture(
-        plot_chunks(route.plan, route.places),
+        plot_chunks(route.plan, run.borders, run.unit),
         "the map's periods along the route",
         "Dotted lines cut the route into chunks. Each bar is a layer: the features that repeat with one "
         "period in one chunk; the wider, the more features.",
@@ -98,16 +118,20 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     """Some queries beside the frames found for them; nothing for ready features, or where none is found."""
     if not has_frames(run):
         return {}
-    examples = example_matches(run.match, run.truth, run.tolerance)
-    frames = [
-        [
-            frame_at(run.query, one.query),
-            *(frame_at(run.reference, place) for place in (one.place, one.right) if place >= 0),
-        ]
-        for one in examples
-    ]
+    examples = example_matches(run.scored, run.truth, run.tolerance)
     if not examples:
         return {}
+    rows = []
+    for one in examples:
+        titles = [f"query:\n{_name(run.query, run.query_frames[one.query])}"]
+        titles.append(f"reported:\n{_name(run.reference, run.borders[one.place])}")
+        frames = [frame_at(run.query, one.query), frame_at(run.reference, one.place)]
+        if one.right >= 0:
+            titles.append(f"right:\n{_name(run.reference, run.borders[one.right])}")
+            frames.append(frame_at(run.reference, one.right))
+        elif run.truth is not None:
+            titles.append("right:\nnone is known")
+        rows.append(Row(one.why, titles, frames))
     known = "" if run.truth is None else ", and at the right what it should have been"
     last = (
         "First above the threshold: the best match that the threshold rejects."
@@ -116,7 +140,7 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     )
     return {
         "pairs": Picture(
-            plot_pairs(examples, frames, lambda kind, number: frame_label(run, kind, number)),
+            plot_rows(rows),
             "queries and what was found",
             f"A query, beside it the reference frame of the place reported{known}. The lower the score, the "
             f"surer the match. {last}",
@@ -124,13 +148,22 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
     }
 
 
-def frame_label(run: Localization, kind: str, number: int) -> str:
+def _name(traverse: Traverse, frame: Tensor) -> str:
     """A query or a place by what matches.csv calls it: the frame of its source, and the frame's name."""
-    traverse = run.query if kind == "query" else run.reference
-    if isinstance(traverse, ResampledTraverse):
-        number, traverse = int(traverse.frame[number]), traverse.traverse
-    what = "query frame" if kind == "query" else "frame"
-    return f"{what} {number} {traverse.frame_name(number)}".strip()
+    return f"frame {frame} {source_of(traverse).frame_name(int(frame))}".strip()
+
+
+def draw_coverage(
+    match: Match, truth: GroundTruth | None, tolerance: int, borders: Tensor, queries: Tensor, unit: str
+) -> dict[str, Picture]:
+    """The places reported; see `plot_coverage`."""
+    picture = Picture(
+        plot_coverage(match, truth, tolerance, borders, queries, unit),
+        "places reported",
+        "Where along the route each query was found."
+        + (" A query in its right place is green, in a wrong one red." if truth is not None else ""),
+    )
+    return {"coverage": picture}
 
 
 def draw_scores(run: Localization) -> dict[str, Picture]:
@@ -142,13 +175,13 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
     if matrix is None:
         return {}
     shares = []
-    if len(matrix.query) < len(run.match.index):
+    if len(matrix.query) < len(run.query_features):
         shares.append(f"{len(matrix.query)} of the queries")
     if matrix.block > 1:
         shares.append(f"of {matrix.block} neighbouring places the one that fits best")
     return {
         "scores": Picture(
-            plot_score_matrix(matrix, run.match, run.truth),
+            plot_score_matrix(matrix, run.scored, run.truth, run.borders, run.query_frames),
             "how well each place fits each query",
             "Dark: the place fits the query about as well as its best one does. What repeats shows as lines "
             "beside the right places." + (f" Drawn: {'; '.join(shares)}." if shares else ""),
@@ -156,26 +189,31 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
     }
 
 
-def draw_curves(contenders: Mapping[str, Contender], tolerance: int) -> dict[str, Picture]:
-    """Precision-recall curves and their areas; nothing where no contender has a curve."""
+def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
+    """Precision-recall curves, and their areas side by side; nothing where no contender has a curve.
+
+    Args:
+        tolerance: with its unit.
+    """
     # leave_out has other queries
     curves = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
-    if not curves:
-        return {}
-    return {
-        "pr": Picture(
-            plot_curves(curves, f"right within {tolerance} places"),
+    pictures = {}
+    if curves:
+        pictures["pr"] = Picture(
+            plot_curves(curves, f"right within {tolerance}"),
             "precision and recall",
             "How many of the reported places are right, against how many of the queries are answered right, "
             "as the threshold rises. The higher and the further to the right, the better.",
-        ),
-        "auc": Picture(
+        )
+    if len(curves) > 1:
+        pictures["auc"] = Picture(
             plot_auc(curves),
             "area under each curve",
-            "The curves above in one number each: this map, baselines that store frames, and nulls, in which "
-            "nothing repeats. A curve starts at the queries of the best score; nothing counts to its left.",
-        ),
-    }
+            "The curves above in one number each: this map, baselines that store features as they are, and "
+            "nulls, in which nothing repeats. A curve starts at the queries of the best score; nothing "
+            "counts to its left.",
+        )
+    return pictures
 
 
 def draw_motion(run: Localization) -> dict[str, Picture]:
@@ -228,28 +266,29 @@ def draw_features(run: Localization, route: TemplateMap) -> dict[str, Picture]:
             for start, stop, _ in spectra
         ]
         pictures["spectrogram"] = Picture(
-            plot_spectrogram(values[:, 0], spectra, kept, periods.min_period, feature),
+            plot_spectrogram(values[:, 0], spectra, kept, periods.min_period, feature, run.borders, run.unit),
             "a feature and its spectrogram",
-            "One feature of each frame along the route, and how its power is spread over periods in each "
+            "One feature along the route, and how its power is spread over periods in each "
             "chunk. The map keeps the strongest periods, circled: they put the feature into a layer each.",
         )
     made = "the trained template" if model.trained else "their mean"
     pictures["templates"] = Picture(
-        plot_templates(layer, values[layer.start : layer.stop, 0], templates, chosen, made),
-        "frames of equal phase become templates",
+        plot_templates(layer, values[layer.start : layer.stop, 0], templates, chosen, run.unit, made),
+        "places of equal phase become templates",
         "Above, the same feature cut into cycles of one period and laid over each other, and "
         + ("the template that training made of it" if model.trained else "their mean, which the map stores")
         + ". Below, the templates of the layer's features, a row each.",
     )
-    number = (layer.start + layer.stop) // 2
+    middle = (layer.start + layer.stop) // 2
     if type(model.features) is HOG and len(run.reference.frame_shape) == 3:
-        frame = as_hog_sees(model, frame_at(run.reference, number))
+        frame = as_hog_sees(model, frame_at(run.reference, middle))
         layout = model.features.orientations, model.features.cell, model.features.block
         pictures["features"] = Picture(
             plot_features(frame, [plan[j] for j in leading], *layout),
             "where the features of a layer look",
-            f"The HOG features that take part in each layer, drawn on frame {number} as the edges they "
-            "respond to; the stronger a line, the more of the overlapping blocks have it in the layer.",
+            "The HOG features that take part in each layer, drawn on frame "
+            f"{run.borders[middle]} as the edges they respond to; the stronger a line, the more "
+            "of the overlapping blocks have it in the layer.",
         )
     return pictures
 
@@ -272,20 +311,22 @@ def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture
         right = truth.positives[query].tolist() if truth.judged[query] else []
         places = [place for place in right if start <= place < stop]
         best = [best_phases(route, queries, j) for j in chosen]
-        rates = activation_rates(layers, best, run.match.index, truth, run.tolerance, route.places)
+        rates = activation_rates(layers, best, run.scored.index, truth, run.tolerance, route.places)
     one = queries[query : query + 1]
     scores = [layer_distances(route, one, j)[0, plan[j].place_phases] for j in chosen]
     with torch.no_grad():
         fused = route.scores(one.to(route.templates.device))[0, start:stop].cpu()
-    strip = slit_scan(run.reference, start, stop)
+    borders = run.borders
+    strip = slit_scan(source_of(run.reference), int(borders[start]), int(borders[stop]))
+    number = int(run.query_frames[query])
     covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
     explained = (
-        f" Right: within {run.tolerance} places, for a layer in phase. Elsewhere: queries from other chunks, "
-        "the layer's phase counted on; near chance where its period ends with the chunk. All layers fused "
-        "choose from the whole route."
+        f" Right: within {run.tolerance} {run.unit}, for a layer in phase. Elsewhere: queries from other "
+        "chunks, the layer's phase counted on; near chance where its period ends with the chunk. All layers "
+        "fused choose from the whole route."
     )
     picture = Picture(
-        plot_activations(layers, scores, fused, query, places, strip, rates),
+        plot_activations(layers, scores, fused, number, borders, places, strip, rates),
         "two layers, and all layers fused",
         "How much one query differs from each place of a chunk: a layer alone fits one place a period, all "
         f"{covering} of the chunk together one." + (explained if rates else ""),
@@ -300,11 +341,14 @@ def paper_pictures(run: Localization) -> dict[str, Picture]:
     if run.truth is not None and (run.truth.positives >= 0).any() and has_frames(run):
         middles = [len(run.reference_features) * (k + 0.5) / EXAMPLES for k in range(EXAMPLES)]
         queries = [nearest_query(run.truth, middle) for middle in middles]
-        places = run.truth.positives[queries].amax(1).tolist()
-        first = torch.stack([frame_at(run.reference, place) for place in places])
-        second = torch.stack([frame_at(run.query, query) for query in queries])
+        places = run.truth.positives[queries].amax(1)
+        rows = []
+        for place, query in zip(places.tolist(), queries, strict=True):
+            numbers = run.borders[place], run.query_frames[query]
+            titles = [f"{name}, frame {n}" for name, n in zip(("reference", "second"), numbers, strict=True)]
+            rows.append(Row("", titles, [frame_at(run.reference, place), frame_at(run.query, query)]))
         pictures["frames"] = Picture(
-            plot_frames(first, second, places),
+            plot_rows(rows),
             "the route",
             "The same places on the reference and on the second traverse.",
         )
@@ -317,13 +361,13 @@ def paper_pictures(run: Localization) -> dict[str, Picture]:
         kept = [float(p.period) for p in chunk if feature in p.features]
         values = run.reference_features[layer.start : layer.stop, feature].cpu()
         pictures["autocorrelogram"] = Picture(
-            plot_autocorrelogram(values, kept, feature),
+            plot_autocorrelogram(values, kept, feature, run.unit),
             "a feature against itself",
-            "How alike a feature is to itself so many frames later: where it repeats, it is high at every "
+            "How alike a feature is to itself so many places later: where it repeats, it is high at every "
             "multiple of its period.",
         )
         pictures["layers"] = Picture(
-            plot_layers(chunk),
+            plot_layers(chunk, run.borders, run.unit),
             "layers and their phases",
             "One chunk of the map: a row a layer, the colour its phase. A column of phases names a place; "
             "the next place where all are the same is the least common multiple of the periods away.",

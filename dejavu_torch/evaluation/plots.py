@@ -1,4 +1,9 @@
-"""What all pictures share: their width, their colours, and how one is put into a report."""
+"""What all pictures share: their width, colours and axes, and how one is put into a report.
+
+Convention 11: axes along a route count frames of its source. What counts places, such as periods, is labelled
+with the unit of `unit_of`. Pictures take both from the map: `borders`, its table from place to frame, and the
+unit.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,9 @@ from torch import Tensor
 
 Plot = tuple[Figure, Any]
 
-WIDTH = 6.0  # inches; a phone shows about 60 pixels an inch, so 9 points are the smallest letters
+WIDTH = 4.0  # inches; a phone shows about 85 pixels an inch, so 9 points are the smallest letters
+LINE, LETTERS = 0.18, 54  # inches that a line of text takes, and letters of 9 points that fit in one
+QUERY, PLACE = "query (frame)", "place (frame)"  # axes, named as the columns of matches.csv
 DARK, GREY = "#333333", "#bbbbbb"
 RIGHT, WRONG = "#4daf7c", "#9e1b32"
 LAYERS = ("#b35806", "#542788")  # the two layers that several pictures show
@@ -32,9 +39,14 @@ class Picture(NamedTuple):
     numbers: Mapping[str, Any] = MappingProxyType({})
 
 
+def empty(height: float) -> Figure:
+    """A figure of the width all pictures have, in inches."""
+    return Figure(figsize=(WIDTH, height), layout="constrained", dpi=200)
+
+
 def canvas(height: float, rows: int = 1, columns: int = 1, **grid: Any) -> Plot:
-    """An empty figure of the width all pictures have, without the upper and right frame line."""
-    figure = Figure(figsize=(WIDTH, height), layout="constrained", dpi=130)
+    """A figure with empty axes, without the upper and right frame line."""
+    figure = empty(height)
     axes = figure.subplots(rows, columns, **grid)
     for axis in figure.axes:
         axis.spines[["top", "right"]].set_visible(False)
@@ -48,16 +60,21 @@ def show_frame(axis: Any, frame: Tensor, title: str = "") -> None:
     axis.set_title(title, loc="left", fontsize=9, pad=3)
 
 
+def show_cells(axis: Any, x: Tensor, y: Tensor, values: Tensor, **style: Any) -> Any:
+    """Draw cells (h,w) between the borders x (w+1,) and y (h+1,), which need not be even."""
+    return axis.pcolorfast(x.numpy(), y.numpy(), values.numpy(), **style)
+
+
 def pixels(frame: Tensor) -> np.ndarray[Any, Any]:
     """A frame (C,H,W) in [0,1] as imshow takes it, (H,W,3)."""
     values: np.ndarray[Any, Any] = frame.expand(3, -1, -1).permute(1, 2, 0).clamp(0, 1).numpy()
     return values
 
 
-def period_axis(axis: Any, low: float, high: float) -> None:
-    """Make the y axis logarithmic from `low` to `high` frames, with powers of two as ticks."""
+def period_axis(axis: Any, low: float, high: float, unit: str) -> None:
+    """Make the y axis logarithmic from a period of `low` to one of `high`, with powers of two as ticks."""
     axis.set_yscale("log")
     ticks = [2**k for k in range(40) if low <= 2**k <= high]
     axis.set_yticks(ticks, [str(t) for t in ticks])
     axis.minorticks_off()
-    axis.set(ylim=(low, high), ylabel="period (frames)")
+    axis.set(ylim=(low, high), ylabel=f"period ({unit})")

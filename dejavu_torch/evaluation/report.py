@@ -58,11 +58,15 @@ class Report(NamedTuple):
 
 
 def score_table(report: Report, every: bool = False) -> list[list[str]]:
-    """The scores as rows of text, the header first; bytes only where the number of frames is known.
+    """The scores as rows of text, the header first; no rows where nothing is scored.
+
+    There are bytes only where the number of frames is known.
 
     Args:
         every: all scores, and the bytes in total, not only the columns that matter most.
     """
+    if not any(one.scores for one in report.shown().values()):
+        return []
     frames, columns = report.facts.get("frames"), _MAIN | (_MORE if every else {})
     sizes = [*(["bytes"] if every else []), "bytes per place"] if frames else []
     rows = [["", *columns.values(), *sizes]]
@@ -96,10 +100,13 @@ def text_table(rows: list[list[str]]) -> str:
 def headline(report: Report) -> str:
     """What was done and how good it is, in plain words."""
     facts, scores = report.facts, report.ours.scores
-    text = f"{facts['queries']} query frames were looked up"
+    text = f"{facts['queries']} queries were looked up"
     text += f" on a map of {facts['frames']} places" if "frames" in facts else ""
     if scores is None:
-        return f"{text}. There is no ground truth, so nothing is scored: see the matches and the pictures."
+        return (
+            f"{text}. There is no ground truth, so nothing is scored: see the matches and the pictures, or "
+            "give one, such as --truth 12 (place = query + 12) or --truth truth.csv (rows of query,place)."
+        )
     text += (
         f": {percent(scores.recall_at_1)} were found in their right place (recall@1). Sorted by score, the "
     )
@@ -107,9 +114,7 @@ def headline(report: Report) -> str:
     baseline = report.contenders.get("uncompressed")
     if baseline and baseline.scores and baseline.bytes and report.ours.bytes and "frames" in facts:
         ours, full = (size / facts["frames"] for size in (report.ours.bytes, baseline.bytes))
-        text += (
-            f" The map takes {ours:.0f} bytes per place. The features of all frames would take {full:.0f} "
-        )
+        text += f" The map takes {ours:.0f} bytes per place. The features as they are would take {full:.0f} "
         text += f"and find {percent(baseline.scores.recall_at_1)}."
     return text
 
@@ -139,6 +144,8 @@ def summary(report: Report) -> str:
         lines.append(f"{reference} frames {both} were resampled to even steps of {step:.4g} pixels of ground")
     if facts.get("unknown"):
         lines.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")
+    if "with_answer" in facts:
+        lines.append(f"{facts['with_answer']} of the queries have a right answer")
     if facts.get("ignored"):
         lines.append(f"{facts['ignored']} report a place that counts neither as right nor as wrong")
     if "accepted_right" in facts:
@@ -150,8 +157,9 @@ def summary(report: Report) -> str:
     if any(is_late(one) for one in report.shown().values()):
         lines.append(_LATE)
     if "seconds_learn" in facts:
-        seconds = f"{facts['seconds_learn']:.1f} s, localizing {facts['seconds_localize']:.1f} s"
-        lines.append(f"Learning took {seconds}")
+        learning = f"Learning took {facts['seconds_learn']:.1f} s, localizing"
+        took = learning if facts["seconds_learn"] else "Localizing took"
+        lines.append(f"{took} {facts['seconds_localize']:.1f} s")
     return ". ".join(lines) + "."
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import NamedTuple
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of
-from dejavu_torch.evaluation.plots import GREY, Plot, canvas
+from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas
 
 _OURS = COLOURS["map"]
 _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
@@ -15,7 +16,7 @@ _HATCHES = {"hog": "...", "null": "///"}
 
 
 class Length(NamedTuple):
-    """What a map with chunks of `window` frames recognises, and what it stores.
+    """What a map with chunks of `window` places recognises, and what it stores.
 
     recall_at_1_comparable: with scores that are comparable between chunks, `reduction="mean"`.
     """
@@ -34,24 +35,28 @@ def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
     Args:
         contenders: by key, which gives the colour; HOG is dashed, nulls are dotted.
     """
-    figure, axis = canvas(5.6)
+    names = {key: one.name for key, one in contenders.items()}
+    for key, one in contenders.items():
+        silent = one.curve is not None and len(one.curve.recall) == 0
+        names[key] = fill(f"{one.name} (reports nothing)" if silent else one.name, LETTERS - 8)
+    lines = sum(1 + name.count("\n") for name in names.values())
+    figure, axis = canvas(3.4 + 1.1 * LINE * lines)
     for key, one in reversed(list(contenders.items())):  # the first on top
         if one.curve is None:
             continue
-        silent = len(one.curve.recall) == 0
         axis.plot(
             one.curve.recall,
             one.curve.precision,
             _LINES.get(key.partition("_")[0], "-"),
             color=colour_of(key),
-            label=f"{one.name} (reports nothing)" if silent else one.name,
+            label=names[key],
             linewidth=2.4 if key == "map" else 1.6,
         )
     axis.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision")
-    axis.set_title(title, fontsize=11)
+    axis.set_title(title, fontsize=10)
     axis.grid(alpha=0.25)
     handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc="outside lower left", frameon=False)
+    figure.legend(handles[::-1], labels[::-1], loc="outside lower left", frameon=False, fontsize=9)
     return figure, axis
 
 
@@ -62,18 +67,18 @@ def plot_auc(contenders: Mapping[str, Contender]) -> Plot:
     bars = axis.barh(range(len(areas)), [area for _, area in areas.values()], height=0.42)
     for row, (bar, (key, (name, area))) in enumerate(zip(bars, areas.items(), strict=True)):
         bar.set(facecolor=colour_of(key), hatch=_HATCHES.get(key.partition("_")[0]), edgecolor="white")
-        axis.text(0.008, row - 0.24, name, fontsize=9, va="bottom")
+        axis.text(0.008, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
         axis.text(area + 0.01, row, f"{area:.3f}", fontsize=9, va="center")
     axis.invert_yaxis()
     axis.set(xlim=(0, 1.1), yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
-    axis.set_xlabel("area under the precision-recall curve (recall of all queries)")
+    axis.set_xlabel("area under the precision-recall curve")
     axis.spines["bottom"].set_bounds(0, 1)
     return figure, axis
 
 
 def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
     """Recall and storage over the length of the chunks (section VI)."""
-    figure, (above, below) = canvas(5.4, 2, sharex=True)
+    figure, (above, below) = canvas(4.6, 2, sharex=True)
     for number, (name, rows) in enumerate(datasets.items()):
         colour, mark = _SHADES[number % len(_SHADES)], "osD^v"[number % 5]
         windows = [row.window for row in rows]
@@ -86,7 +91,7 @@ def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
     below.set_xticks(windows, [str(window) for window in windows])
     below.minorticks_off()
     above.set(ylabel="recall@1", ylim=(0, 1.02))
-    below.set(xlabel="length of a chunk (frames)", ylabel="bytes per place")
+    below.set(xlabel="length of a chunk (places)", ylabel="bytes per place")
     below.set_ylim(bottom=0)
     for axis in (above, below):
         axis.grid(alpha=0.25)
@@ -102,16 +107,16 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
         cases: at least one: case -> contender -> ratio. Names that start with "dejavu" are ours.
     """
     bars = [len(ratios) for ratios in cases.values()]
-    height = 0.5 + 0.3 * sum(bars) + 0.5 * len(bars)
+    height = 0.5 + 0.42 * sum(bars) + 0.5 * len(bars)
     figure, axes = canvas(height, len(bars), squeeze=False, height_ratios=bars)
     for axis, (case, ratios) in zip(axes[:, 0], cases.items(), strict=True):
         colours = [_OURS if name.startswith("dejavu") else COLOURS.get(name, GREY) for name in ratios]
-        drawn = axis.barh(list(ratios), list(ratios.values()), color=colours, height=0.7)
+        drawn = axis.barh(range(len(ratios)), list(ratios.values()), color=colours, height=0.42)
+        for row, name in enumerate(ratios):
+            axis.text(0, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
         axis.bar_label(drawn, [f"{ratio:.1f}" for ratio in ratios.values()], padding=3, fontsize=9)
         axis.axvline(1, color=_OURS, linewidth=0.8, linestyle=":")
-        axis.set_title(case, loc="left", fontsize=10)
-        axis.set_xlim(0, 1.12 * max(ratios.values()))
-        axis.invert_yaxis()
-        axis.tick_params(labelsize=9)
-    axes[-1, 0].set_xlabel("time over that of our fastest (lower is better)")
+        axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
+        axis.set(xlim=(0, 1.15 * max(ratios.values())), ylim=(len(ratios) - 0.6, -0.8), yticks=[])
+    axes[-1, 0].set_xlabel("time over that of our fastest; less is better")
     return figure, axes[:, 0]

@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
-from dejavu_torch.data.files import make_output_folder, whole_file
+from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.evaluation.score_plots import plot_ratios
@@ -88,7 +88,7 @@ def bench_matcher(
         seed: of the random frames and features.
 
     Convention: one process, float32, and the same number of threads, torch.get_num_threads(), for all
-        that can use several.
+        that can use several; ours with one thread as well.
 
     Raises:
         InputError: a number below 1.
@@ -108,6 +108,27 @@ def bench_matcher(
             query, templates = (torch.rand(n, f, generator=generator) for n in (q, p))
             rows += _l1_case(f"l1 {q} x {f} x {p}", query, templates, repeats, torch_compile)
     return rows
+
+
+def in_one_thread(run: Run) -> Run:
+    """The same work where torch may use one thread only."""
+
+    def alone() -> Tensor:
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return run()
+        finally:
+            torch.set_num_threads(threads)
+
+    return alone
+
+
+def _ours(run: Run) -> list[Program]:
+    """Our work with all threads and, where there are several, with one."""
+    threads = torch.get_num_threads()
+    alone = Program("dejavu (one thread)", 1, lambda: in_one_thread(run))
+    return [Program("dejavu", threads, lambda: run), *([alone] if threads > 1 else [])]
 
 
 def _hog_case(case: str, some: Tensor, frames: int, repeats: int) -> list[Row]:
@@ -139,11 +160,7 @@ def _hog_case(case: str, some: Tensor, frames: int, repeats: int) -> list[Row]:
 
         return run
 
-    contenders = [
-        Program("dejavu", torch.get_num_threads(), lambda: ours),
-        Program("scikit-image", 1, skimage),
-    ]
-    return benchmark(case, contenders, repeats)
+    return benchmark(case, [*_ours(ours), Program("scikit-image", 1, skimage)], repeats)
 
 
 def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_compile: bool) -> list[Row]:
@@ -179,7 +196,7 @@ def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_co
         return lambda: torch.from_numpy(pairwise(query.numpy(), templates.numpy()))
 
     contenders = [
-        Program("dejavu", threads, lambda: partial(phase_distances, query, templates)),
+        *_ours(partial(phase_distances, query, templates)),
         Program("dejavu (eager torch)", threads, eager),
         Program("torch.cdist", threads, lambda: partial(torch.cdist, query, templates, p=1.0)),
         Program("torch.compile", threads, compiled),
@@ -280,8 +297,9 @@ def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> lis
     """
     if what not in BENCHES:
         raise InputError(f"bench {what!r} is unknown; expected {', '.join(BENCHES)}")
-    make_output_folder(out)  # before the long work
+    check_output_folder(out)  # before the long work
     rows = BENCHES[what](frames, repeats)
+    make_output_folder(out)
     write_bench(out, rows)
     return rows
 

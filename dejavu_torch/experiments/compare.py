@@ -7,12 +7,12 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-import dejavu_torch
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import (
     as_ground_truth,
@@ -20,28 +20,23 @@ from dejavu_torch.data.ground_truth import (
     describe_ground_truth,
     ground_truth_in_places,
 )
-from dejavu_torch.data.positions import unit_of
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.recipe import recipe_of
+from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines
 from dejavu_torch.evaluation.contenders import Contender, contend
-from dejavu_torch.evaluation.curves import (
-    RECALL_DEFINITION,
-    count_queries,
-    curve_of,
-    threshold_of_full_precision,
-)
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
+from dejavu_torch.experiments.evaluate import evaluation_facts
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
-from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -50,22 +45,15 @@ NEAR = 10  # places within which it should find them, at least
 
 
 class Comparison(NamedTuple):
-    """A comparison's figures and pictures, and what was compared.
+    """A comparison's figures and pictures, and the run they are of.
 
-    model holds the map; reference and query are the traverses as they were learned and localized, resampled
-    where the model asks for it; reference_features (N,D) and query_features (Q,D) are those of the places and
-    of the queries; match and truth count places, truth is None where nothing tells the right places.
+    The run's traverses are as they were learned and localized, resampled where the model asks for it; its
+    match and truth count places.
     """
 
     report: Report
     pictures: Mapping[str, Picture]
-    model: DejaVu
-    reference: Traverse
-    query: Traverse
-    reference_features: Tensor
-    query_features: Tensor
-    match: Match
-    truth: GroundTruth | None
+    run: Localization
 
 
 def compare(
@@ -84,7 +72,8 @@ def compare(
 
     Args:
         reference: the traverse to learn. query: a second traverse of the route.
-        truth: see `find_ground_truth`; without one there are matches and pictures but no scores.
+        truth: see `find_ground_truth`; without one there are matches and pictures, but neither scores nor
+            baselines.
         model: settings; None is DejaVu with its defaults. A model that has a map keeps it and is
             evaluated as it is: the map has to be of this very reference.
         tolerance: places within which one is right, inclusive.
@@ -101,56 +90,61 @@ def compare(
     reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
     _check_sizes(model, reference, query)
-    clock, has_map = Clock(), model.map.places > 0
-    with clock("learn"):
+    seconds: dict[str, float] = defaultdict(float)
+    has_map = model.map.places > 0
+    work = "describe" if has_map else "learn"
+    with timed(seconds, work):
         reference = model.resample(reference, model.step if has_map else None, progress)
-    with clock("localize"):
+    with timed(seconds, "localize"):
         query = model.resample(query, getattr(reference, "step", None), progress)
-    known = None
-    early = reference.length is not None and query.length is not None
-    if early:  # a ground truth that does not fit is refused before the long work
-        known = ground_truth_of(truth, reference, query, interpolate=interpolate)
+    find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
+    lengths_known = reference.length is not None and query.length is not None
+    known = find_truth() if lengths_known else None  # one that does not fit is refused before the long work
     if reference.name == query.name:
         log.warning(
             "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
         )
-    with clock("learn"):
-        reference_features = _learn(model, reference, has_map, tolerance, progress)
-    with clock("localize"):
-        query_features = model.extract_all(query, "describing the query" if progress else None)
-        model.check_queries(query.frame_shape, query_features.shape[1], query.name)
-        match = model.localize(query_features)
-    if not early:
-        lengths = len(reference_features), len(query_features)
-        known = ground_truth_of(truth, reference, query, *lengths, interpolate)
+    with timed(seconds, work):
+        if has_map and reference.length is not None:
+            _check_places(model.map, reference.name, reference.length)
+        places = model.extract_all(reference, "describing the reference" if progress else None)
+        if has_map:
+            _check_map(model, places, reference.name, tolerance)
+        else:
+            model.learn_features(places, reference)
+    with timed(seconds, "localize"):
+        queries = model.extract_all(query, "describing the query" if progress else None)
+        model.check_queries(query.frame_shape, queries.shape[1], query.name)
+        match = model.localize(queries)
+    if not lengths_known:
+        known = find_truth(len(places), len(queries))
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
-    run = Localization(model, reference, query, reference_features, query_features, match, known, tolerance)
+    run = Localization(model, reference, query, places, queries, match, known, tolerance)
     contenders = _contenders(run, seed, leave_out, progress)
-    facts = _facts(run, clock)
-    if known is not None:
-        positions = all(source_of(one).place is not None for one in (reference, query))
-        shown = of_shown_frames(match, model.map)
-        facts |= count_queries(shown, known, tolerance)
-        facts["truth"] = describe_ground_truth(truth, interpolate, positions)
-        facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(shown, known, tolerance))
     pictures = draw_pictures(run, contenders)
-    facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
-    report = Report(contenders.pop("map"), contenders, facts)
-    return Comparison(report, pictures, *run[:-1])
+    carried = all(source_of(one).place is not None for one in (reference, query))
+    facts = {
+        **_map_facts(model.summary(), places),
+        **_run_facts(run, seconds),
+        **evaluation_facts(
+            of_shown_frames(match, model.map),
+            known,
+            tolerance,
+            model.map.positions,
+            describe_ground_truth(truth, interpolate, carried),
+        ),
+        **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
+    }
+    return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run)
 
 
-class Clock:
-    """Adds up the seconds of what is done under a name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        began = time.perf_counter()
-        yield
-        self.seconds[name] += time.perf_counter() - began
+@contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Add the seconds of a block to what is under a name."""
+    began = time.perf_counter()
+    yield
+    seconds[name] += time.perf_counter() - began
 
 
 def _check_arguments(
@@ -178,23 +172,16 @@ def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
         raise InputError(f"{seen}; expected as many, as frames of one size give")
 
 
-def _learn(model: DejaVu, reference: Traverse, has_map: bool, tolerance: int, progress: bool) -> Tensor:
-    """Features of the reference, learned where the model has no map of it yet."""
-    if has_map and reference.length is not None:
-        _check_places(model.map, reference.name, reference.length)
-    features = model.extract_all(reference, "describing the reference" if progress else None)
-    if not has_map:
-        model.learn_features(features, reference)
-        return features
-    _check_places(model.map, reference.name, len(features))
+def _check_map(model: DejaVu, features: Tensor, name: str, tolerance: int) -> None:
+    """Refuse a map of another number of places, and warn of one that does not find its own reference."""
+    _check_places(model.map, name, len(features))
     sample = torch.arange(0, len(features), max(1, len(features) // SAMPLED))
     found = (model.localize(features[sample]).index - sample).abs() <= max(tolerance, NEAR)
     if found.float().mean() < 0.5 and model.map.summary().covered:
         log.warning(
             "the map finds %d of %d frames of %s; expected the reference that it was made of",
-            *(int(found.sum()), len(sample), reference.name),
+            *(int(found.sum()), len(sample), name),
         )
-    return features
 
 
 def _check_places(route: PlaceMap, name: str, places: int) -> None:
@@ -207,23 +194,25 @@ def _check_places(route: PlaceMap, name: str, places: int) -> None:
 
 def of_shown_frames(match: Match, route: PlaceMap) -> Match:
     """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
-    return match._replace(index=route.place_of(route.frame_of(match.index)))
+    return match._replace(index=route.scored(match.index))
 
 
 def _contenders(run: Localization, seed: int, leave_out: int | None, progress: bool) -> dict[str, Contender]:
     """The map and what it is set beside, by their keys in report.json; the map's own is `map`."""
     model, tolerance = run.model, run.tolerance
+    ours, size = of_shown_frames(run.match, model.map), model.summary().map_bytes
+    contenders = {"map": contend("this map", ours, run.truth, tolerance, size)}
+    if run.truth is None and leave_out is None:  # nothing that the others find could be scored
+        return contenders
     features = run.reference_features, run.query_features
     baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress)
     if not _is_plain_hog(model):
         baselines |= hog_baselines(run.reference, run.query, model.batch_size, tolerance, progress)
-    size = model.summary().map_bytes
-    ours = of_shown_frames(run.match, model.map)
-    contenders = {"map": contend("this map", ours, run.truth, tolerance, size)}
     for key, (name, match, bytes, k) in baselines.items():
         truth, match = run.truth, of_shown_frames(match, model.map)
         if key == "leave_out":  # its queries are the places themselves
-            truth = ground_truth_in_places(as_ground_truth(_own_frames(model.map)), model.map.place_of)
+            own = model.map.frame_of(torch.arange(model.map.places))[:, None]
+            truth = ground_truth_in_places(as_ground_truth(own), model.map.place_of)
         contenders[key] = contend(name, match, truth, tolerance, bytes, k)
     return contenders
 
@@ -235,20 +224,10 @@ def _is_plain_hog(model: DejaVu) -> bool:
     return same and getattr(model.map, "metric", "l1") == "l1"
 
 
-def _own_frames(route: PlaceMap) -> Tensor:
-    return route.frame_of(torch.arange(route.places))[:, None]
-
-
-def _facts(run: Localization, clock: Clock) -> dict[str, Any]:
-    """What report.json holds beside the scores."""
-    model, reference, query = run.model, run.reference, run.query
-    summary, features = model.summary(), run.reference_features
-    facts = {
+def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
+    """What report.json holds of the map, whose places have these features (N,D)."""
+    return {
         "frames": len(features),
-        "queries": len(run.match.index),
-        "tolerance": run.tolerance,
-        "unit": unit_of(model.map.positions),
-        "recall_definition": RECALL_DEFINITION,
         "kind": summary.kind,
         "map_bytes": summary.map_bytes,
         "backbone_bytes": summary.fixed.get("backbone", 0),
@@ -269,17 +248,21 @@ def _facts(run: Localization, clock: Clock) -> dict[str, Any]:
             }
             for chunk in summary.chunks
         ],
-        "seconds_learn": clock.seconds["learn"] + (model.trained.seconds if model.trained else 0.0),
-        "seconds_localize": clock.seconds["localize"],
-        "accepted": int(run.match.accepted.sum()),
+    }
+
+
+def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """What report.json holds of the run beside its scores; nothing is learned where the map is given."""
+    model, reference, query = run.model, run.reference, run.query
+    facts = {
+        "seconds_learn": model.trained.seconds if model.trained else seconds["learn"],
+        "seconds_localize": seconds["localize"],
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
         "threshold": model.threshold,
         "trained": model.trained and model.trained._asdict(),
         "reference": reference.name,
         "query": query.name,
-        "version": dejavu_torch.__version__,
-        "torch": torch.__version__,
     }
     if isinstance(reference, ResampledTraverse):
         facts["resampling"] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,18 +17,17 @@ from dejavu_torch.data.ground_truth import (
     ground_truth_in_places,
 )
 from dejavu_torch.data.positions import unit_of
-from dejavu_torch.evaluation.contenders import Contender, contend
+from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     count_queries,
     curve_of,
     threshold_of_full_precision,
 )
-from dejavu_torch.evaluation.match_plots import plot_coverage
 from dejavu_torch.evaluation.matches import read_matches
+from dejavu_torch.evaluation.pictures import draw_coverage, draw_curves
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
-from dejavu_torch.evaluation.score_plots import plot_curves
 from dejavu_torch.model import read_place_map
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
@@ -74,7 +73,7 @@ def evaluate_file(
         check_ground_truth(truth, interpolate)
     place_map = None if map is None else read_place_map(map)
     positions = torch.zeros(0) if place_map is None else place_map.positions
-    resampled, unit = len(positions) > 0, unit_of(positions)
+    resampled = len(positions) > 0
     frames = places = None if reference is None else reference.length
     if place_map is not None:
         places = place_map.places
@@ -88,45 +87,44 @@ def evaluate_file(
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         match = match._replace(index=place_map.place_of(match.index))
-    counts = count_queries(match, known, tolerance)
-    facts = counts | {
-        "accepted_precision": counts["accepted_right"] / counts["accepted"] if counts["accepted"] else None,
-        "tolerance": tolerance,
-        "unit": unit,
-        "recall_definition": RECALL_DEFINITION,
+    facts = evaluation_facts(
+        match, known, tolerance, positions, describe_ground_truth(truth, interpolate, positions=True)
+    )
+    accepted = facts["accepted"]
+    facts |= {
+        "accepted_precision": facts["accepted_right"] / accepted if accepted else None,
         "matches": str(matches),
         "places": places,
-        "truth": describe_ground_truth(truth, interpolate, positions=True),
-        "threshold_of_full_precision": threshold_of_full_precision(curve_of(match, known, tolerance)),
-        "version": dejavu_torch.__version__,
-        "torch": torch.__version__,
     }
     ours = contend(matches.name, match, known, tolerance)
-    pictures = _pictures(ours, queries, match, known, tolerance, places, unit)
+    seen = places or 1 + max(int(table.max()) for table in (match.index, known.positives))
+    borders = torch.arange(seen + 1) if place_map is None else place_map.borders
+    pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
+    pictures |= draw_coverage(match, known, tolerance, borders, queries, facts["unit"])
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
 
 
-def _pictures(
-    ours: Contender,
-    queries: Tensor,
-    match: Match,
-    truth: GroundTruth,
-    tolerance: int,
-    places: int | None,
-    unit: str,
-) -> dict[str, Picture]:
-    if places is None:
-        places = 1 + max(int(table.max()) for table in (match.index, truth.positives))
-    return {
-        "pr": Picture(
-            plot_curves({"map": ours}, f"right within {tolerance} {unit}"),
-            "precision and recall",
-            "How many of the reported places are right, against how many of the queries are answered right, "
-            "as the threshold rises.",
-        ),
-        "coverage": Picture(
-            plot_coverage(match, truth, tolerance, places, queries),
-            "places reported",
-            "Where along the route each query was found. In its right place it is green, in a wrong one red.",
-        ),
+def evaluation_facts(
+    match: Match, truth: GroundTruth | None, tolerance: int, positions: Tensor, described: str
+) -> dict[str, Any]:
+    """What every report.json holds beside the scores.
+
+    Args:
+        truth: None where nothing tells the right places.
+        positions: of the map's places, empty where they are the frames; see `PlaceMap`.
+        described: the ground truth in words.
+    """
+    facts: dict[str, Any] = {
+        "queries": len(match.index),
+        "accepted": int(match.accepted.sum()),
+        "tolerance": tolerance,
+        "unit": unit_of(positions),
+        "recall_definition": RECALL_DEFINITION,
+        "version": dejavu_torch.__version__,
+        "torch": torch.__version__,
     }
+    if truth is not None:
+        facts |= count_queries(match, truth, tolerance)
+        facts["truth"] = described
+        facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, truth, tolerance))
+    return facts

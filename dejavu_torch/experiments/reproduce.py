@@ -15,7 +15,7 @@ from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.pictures import Localization, paper_pictures
+from dejavu_torch.evaluation.pictures import paper_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import Length, plot_lengths
@@ -89,16 +89,17 @@ def reproduce(
         "published": PUBLISHED[dataset]._asdict(),
         "chunk_lengths": [row._asdict() for row in chunk_lengths(result, tolerance, lengths)],
     }
-    if isinstance(result.reference, ResampledTraverse) and isinstance(result.query, ResampledTraverse):
-        pair = {"reference": result.reference, "query": result.query}
-        facts["measured_distance"] = {name: measured_distance(one) for name, one in pair.items()}
+    first, second = result.run.reference, result.run.query
+    if isinstance(first, ResampledTraverse) and isinstance(second, ResampledTraverse):
+        distances = {"reference": measured_distance(first), "query": measured_distance(second)}
+        facts["measured_distance"] = distances
     cuts = structure_places(result, structure_cuts(reference))
     if cuts:
         boundaries = known_boundaries(result, cuts, tolerance)
         contenders |= {key: contender for key, (contender, _) in boundaries.items()}
         effects = {key: effect._asdict() for key, (_, effect) in boundaries.items()}
         facts["boundaries"] = {"cuts": len(cuts), **effects}
-    pictures = paper_pictures(Localization(*result[2:], tolerance))
+    pictures = paper_pictures(result.run)
     return result._replace(
         report=Report(result.report.ours, contenders, facts), pictures={**pictures, **result.pictures}
     )
@@ -106,7 +107,7 @@ def reproduce(
 
 def ideal(result: Comparison, tolerance: int) -> dict[str, Contender]:
     """The database queried with itself: the paper's conditions, and the same with the neighbours left out."""
-    model, features = result.model, result.reference_features
+    model, features = result.run.model, result.run.reference_features
     itself = torch.arange(len(features))[:, None]
     left_out, name = leave_out_match(model, features, tolerance), f"ideal, +-{tolerance} frames left out"
     return {
@@ -124,8 +125,8 @@ def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int]
     Returns:
         A row for each length; none without ground truth, or with periods of another finder.
     """
-    mapper, places = _mapper(result.model), len(result.reference_features)
-    if result.truth is None or mapper is None:
+    mapper, places = _mapper(result.run.model), len(result.run.reference_features)
+    if result.run.truth is None or mapper is None:
         return []
     rows = []
     for window in lengths:
@@ -134,9 +135,9 @@ def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int]
         periods = SpectrogramAnalysis(window, **_settings(mapper))
         model = _learned(result, TemplateMapper(periods, mapper.metric, mapper.reduction))
         size = model.summary().map_bytes
-        scores = evaluate(_localized(model, result), result.truth, tolerance)
+        scores = evaluate(_localized(model, result), result.run.truth, tolerance)
         template_map_of(model, "a comparable score").reduction = "mean"
-        comparable = evaluate(_localized(model, result), result.truth, tolerance).recall_at_1
+        comparable = evaluate(_localized(model, result), result.run.truth, tolerance).recall_at_1
         rows.append(Length(window, scores.recall_at_1, scores.auc, comparable, size, size / places))
     return rows
 
@@ -181,7 +182,8 @@ def structure_cuts(reference: Traverse) -> list[int]:
 
 def structure_places(result: Comparison, cuts: Sequence[int]) -> list[int]:
     """Frames of the reference as places of its map, each once."""
-    places: list[int] = result.model.map.place_of(torch.tensor(cuts, dtype=torch.int64)).unique().tolist()
+    frames = torch.tensor(cuts, dtype=torch.int64)
+    places: list[int] = result.run.model.map.place_of(frames).unique().tolist()
     return places
 
 
@@ -199,16 +201,16 @@ class GivenChunks(SpectrogramAnalysis):
         super().__init__(**settings)
         self.cuts = list(cuts)
 
-    def chunks(self, frames: int) -> list[tuple[int, int]]:
-        """The chunks [start, stop) of a traverse of `frames` frames."""
+    def chunks(self, places: int) -> list[tuple[int, int]]:
+        """The chunks [start, stop) of a route of so many places."""
         shortest = 2 * self.min_period
-        if frames < shortest:
-            raise InputError(f"the traverse has {frames} frames; expected at least {shortest}, two periods")
+        if places < shortest:
+            raise InputError(f"the route has {places} places; expected at least {shortest}, two periods")
         edges = [0]
         for cut in self.cuts:
-            if edges[-1] + shortest <= cut <= frames - shortest:
+            if edges[-1] + shortest <= cut <= places - shortest:
                 edges.append(cut)
-        return list(pairwise([*edges, frames]))
+        return list(pairwise([*edges, places]))
 
 
 class BoundaryEffect(NamedTuple):
@@ -264,7 +266,7 @@ def known_boundaries(
     Raises:
         InputError: a comparison without ground truth, or with periods of another finder.
     """
-    mapper, truth = _mapper(result.model), result.truth
+    mapper, truth = _mapper(result.run.model), result.run.truth
     if truth is None or mapper is None:
         raise InputError(
             "known boundaries need a ground truth and SpectrogramAnalysis; this comparison has not both"
@@ -300,9 +302,9 @@ def _settings(mapper: TemplateMapper) -> dict[str, Any]:
 
 def _learned(result: Comparison, mapper: TemplateMapper) -> DejaVu:
     """The model of a comparison with a map of another mapper."""
-    model = with_mapper(result.model, mapper)
-    return model.learn_features(result.reference_features, result.reference)
+    model = with_mapper(result.run.model, mapper)
+    return model.learn_features(result.run.reference_features, result.run.reference)
 
 
 def _localized(model: DejaVu, result: Comparison) -> Match:
-    return of_shown_frames(model.localize(result.query_features), model.map)
+    return of_shown_frames(model.localize(result.run.query_features), model.map)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import find_ground_truth
-from dejavu_torch.data.positions import NEAR, look_up, nearest_places, shown_frames
+from dejavu_torch.data.positions import NEAR, shown_frames
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
@@ -76,10 +76,6 @@ class ResampledTraverse(Traverse):
         self.length = len(self.frame)
         if traverse.place is not None:
             self.place = traverse.place.double()[self.frame]
-
-    def place_of(self, frames: Tensor) -> Tensor:
-        """The step nearest to each frame of the other traverse; -1 behind the first, and for -1."""
-        return look_up(nearest_places(self.positions), frames)
 
     def frame_name(self, i: int) -> str:
         return self.traverse.frame_name(int(self.frame[i]))

@@ -15,7 +15,7 @@ class PeriodFinder(nn.Module, ABC):
 
     @abstractmethod
     def plan(self, features: Tensor) -> Plan:
-        """Layers of a traverse: exact numbers, the one place where gradients stop.
+        """Layers of a route: exact numbers, where gradients stop.
 
         Shape: features (N,D) -> plan; empty where nothing repeats.
         """

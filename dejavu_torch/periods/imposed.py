@@ -16,21 +16,21 @@ log = logging.getLogger("dejavu_torch")
 
 
 class ImposedPeriods(PeriodFinder):
-    """The same small layers over the whole route, whatever the features: frame i has phase i // bin mod P.
+    """The same small layers over the whole route, whatever the features: place i has phase i // bin mod P.
 
     Args:
         periods: P of each layer, distinct, >= 2, in bins; None chooses `supportive_periods` for the route.
-        bin: frames that share a phase, >= 1; the tolerance is a sensible size.
-        stagger: let the bins of the layers drift past each other, so that together they tell frames apart
-            that share a bin: the periods are P * bin frames and, in turn, a tenth of a bin more and less.
+        bin: places that share a phase, >= 1; the tolerance is a sensible size.
+        stagger: let the bins of the layers drift past each other, so that together they tell places apart
+            that share a bin: the periods are P * bin places and, in turn, a tenth of a bin more and less.
             What `support_of` says then holds for nearly all places, not for every one.
 
-    Shape: features (N,D), N >= 2 -> plan of L layers, each of period P * bin frames and P phases over 0..N,
+    Shape: features (N,D), N >= 2 -> plan of L layers, each of period P * bin places and P phases over 0..N,
         each of all D features.
 
     Convention: the last bin may be short. Given periods keep their order. Those that cannot tell the bins of
         the route apart are allowed and logged in a line; one period of as many phases as bins is a
-        classifier of places. A phase that no frame has gets a template that nothing reads.
+        classifier of places. A phase that no place has gets a template that nothing reads.
 
     Raises:
         InputError: periods or a bin out of range, or features not (N,D) with N >= 2 and D >= 1.
@@ -43,7 +43,7 @@ class ImposedPeriods(PeriodFinder):
     def __init__(self, periods: list[int] | None = None, bin: int = 5, stagger: bool = False) -> None:
         super().__init__()
         if bin < 1 + stagger:
-            least = "2 frames to stagger" if stagger else "1 frame"
+            least = "2 places to stagger" if stagger else "1 place"
             raise InputError(f"imposed periods got bin={bin}; expected at least {least}")
         if periods is not None:
             whole = all(isinstance(period, int) and period >= 2 for period in periods)
@@ -60,19 +60,19 @@ class ImposedPeriods(PeriodFinder):
             raise InputError(
                 f"imposed periods got features {tuple(features.shape)}; expected (N,D) with N >= 2, D >= 1"
             )
-        frames, dimension = features.shape
-        bins = -(-frames // self.bin)
+        places, dimension = features.shape
+        bins = -(-places // self.bin)
         # a route of a single bin leaves nothing to tell apart
         periods = self.periods or supportive_periods(max(2, bins))
         distinct = math.lcm(*periods)
         if distinct < bins:
             log.warning(
                 f"periods {tuple(periods)} tell {distinct} bins apart; the route has {bins}, "
-                f"so frames {distinct * self.bin} apart look alike"
+                f"so places {distinct * self.bin} apart look alike"
             )
         drift = Fraction(self.bin, 10) if self.stagger and len(periods) > 1 else Fraction(0)
         return tuple(
-            FrequencyLayer(period * self.bin + (-1) ** j * drift, period, 0, frames, tuple(range(dimension)))
+            FrequencyLayer(period * self.bin + (-1) ** j * drift, period, 0, places, tuple(range(dimension)))
             for j, period in enumerate(periods)
         )
 

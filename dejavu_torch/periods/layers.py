@@ -13,7 +13,7 @@ Bin = TypeVar("Bin", int, Tensor)
 
 
 def bin_period(length: int, k: Bin) -> Bin:
-    """Period, in whole frames, of bin k of a spectrum over `length` frames: round(length / k), halves up.
+    """Period, in whole places, of bin k of a spectrum over `length` places: round(length / k), halves up.
 
     Example:
         >>> bin_period(1024, 11), bin_period(1024, 6)  # the paper's two periods

@@ -21,9 +21,9 @@ HANN_PEAK = 2 / 3  # share of its power that a pure wave holds in its own bin un
 
 
 class Spectrum(NamedTuple):
-    """Power of every feature at every frequency of one chunk [start, stop), n = stop - start frames.
+    """Power of every feature at every frequency of one chunk [start, stop), n = stop - start places.
 
-    power: (n // 2 + 1, D); bin k is the frequency k / n per frame, the period n / k frames.
+    power: (n // 2 + 1, D); bin k is the frequency k / n per place, the period n / k places.
     """
 
     start: int
@@ -81,27 +81,27 @@ class SpectrogramAnalysis(PeriodFinder):
     """Which features repeat, where and how often, by the spectrogram of each (section III-A).
 
     Args:
-        window: frames per spectrum, which is also the length of a chunk.
-        hop: frames from one chunk to the next; None is `window`, chunks side by side.
-        min_period: shortest period considered, frames. The longest is half the window (bin 2):
+        window: places per spectrum, which is also the length of a chunk.
+        hop: places from one chunk to the next; None is `window`, chunks side by side.
+        min_period: shortest period considered, in places. The longest is half the window (bin 2):
             bins 0 and 1 hold the mean, slow drift, and their leakage through the Hann window.
         strongest: how many of its strongest frequencies a feature keeps.
         peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
         false_alarm: a chunk gets layers only where some frequency holds a larger share of its feature's
             power than white noise would show anywhere in the chunk with at most this probability
-            (`noise_share`), so that frames in random order get none. Smooth footage passes, whether
+            (`noise_share`), so that places in random order get none. Smooth footage passes, whether
             it repeats or not. None: every chunk gets layers (the paper).
-        short: for a traverse shorter than the window: "shrink" the window to it and log that, or "refuse".
+        short: for a route shorter than the window: "shrink" the window to it and log that, or "refuse".
 
     Shape: features (N,D) -> tuple of G spectra, one for each chunk, each (n // 2 + 1, D).
 
-    Convention: Hann window, not centred. The frames after the last whole window are a shorter window of
+    Convention: Hann window, not centred. The places after the last whole window are a shorter window of
         their own, left out where they are fewer than two of the shortest periods. A feature that does not
         vary inside a chunk has no power there. Features of equal `bin_period` share a layer (`layers_of`).
         Where a chunk is too short for any wave to pass `false_alarm`, one logged line says so.
 
     Raises:
-        InputError: not a float tensor (N,D), not finite, fewer frames than two of the shortest periods, or
+        InputError: not a float tensor (N,D), not finite, fewer places than two of the shortest periods, or
             than the window where `short` is "refuse".
 
     Example:
@@ -146,27 +146,25 @@ class SpectrogramAnalysis(PeriodFinder):
         self.short = short
         self._logged: set[str] = set()
 
-    def chunks(self, frames: int) -> list[tuple[int, int]]:
-        """The chunks [start, stop) that a traverse of `frames` frames is cut into."""
+    def chunks(self, places: int) -> list[tuple[int, int]]:
+        """The chunks [start, stop) that a route of so many places is cut into."""
         shortest = 2 * self.min_period
-        if frames < shortest:
+        if places < shortest:
             raise InputError(
-                f"the traverse has {frames} frame{'s' * (frames != 1)}; expected at least {shortest}, "
+                f"the route has {places} place{'s' * (places != 1)}; expected at least {shortest}, "
                 f"two periods of {self.min_period}"
             )
-        window = min(self.window, frames)
-        if window < self.window:
-            if self.short == "refuse":
-                raise InputError(
-                    f"the traverse has {frames} frames; expected at least {self.window}, the window, "
-                    "or a shorter window, or short='shrink'"
-                )
-            self._warn_once(f"window shrunk from {self.window} to {frames} frames, the whole traverse")
+        window = min(self.window, places)
+        if window < self.window and self.short == "refuse":
+            raise InputError(
+                f"the route has {places} places; expected at least {self.window}, the window, "
+                "or a shorter window, or short='shrink'"
+            )
         hop = min(self.hop or window, window)
-        chunks = [(start, start + window) for start in range(0, frames - window + 1, hop)]
+        chunks = [(start, start + window) for start in range(0, places - window + 1, hop)]
         rest = chunks[-1][0] + hop
-        if chunks[-1][1] < frames and frames - rest >= shortest:
-            chunks.append((rest, frames))
+        if chunks[-1][1] < places and places - rest >= shortest:
+            chunks.append((rest, places))
         return chunks
 
     def forward(self, features: Tensor) -> tuple[Spectrum, ...]:
@@ -175,14 +173,18 @@ class SpectrogramAnalysis(PeriodFinder):
         return tuple(Spectrum(start, stop, chunk_power(features[start:stop])) for start, stop in chunks)
 
     def plan(self, features: Tensor) -> Plan:
-        """The layers of a traverse, the one place where gradients stop.
+        """The layers of a route, where gradients stop.
 
         Shape: features (N,D) -> plan, ordered by chunk and then by period.
         """
         check_features(features)
+        places = len(features)
+        chunks = self.chunks(places)
+        if chunks == [(0, places)] and places < self.window:
+            self._warn_once(f"window shrunk from {self.window} to {places} places, the whole route")
         layers = []
         with torch.no_grad():
-            for start, stop in self.chunks(len(features)):
+            for start, stop in chunks:
                 bins, share = self._strongest(features[start:stop])
                 if self._stands_out(share, start, stop):
                     layers += layers_of(bins, start, stop)
@@ -200,12 +202,12 @@ class SpectrogramAnalysis(PeriodFinder):
         return torch.cat(kept, 1), torch.cat(shares)
 
     def _stands_out(self, share: Tensor, start: int, stop: int) -> bool:
-        """Whether any frequency of a chunk is stronger than noise that is new in every frame."""
+        """Whether any frequency of a chunk is stronger than noise that is new at every place."""
         if self.false_alarm is None:
             return True
         least = noise_share((stop - start) // 2, len(share), self.false_alarm)
         if least > HANN_PEAK:
-            self._warn_once(f"frames {start}-{stop - 1}: too few to tell a period from noise; no layers here")
+            self._warn_once(f"places {start}-{stop - 1}: too few to tell a period from noise; no layers here")
         return bool((share > least).any())
 
     def _warn_once(self, message: str) -> None:

@@ -14,7 +14,7 @@ from dejavu_torch.types import InputError
 
 
 def common_period(periods: Sequence[Fraction | int]) -> Fraction:
-    """Least common multiple of the periods, in frames: the number of places they can tell apart.
+    """Least common multiple of the periods: the number of places they can tell apart.
 
     Not their product: the paper's 93 and 171 share a factor 3. With fractions it is the shortest
     time after which all of them are back at phase 0.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_places
+from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.memory import concatenate
@@ -206,7 +208,7 @@ class RouteData(LightningDataModule):
                 f"{len(reference)} places; expected {option}"
             )
         if isinstance(self.reference, ResampledTraverse):
-            known = ground_truth_in_places(known, self.reference.place_of)
+            known = ground_truth_in_places(known, partial(place_of, self.reference.positions))
         return StoredFrames([values], known)
 
     def _check_length(self, name: str, frames: int) -> None:

@@ -54,7 +54,7 @@ class MapExport(Callback):
             log.warning("no step was taken: no map is written")
             return
         if self.began in (None, step):
-            log.warning("nothing was trained: max_steps counts from the start, and step %d is reached", step)
+            log.warning("nothing was trained: step %d is reached; max_steps counts from the start", step)
         best = best_checkpoint(trainer)
         if best is not None and not Path(best).is_file():
             log.warning("%s is gone: the map is of the last step", best)

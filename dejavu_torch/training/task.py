@@ -316,7 +316,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             frames = batch.frames if self.trainer.testing else self.data.validated(batch)
             with torch.autocast(self.device.type, enabled=False):
                 match = best_match(self(frames))
-            index = self.route.place_of(self.route.frame_of(match.index))  # one place for each frame shown
+            index = self.route.scored(match.index)
             self.metric.update(match._replace(index=index), batch.truth)
 
     def on_validation_epoch_end(self) -> None:

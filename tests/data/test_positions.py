@@ -6,7 +6,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.data.positions import NEAR, look_up, nearest_places, shown_frames
+from dejavu_torch.data.positions import (
+    NEAR,
+    borders,
+    look_up,
+    nearest_places,
+    place_of,
+    shown_frames,
+)
 
 WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
     lambda steps: torch.tensor([0.0, *steps]).cumsum(0)
@@ -41,6 +48,8 @@ def test_convention_11_standing_and_going_back_add_no_places() -> None:
     positions = torch.tensor([0.0, 1, 2, 2, 2, 1, 0, 1, 2, 3])
     assert shown_frames(positions).tolist() == [0, 1, 2, 9]
     assert nearest_places(positions).tolist() == [0, 1, 2, 2, 2, 1, 0, 1, 2, 3]
+    assert borders(positions).tolist() == [0, 1, 2, 9, 10]
+    assert place_of(positions, torch.tensor([[8, -1]])).tolist() == [[2, -1]]
 
 
 def test_minus_one_stays() -> None:

@@ -345,7 +345,7 @@ def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right() -> None:
 )
 def test_a_truth_whose_parts_do_not_fit_is_refused(known: tuple[int, ...], soft: tuple[int, ...]) -> None:
     parts = torch.ones(known, dtype=torch.bool), torch.zeros(soft, dtype=torch.int64)
-    with refused("known and soft places are", "(2,) and (2, S)"):
+    with refused("judged and ignored are", "(2,) and (2, S)"):
         evaluate(match_of([0, 1]), GroundTruth(torch.zeros(2, 1).long(), *parts), 5)
     with refused("the truth is (3, 1)", "(2, R)"):
         evaluate(match_of([0, 1]), GroundTruth(torch.zeros(3, 1).long(), *parts), 5)

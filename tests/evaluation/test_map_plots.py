@@ -14,7 +14,7 @@ from dejavu_torch.types import FrequencyLayer
 
 def test_chunks_are_drawn_at_their_periods() -> None:
     plan = (layer(93, 0, 512, 4), layer(171, 0, 512), layer(Fraction(195, 2), 512, 1024))
-    figure, axis = plot_chunks(plan, 1024)
+    figure, axis = plot_chunks(plan, torch.arange(1025), "frames")
     drawn = {tuple(map(tuple, part.get_segments()[0].tolist())) for part in axis.collections}
     assert drawn == {
         ((0, 93), (512, 93)),
@@ -25,12 +25,14 @@ def test_chunks_are_drawn_at_their_periods() -> None:
 
 
 def test_chunks_of_a_route_without_layers() -> None:
-    assert "this route does not repeat: no layers" in texts(plot_chunks((), 100)[0])
+    assert "this route does not repeat: no layers" in texts(plot_chunks((), torch.arange(101), "frames")[0])
 
 
 def test_activations_show_the_scores_and_mark_the_best() -> None:
     layers, scores = (layer(4, 8, 16), layer(2, 8, 16)), torch.rand(2, 8)
-    figure, rows = plot_activations(layers, scores, scores.sum(0), 5, [11], torch.rand(3, 6, 8))
+    figure, rows = plot_activations(
+        layers, scores, scores.sum(0), 5, torch.arange(21), [11], torch.rand(3, 6, 8)
+    )
     for axis, values in zip(rows[1:], (*scores, scores.sum(0)), strict=True):
         curve, best = axis.lines[:2]
         assert curve.get_xdata().tolist() == list(range(8, 16))
@@ -41,8 +43,31 @@ def test_activations_show_the_scores_and_mark_the_best() -> None:
 
 def test_layers_show_their_phases() -> None:
     layers = [FrequencyLayer(Fraction(tau), tau, 20, 80, tuple(range(tau))) for tau in range(5, 20)]
-    plot = plot_layers(layers)
+    plot = plot_layers(layers, torch.arange(81), "frames")
     render(plot[0])
     shown = plot[1].images[0].get_array()
     assert shown.shape == (12, 60)  # the twelve of most features
     assert shown[0].tolist() == pytest.approx([(i % 8) / 8 for i in range(20, 80)])
+
+
+STANDS = torch.tensor([0, 2, 4, 30, 31, 32, 33, 34, 35])  # the camera stands from frame 4 to 29
+
+
+def test_convention_11_axes_along_the_route_count_frames_and_periods_count_places() -> None:
+    layers = (layer(4, 0, 4), layer(2, 4, 8))
+    figure, axis = plot_chunks(layers, STANDS, "places")
+    drawn = {tuple(part.get_segments()[0][:, 0].tolist()) for part in axis.collections}
+    assert drawn == {(0, 31), (31, 35)}
+    assert axis.get_xlim() == (0, 35)
+    assert {"place (frame)", "period (places)"} <= set(texts(figure))
+    figure, axis = plot_layers(layers[:1], STANDS, "places")
+    assert axis.get_xlim() == (-0.5, 30.5)
+    assert {"place (frame)", "period (places)"} <= set(texts(figure))
+    assert axis.images[0].get_array().shape[:2] == (1, 4)
+    scores = torch.rand(1, 4)
+    figure, rows = plot_activations(layers[1:], scores, scores[0], 77, STANDS, [6], torch.rand(1, 6, 4))
+    assert rows[-1].lines[0].get_xdata().tolist() == [31, 32, 33, 34]
+    assert rows[-1].get_xlim() == (31, 35)
+    assert [line.get_xdata()[0] for line in rows[0].lines] == [33]
+    assert rows[0].images[0].get_extent()[:2] == [31, 35]
+    assert "difference of query 77 (lower is better)" in texts(figure)

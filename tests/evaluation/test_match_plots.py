@@ -8,10 +8,10 @@ from drawn import matched, render, texts
 
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
+    Row,
     example_matches,
     plot_coverage,
-    plot_frames,
-    plot_pairs,
+    plot_rows,
     plot_score_matrix,
     score_matrix,
 )
@@ -27,10 +27,12 @@ def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
 
 
 def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
-    figure, axis = plot_coverage(matched(0, 9, -1, 4), torch.arange(4)[:, None], tolerance=1, places=10)
+    figure, axis = plot_coverage(
+        matched(0, 9, -1, 4), torch.arange(4)[:, None], 1, torch.arange(11), torch.arange(4), "frames"
+    )
     assert dots(axis) == {
         "1 wrong": [(1, 9)],
-        "2 right (within 1 places)": [(0, 0), (3, 4)],
+        "2 right": [(0, 0), (3, 4)],
         "1 not reported": [(2, 0)],
     }
     render(figure)
@@ -40,27 +42,33 @@ def test_coverage_leaves_grey_what_is_not_scored() -> None:
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
     truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
     figure, axis = plot_coverage(
-        matched(0, 1, 7, -1, 9), truth, 0, 10, queries=torch.tensor([10, 20, 30, 40, 50])
+        matched(0, 1, 7, -1, 9), truth, 0, torch.arange(11), torch.tensor([10, 20, 30, 40, 50]), "frames"
     )
     assert dots(axis) == {
         "3 not scored": [(20, 1), (30, 7)],
         "1 wrong": [(50, 9)],
-        "1 right (within 0 places)": [(10, 0)],
+        "1 right": [(10, 0)],
     }
     assert axis.get_xlim() == (10, 50)
-    assert "3 not scored" in texts(figure)
+    assert {"3 not scored", "right within 0 frames"} <= set(texts(figure))
 
 
 def test_coverage_without_truth_or_of_one_query() -> None:
-    figure, axis = plot_coverage(matched(3), None, 5, 10)
+    figure, axis = plot_coverage(matched(3), None, 5, torch.arange(11), torch.arange(1), "frames")
     assert dots(axis) == {"1 reported": [(0, 3)]}
     render(figure)
 
 
 @pytest.mark.parametrize(("channels", "height", "width"), [(1, 32, 32), (3, 32, 64), (3, 20, 100)])
 def test_frames_of_any_shape(channels: int, height: int, width: int) -> None:
-    frames = torch.rand(4, channels, height, width)
-    render(plot_frames(frames, 1 - frames, [1, 5, 9, 13])[0])
+    frames = torch.rand(2, channels, height, width)
+    titles = ["reference, frame 1", "second, frame 2"]
+    figure, axes = plot_rows([Row("", titles, list(frames))] * 3)
+    assert axes.shape == (3, 2)
+    assert set(titles) <= set(texts(figure))
+    image = render(figure)
+    shown = image.width * 3 * height / (2 * width)
+    assert shown < image.height < 1.2 * shown + 300  # little room that is empty
 
 
 def found(index: list[int], score: list[float], below: float = 10.0) -> Match:
@@ -103,16 +111,21 @@ def test_the_right_place_shown_is_the_nearest_to_the_one_reported() -> None:
     assert example.right == 90
 
 
-def test_pairs_show_query_reported_and_right_place_side_by_side() -> None:
-    examples = example_matches(found([0, 9], [0.1, 0.2]), as_ground_truth(torch.arange(2)[:, None]), 0)
-    frames = [[torch.rand(3, 8, 12), torch.rand(1, 16, 16), torch.rand(1, 16, 16)] for _ in examples]
-    figure, axes = plot_pairs(examples, frames)
-    assert {"query 0", "reported: place 9", "right: place 1"} <= {text.strip() for text in texts(figure)}
-    for row, shown in zip(axes, frames, strict=True):
-        for axis, frame in zip(row, shown, strict=True):
-            pixels = torch.as_tensor(axis.images[0].get_array())
-            assert torch.equal(pixels, frame.expand(3, -1, -1).permute(1, 2, 0))
-    assert plot_pairs(examples, [row[:2] for row in frames])[1].shape == (2, 2)
+def test_rows_show_frames_side_by_side_under_their_titles() -> None:
+    frames = [torch.rand(3, 8, 12), torch.rand(1, 16, 16), torch.rand(1, 16, 16)]
+    titles = ["query:\nframe 0", "reported:\nframe 9 of_a_long_name_0009.png", "right:\nframe 1"]
+    missing = [*titles[:2], "right:\nnone is known"]
+    figure, axes = plot_rows([Row("surest answer", titles, frames), Row("other", missing, frames[:2])])
+    assert {"surest answer", "other", "query:\nframe 0", "right:\nnone is known"} <= {
+        text.strip() for text in texts(figure)
+    }
+    for axis, frame in zip(axes[0], frames, strict=True):
+        assert torch.equal(
+            torch.as_tensor(axis.images[0].get_array()), frame.expand(3, -1, -1).permute(1, 2, 0)
+        )
+    assert not axes[1, 2].images
+    assert len({axis.get_title(loc="left").count("\n") for axis in axes[0]}) == 1
+    assert "".join(axes[0, 1].get_title(loc="left").split()) == "".join(titles[1].split())  # wrapped
 
 
 def test_the_score_matrix_holds_block_minima_of_scaled_scores() -> None:
@@ -120,7 +133,7 @@ def test_the_score_matrix_holds_block_minima_of_scaled_scores() -> None:
     matrix = score_matrix(lambda rows: scores[rows[:, 0].long()], torch.arange(30.0)[:, None], cells=20)
     assert matrix is not None
     assert matrix.query.tolist() == list(range(0, 30, 2))
-    assert (matrix.block, matrix.places, matrix.values.shape) == (3, 50, (15, 17))
+    assert (matrix.block, matrix.values.shape) == (3, (15, 17))
     least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
     scaled = ((scores - least) / (median - least)).clamp(max=1)[::2]
     for column, block in enumerate(scaled.split(3, 1)):
@@ -153,11 +166,38 @@ def test_the_score_matrix_is_drawn_with_reported_and_right_places() -> None:
     match, truth = matched(0, 7, -1, 3), as_ground_truth(torch.tensor([[0, 5], [1, -1], [2, -1], [3, -1]]))
     matrix = score_matrix(lambda rows: torch.rand(len(rows), 10), torch.rand(4, 2))
     assert matrix is not None
-    figure, axis = plot_score_matrix(matrix, match, truth)
+    figure, axis = plot_score_matrix(matrix, match, truth, torch.arange(11), torch.arange(4))
     reported, first, second, _ = axis.lines
     assert list(zip(*reported.get_data(), strict=True)) == [(0, 0), (1, 7), (3, 3)]
     assert first.get_ydata().tolist() == [0, 1, 2, 3]
     assert second.get_ydata()[0] == 5
     assert axis.images[0].get_array().shape == (10, 4)
     assert {"reported place", "right place"} <= set(texts(figure))
-    assert "right place" not in texts(plot_score_matrix(matrix, match)[0])
+    assert "right place" not in texts(
+        plot_score_matrix(matrix, match, None, torch.arange(11), torch.arange(4))[0]
+    )
+
+
+def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
+    """Of ten places, the camera stands at the fourth from frame 6 to 29; the query moves twice as fast."""
+    borders = torch.tensor([0, 2, 4, 6, 30, 31, 32, 33, 34, 35, 40])
+    queries, match = torch.tensor([0, 4, 8, 12]), matched(0, 3, -1, 9)
+    truth = as_ground_truth(torch.tensor([[0, -1], [4, -1], [2, -1], [9, 5]]))
+    figure, axis = plot_coverage(match, truth, 1, borders, queries, "places")
+    assert dots(axis) == {"3 right": [(0, 0), (4, 6), (12, 35)], "1 not reported": [(8, 0)]}
+    assert (axis.get_xlim(), axis.get_ylim()[1]) == ((0, 12), 40)
+    labels = {"query (frame)", "reported place (frame)", "right within 1 places"}
+    assert labels <= set(texts(figure))
+    scores = torch.rand(4, 10)
+    for cells, shape in ((20, (10, 4)), (4, (4, 4))):
+        matrix = score_matrix(lambda rows: scores[: len(rows)], torch.rand(4, 2), cells)
+        assert matrix is not None
+        figure, axis = plot_score_matrix(matrix, match, truth, borders, queries)
+        assert axis.images[0].get_array().shape[:2] == shape
+        assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 12.5), (-0.5, 39.5))
+        reported, first, second, _ = axis.lines
+        assert list(zip(*reported.get_data(), strict=True)) == [(0, 0), (4, 6), (12, 35)]
+        assert first.get_xdata().tolist() == [0, 4, 8, 12]
+        assert first.get_ydata().tolist() == [0, 30, 4, 35]
+        assert second.get_ydata()[3] == 31
+        assert {"query (frame)", "place (frame)"} <= set(texts(figure))

@@ -5,11 +5,14 @@ from fractions import Fraction
 
 import pytest
 import torch
+from drawn import texts
+from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, Preprocess, SlidingWindow, SpectrogramAnalysis
 from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
+from dejavu_torch.data.positions import place_of
 from dejavu_torch.evaluation.activation import best_phases
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.pictures import (
@@ -254,3 +257,72 @@ def test_slit_scan_of_a_sliding_window_is_the_strip() -> None:
     assert scan is not None
     assert torch.equal(scan, strip[:, :, 25:125])
     assert slit_scan(ArrayTraverse(torch.rand(20, 4)), 0, 10) is None
+
+
+# a resampled map: places are even steps, the camera stands at one of them
+
+
+@pytest.fixture(scope="module")
+def resampled() -> Localization:
+    periods = SpectrogramAnalysis(window=50, min_period=4, false_alarm=None)
+    model = template_model(HOG(), periods, velocity=camera())
+    reference, query = (model.resample(ArrayTraverse(footage(w)), STEP) for w in (REFERENCE, QUERY))
+    stored, seen = (model.extract_all(traverse) for traverse in (reference, query))
+    model.learn_features(stored, reference)
+    nearest = (REFERENCE - QUERY[query.frame, None]).abs().argmin(1, keepdim=True)
+    truth = as_ground_truth(place_of(reference.positions, nearest))
+    return Localization(model, reference, query, stored, seen, model.localize(seen), truth, 3)
+
+
+def test_convention_11_every_axis_along_a_resampled_route_counts_frames(resampled: Localization) -> None:
+    run, frames = resampled, len(REFERENCE)
+    assert run.model.map.places == 101 < frames
+    pictures = draw_pictures(run, {"map": contend("this map", run.match, run.truth, 3)}) | paper_pictures(run)
+    axes = {name: picture.plot[1] for name, picture in pictures.items()}
+    shown = [frame for line in axes["coverage"].lines for frame in line.get_ydata().tolist()]
+    assert sorted(shown) == sorted(run.model.map.frame_of(run.match.index).tolist())
+    asked = [frame for line in axes["coverage"].lines for frame in line.get_xdata().tolist()]
+    assert sorted(asked) == run.query.frame.tolist()
+    assert axes["coverage"].get_ylim()[1] == axes["chunks"].get_xlim()[1] == frames
+    assert axes["scores"].get_ylim() == (-0.5, frames - 0.5)
+    assert axes["spectrogram"][1].get_xlim() == (0, frames)
+    middle = int(run.model.map.frame_of(torch.tensor(50)))
+    borders = [line.get_xdata()[0] for line in axes["chunks"].lines]
+    assert set(borders) == {0, middle, frames}
+    assert middle > 85  # it stands from frame 60 to 85
+    start, stop = axes["activations"][-1].get_xlim()
+    assert (start, stop) in ((0, middle), (middle, frames))
+    assert axes["activations"][0].images[0].get_array().shape[1] == stop - start  # a column a frame
+    assert axes["layers"].get_xlim() == (start - 0.5, stop - 0.5)
+    for name in ("spectrogram", "chunks", "scores", "activations", "layers"):
+        assert "place (frame)" in texts(pictures[name].plot[0]), name
+
+
+def test_convention_11_what_counts_places_says_so(resampled: Localization) -> None:
+    run = resampled
+    pictures = draw_pictures(run, {"map": contend("this map", run.match, run.truth, 3)}) | paper_pictures(run)
+    for name in ("spectrogram", "chunks", "layers"):
+        assert "period (places at even steps)" in texts(pictures[name].plot[0]), name
+    assert "lag (places at even steps)" in texts(pictures["autocorrelogram"].plot[0])
+    for name in ("coverage", "pr"):
+        assert "right within 3 places at even steps" in texts(pictures[name].plot[0]), name
+    assert "within 3 places at even steps" in pictures["activations"].caption
+    assert pictures["activations"].numbers["start"] in (0, 50)  # as the chunks of report.json
+    assert "period (frames)" in texts(drawn(short(), frames(0), frames(1), None)["chunks"].plot[0])
+
+
+def test_convention_11_frames_of_a_resampled_route_are_called_as_in_the_matches(
+    resampled: Localization,
+) -> None:
+    run = resampled
+    pictures = draw_pictures(run, {}) | paper_pictures(run)
+    titles = [axis.get_title(loc="left") for axis in pictures["pairs"].plot[1].flat]
+    asked, reported = ([int(title.split()[-1]) for title in titles[k::3]] for k in (0, 1))
+    shown = run.model.map.frame_of(run.match.index)
+    pairs = set(zip(run.query.frame.tolist(), shown.tolist(), strict=True))
+    assert set(zip(asked, reported, strict=True)) <= pairs
+    layer = run.model.map.plan[leading_layers(run.model.map.plan)[0]]
+    middle = int(run.model.map.frame_of(torch.tensor((layer.start + layer.stop) // 2)))
+    assert f"drawn on frame {middle} as" in pictures["features"].caption
+    numbers = [axis.get_title(loc="left").split()[-1] for axis in pictures["frames"].plot[1].flat]
+    assert max(int(number) for number in numbers) > 101

@@ -147,7 +147,7 @@ def test_the_summary_tells_what_was_scored() -> None:
 def test_the_page_begins_with_plain_words() -> None:
     baseline = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
     text = headline(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ")
-    for words in ("20 query frames", "32 places", "75.0 %", "0.500", "125 bytes", "2000", "90.0 %"):
+    for words in ("20 queries", "32 places", "75.0 %", "0.500", "125 bytes", "2000", "90.0 %"):
         assert words in text
     unscored = report()._replace(ours=Contender("this map", None))
     assert "no ground truth" in headline(unscored)
@@ -166,6 +166,9 @@ def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path: Path) -> No
     found = key(tmp_path, report({"frames": 32}, uncompressed=frames, null=null, null_same_plan=null))
     assert list(found)[3:] == ["bytes per place", "all, every k-th frame", "null"]
     assert "second" in found["null"]
+    steps = {"step": 6.0, "reference_frames": 40, "query_frames": 30}
+    found = key(tmp_path, report({"resampling": steps}, uncompressed=frames))
+    assert list(found)[3:] == ["all, every k-th place"]
     trained = key(tmp_path, report({"trained": {"steps": 1}}, null=null))["null"]
     assert "backbone" in trained
     assert "second" not in trained

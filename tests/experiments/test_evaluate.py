@@ -172,11 +172,11 @@ def test_report_of_an_evaluation(tmp_path: Path) -> None:
     for text in (
         "matches &lt;judged&gt;",
         "5 queries; right within 3 frames of the truth (",
-        "truth.csv). 4 of the queries are in the truth. ",
+        "truth.csv). 4 of the queries are in the truth. 4 of the queries have a right answer. ",
         "Of 4 scored 3 are accepted, 2 correctly.",
         "<pre>dejavu evaluate matches.csv",
         "precision and recall</h2>",
-        "In its right place it is green",
+        "A query in its right place is green",
     ):
         assert text in page
     # nothing was learnt, and nothing stands beside it

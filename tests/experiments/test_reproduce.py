@@ -75,13 +75,13 @@ def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> No
         aerial.report.facts["map_bytes"],
     )
     mapper = TemplateMapper(SpectrogramAnalysis(512, **PAPER), reduction="sum")
-    other = DejaVu(mapper=mapper).learn_features(aerial.reference_features)
-    scores = evaluate(other.localize(aerial.query_features), aerial.truth, 5)
+    other = DejaVu(mapper=mapper).learn_features(aerial.run.reference_features)
+    scores = evaluate(other.localize(aerial.run.query_features), aerial.run.truth, 5)
     assert (rows[0]["auc"], rows[0]["recall_at_1"]) == (scores.auc, scores.recall_at_1)
     assert rows[0]["bytes_per_place"] == rows[0]["map_bytes"] / FRAMES
     other = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(512, **PAPER)))
-    other.learn_features(aerial.reference_features)
-    again = evaluate(other.localize(aerial.query_features), aerial.truth, 5)
+    other.learn_features(aerial.run.reference_features)
+    again = evaluate(other.localize(aerial.run.query_features), aerial.run.truth, 5)
     assert rows[0]["recall_at_1_comparable"] == again.recall_at_1
 
 
@@ -168,10 +168,10 @@ def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.
 
 @pytest.mark.slow
 def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
-    facts, route = outdoor.report.facts, outdoor.model.map
+    facts, route = outdoor.report.facts, outdoor.run.model.map
     assert facts["unit"] != "frames"
     assert facts["resampling"]["reference_frames"] == facts["resampling"]["query_frames"] == 420
-    assert facts["frames"] == len(outdoor.reference_features) == route.places
+    assert facts["frames"] == len(outdoor.run.reference_features) == route.places
 
     def bend(metres: torch.Tensor) -> float:
         return float((metres - torch.linspace(0, 1, len(metres)) * metres[-1]).abs().max())
@@ -190,12 +190,12 @@ def test_the_measured_distance_is_reported(outdoor: Comparison) -> None:
 
 @pytest.mark.slow
 def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> None:
-    assert outdoor.truth is not None
-    right = outdoor.truth.positives[:, 0]
+    assert outdoor.run.truth is not None
+    right = outdoor.run.truth.positives[:, 0]
     known = right >= 0
     assert known.float().mean() > 0.7
-    reference = metres_of(outdoor, 0, outdoor.model.map.frame_of(right[known]))
-    query = metres_of(outdoor, 1, outdoor.query.frame[known])  # type: ignore[attr-defined]
+    reference = metres_of(outdoor, 0, outdoor.run.model.map.frame_of(right[known]))
+    query = metres_of(outdoor, 1, outdoor.run.query.frame[known])  # type: ignore[attr-defined]
     assert (reference - query).abs().max() < 0.8  # metres; a step is about 0.4
 
 
@@ -203,7 +203,7 @@ def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> 
 def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
     cuts = structure_cuts(open_source("sim:outdoor?frames=420"))
     assert cuts
-    facts, route = outdoor.report.facts, outdoor.model.map
+    facts, route = outdoor.report.facts, outdoor.run.model.map
     places = route.place_of(torch.tensor(cuts)).unique()
     assert (facts["boundaries"]["cuts"], structure_places(outdoor, cuts)) == (len(places), places.tolist())
     nearest = metres_of(outdoor, 0, route.frame_of(places))
@@ -218,9 +218,9 @@ def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
 @pytest.mark.slow
 def test_comparable_scores_are_means_on_the_same_map(outdoor: Comparison) -> None:
     mapper = TemplateMapper(SpectrogramAnalysis(64, **PAPER))
-    model = DejaVu(mapper=mapper).learn_features(outdoor.reference_features)
-    index = model.localize(outdoor.query_features).index
-    right = (index[:, None] - outdoor.truth.positives).abs().amin(1) <= 5  # type: ignore[union-attr]
+    model = DejaVu(mapper=mapper).learn_features(outdoor.run.reference_features)
+    index = model.localize(outdoor.run.query_features).index
+    right = (index[:, None] - outdoor.run.truth.positives).abs().amin(1) <= 5  # type: ignore[union-attr]
     comparable = outdoor.report.contenders["comparable"].scores
     assert comparable is not None
     assert comparable.recall_at_1 == pytest.approx(float(right.float().mean()), abs=0.02)
@@ -263,7 +263,7 @@ def test_given_chunks_end_at_the_cuts() -> None:
     assert GivenChunks([40, 100], min_period=8).chunks(160) == [(0, 40), (40, 100), (100, 160)]
     # pieces under two of the shortest periods join the piece before
     assert GivenChunks([5, 40, 50, 150], min_period=8).chunks(160) == [(0, 40), (40, 160)]
-    with refused("10 frames", "at least 16"):
+    with refused("10 places", "at least 16"):
         GivenChunks([5], min_period=8).chunks(10)
 
 
@@ -306,7 +306,7 @@ def test_a_map_with_known_boundaries_is_learned_and_scored_as_any_other() -> Non
     known, effect = maps["known_boundaries"]
     assert known.scores == evaluate(match, truth[:, None], 0)
     assert effect == boundary_effect(match, as_ground_truth(truth[:, None]), [90], 0)
-    fixed = evaluate(result.match, truth[:, None], 0)  # the default's scores are comparable already
+    fixed = evaluate(result.run.match, truth[:, None], 0)  # the default's scores are comparable already
     assert maps["comparable"][0].scores == fixed
     assert known.scores is not None
     assert known.scores.recall_at_1 > fixed.recall_at_1

@@ -12,6 +12,7 @@ from helpers import refused, template_model
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.positions import place_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 
@@ -105,8 +106,9 @@ def test_the_map_has_the_table_of_the_traverse(model: DejaVu) -> None:
     frames = torch.arange(len(REFERENCE))
     assert torch.equal(model.map.positions, even.positions)
     assert torch.equal(model.map.frame_of(torch.arange(101)), even.frame)
-    assert torch.equal(model.map.place_of(frames), even.place_of(frames))
-    assert even.place_of(torch.tensor([[-1, 0]])).tolist() == [[-1, 0]]
+    assert torch.equal(model.map.borders[:-1], even.frame)
+    assert int(model.map.borders[-1]) == len(REFERENCE)
+    assert torch.equal(model.map.place_of(frames), place_of(even.positions, frames))
 
 
 def test_places_that_show_the_same_frame_are_one() -> None:
@@ -115,17 +117,17 @@ def test_places_that_show_the_same_frame_are_one() -> None:
     for frame in (5, 0):
         shows = (even.frame == frame).nonzero()[:, 0]
         assert 7 <= len(shows) <= 18
-        assert len(even.place_of(even.frame[shows]).unique()) == 1
-        assert shows.min() <= int(even.place_of(torch.tensor(frame))) <= shows.max()
+        assert len(place_of(even.positions, even.frame[shows]).unique()) == 1
+        assert shows.min() <= int(place_of(even.positions, torch.tensor(frame))) <= shows.max()
 
 
 def test_the_way_back_belongs_to_the_places_it_passes() -> None:
     speeds = ((6, 50), (-6, 15), (6, 40))
     where = positions(*speeds)
     even = resampled(*speeds)
-    assert (even.place_of(torch.arange(len(where))) - where / STEP).abs().max() <= 1
+    assert (place_of(even.positions, torch.arange(len(where))) - where / STEP).abs().max() <= 1
     away = resampled((-6, 3), (6, 30), begin=200)
-    assert away.place_of(torch.arange(5)).tolist() == [0, -1, -1, -1, -1]  # behind where it began
+    assert place_of(away.positions, torch.arange(5)).tolist() == [0, -1, -1, -1, -1]  # behind where it began
 
 
 def test_names_and_shape_are_those_of_the_frames_that_are_shown() -> None:

@@ -145,9 +145,9 @@ def test_periods_that_cannot_be_imposed(periods: list[int]) -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    with refused("bin=0", "at least 1 frame"):
+    with refused("bin=0", "at least 1 place"):
         ImposedPeriods(bin=0)
-    with refused("bin=1", "at least 2 frames to stagger"):
+    with refused("bin=1", "at least 2 places to stagger"):
         ImposedPeriods(bin=1, stagger=True)
     for shape in [(1, 4), (8,), (8, 0), (2, 3, 4)]:
         with refused(str(shape), "(N,D) with N >= 2, D >= 1"):

@@ -168,7 +168,7 @@ def test_convention_3_others_shrink_a_long_window_and_say_so(caplog: pytest.LogC
 
 
 def test_convention_3_the_paper_refuses_a_long_window() -> None:
-    with refused("300 frames", "1024"):
+    with refused("300 places", "1024"):
         literal()(torch.randn(300, 1))
     assert len(literal()(torch.randn(1024, 1))) == 1
 
@@ -176,7 +176,7 @@ def test_convention_3_the_paper_refuses_a_long_window() -> None:
 def test_a_chunk_too_short_to_tell_says_so(caplog: pytest.LogCaptureFixture) -> None:
     features = wave(24, 2)[:, None].repeat(1, 500)
     assert SpectrogramAnalysis(24).plan(features) == ()
-    assert "frames 0-23: too few to tell" in caplog.text
+    assert "places 0-23: too few to tell" in caplog.text
     assert SpectrogramAnalysis(24, false_alarm=None).plan(features) != ()
 
 
@@ -310,10 +310,10 @@ def test_arguments_that_make_no_sense_are_refused(arguments: dict, facts: tuple[
         (torch.zeros(100, 2).long(), ("torch.int64", "float")),
         (np.zeros((100, 2), np.float32), ("ndarray", "tensor (N,D)")),
         (torch.full((100, 2), torch.nan), ("not finite",)),
-        (torch.randn(7, 2), ("7 frames", "at least 8", "two periods of 4")),
-        (torch.randn(1, 2), ("1 frame;", "at least 8")),
+        (torch.randn(7, 2), ("7 places", "at least 8", "two periods of 4")),
+        (torch.randn(1, 2), ("1 place;", "at least 8")),
     ],
-    ids=["one axis", "integers", "numpy", "NaN", "7 frames", "1 frame"],
+    ids=["one axis", "integers", "numpy", "NaN", "7 places", "1 place"],
 )
 def test_features_that_do_not_fit_are_refused(features: Tensor, facts: tuple[str, ...]) -> None:
     for refusing in (SpectrogramAnalysis().plan, SpectrogramAnalysis()):

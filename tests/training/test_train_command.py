@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import shlex
 import shutil
 import signal
 import sys
@@ -34,7 +35,10 @@ def figures(path: Path) -> dict[str, list[float]]:
 
 def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
     """The table of figures that a test or validation prints."""
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2].endswith(".ckpt")
+    assert lines[-1].startswith("next: dejavu compare one.npy two.npy --map run/map.safetensors")
+    rows = [line.split() for line in lines]
     return {row[0]: float(row[1]) for row in rows if row and row[0].startswith(("test/", "val/"))}
 
 
@@ -310,7 +314,8 @@ def test_a_run_without_batches_leaves_no_map(
 def test_a_run_that_is_over_warns(folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     last = folder / "run" / "checkpoints" / "last.ckpt"
     train("fit", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path)
-    assert [line for line in warned(caplog) if line.startswith("nothing was trained")]
+    (line,) = [line for line in warned(caplog) if line.startswith("nothing was trained")]
+    assert "step 4 is reached" in line
 
 
 def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
@@ -326,6 +331,9 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
     said = capsys.readouterr()
     assert said.err == "dejavu: interrupted\n"
     assert "written to " in said.out
+    again = shlex.split(said.out.splitlines()[-1].removeprefix("to go on: dejavu "))
+    assert again[:2] == ["train", "fit"]
+    assert again[-2:] == ["--ckpt_path", str(tmp_path / "checkpoints" / "last.ckpt")]
     last = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
     model = DejaVu.load(tmp_path / "map.safetensors", import_module("mine").Interrupted())
     assert model.trained is not None
