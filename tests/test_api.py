@@ -53,6 +53,7 @@ def test_what_the_docstring_names_is_there() -> None:
             assert (PACKAGE / module.replace(".", "/")).with_suffix(".py").exists(), module
 
 
+@pytest.mark.slow
 def test_what_is_heavy_is_loaded_when_it_is_asked_for() -> None:
     code = (
         f"import sys, dejavu_torch; assert set(dejavu_torch.__all__) <= set(dir(dejavu_torch)); "
