@@ -12,12 +12,13 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     eq. 3  distance to every phase of a layer    phase_distances     database.distance
     eq. 4  scores S(i) of all places             TemplateMap         database.template_map
            any kind of map                       PlaceMap            database.place_map
-           what it can tell apart, its bytes     MapSummary          database.summary
+           (ours) their generalisation           SpectralMapper      database.spectral
     eq. 5  best place, eq. 6 acceptance          best_match          recognition.select
     IV-A   HOG features                          HOG, hog            features.hog
     IV-A   window slid along an aerial image     SlidingWindow       data.strip
     IV-B   velocity from the ground              GroundOdometry      motion.odometry, motion.resampling
     IV-A   (ours) channel, local contrast        Preprocess          features.preprocess
+           (ours) few numbers, that tell places  Whitening           features.whitening
     IV-C   precision, recall, area               pr_curve, evaluate  evaluation.curves
     V      (ours) beside baselines and nulls     compare             experiments.compare
     VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
@@ -32,13 +33,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dejavu_torch.data.arrays import ArrayTraverse
-    from dejavu_torch.data.folder import ImageFolder
     from dejavu_torch.data.source import open_source
     from dejavu_torch.data.strip import SlidingWindow
     from dejavu_torch.database.distance import phase_distances
     from dejavu_torch.database.place_map import PlaceMap
-    from dejavu_torch.database.summary import MapSummary
+    from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
     from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
     from dejavu_torch.database.templates import PhaseTemplates, phase_mask
     from dejavu_torch.evaluation.curves import evaluate, pr_curve
@@ -46,6 +45,7 @@ if TYPE_CHECKING:
     from dejavu_torch.features.embedding import Embedding
     from dejavu_torch.features.hog import HOG, hog
     from dejavu_torch.features.preprocess import Preprocess
+    from dejavu_torch.features.whitening import Whitening
     from dejavu_torch.model import DejaVu
     from dejavu_torch.motion.odometry import GroundOdometry
     from dejavu_torch.periods.imposed import ImposedPeriods
@@ -59,15 +59,12 @@ __version__ = "0.1.0"
 
 __all__ = [
     "HOG",
-    "ArrayTraverse",
     "DejaVu",
     "Embedding",
     "FrequencyLayer",
     "GroundOdometry",
-    "ImageFolder",
     "ImposedPeriods",
     "InputError",
-    "MapSummary",
     "Match",
     "PRCurve",
     "PhaseTemplates",
@@ -76,10 +73,13 @@ __all__ = [
     "Preprocess",
     "RouteData",
     "SlidingWindow",
+    "SpectralMap",
+    "SpectralMapper",
     "SpectrogramAnalysis",
     "TemplateMap",
     "TemplateMapper",
     "Traverse",
+    "Whitening",
     "best_match",
     "compare",
     "evaluate",
@@ -92,16 +92,13 @@ __all__ = [
 
 # where each name lives: a room is imported when one of its names is first asked for
 _HOMES = {
-    "ArrayTraverse": "data.arrays",
     "DejaVu": "model",
     "Embedding": "features.embedding",
     "FrequencyLayer": "types",
     "GroundOdometry": "motion.odometry",
     "HOG": "features.hog",
-    "ImageFolder": "data.folder",
     "ImposedPeriods": "periods.imposed",
     "InputError": "types",
-    "MapSummary": "database.summary",
     "Match": "types",
     "PRCurve": "types",
     "PhaseTemplates": "database.templates",
@@ -110,10 +107,13 @@ _HOMES = {
     "Preprocess": "features.preprocess",
     "RouteData": "training.datamodule",
     "SlidingWindow": "data.strip",
+    "SpectralMap": "database.spectral",
+    "SpectralMapper": "database.spectral",
     "SpectrogramAnalysis": "periods.spectrogram",
     "TemplateMap": "database.template_map",
     "TemplateMapper": "database.template_map",
     "Traverse": "types",
+    "Whitening": "features.whitening",
     "best_match": "recognition.select",
     "compare": "experiments.compare",
     "evaluate": "evaluation.curves",

@@ -97,12 +97,12 @@ class DejaVu(nn.Module):
     def __init__(
         self,
         features: nn.Module | None = None,
+        whitening: Whitening | None = None,
         mapper: Mapper | None = None,
         threshold: float | None = None,
         batch_size: int = 64,
         preprocess: Preprocess | None = None,
         velocity: GroundOdometry | None = None,
-        whitening: Whitening | None = None,
     ) -> None:
         super().__init__()
         if mapper is not None and not isinstance(mapper, Mapper):

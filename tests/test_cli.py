@@ -364,7 +364,7 @@ def test_compare_builds_features_of_this_package_by_itself(tmp_path: Path) -> No
     np.save(tmp_path / "a.npy", frames(64, size=16))
     np.save(tmp_path / "b.npy", frames(64, seed=5, size=16))
     features = SmallCNN(dimension=8, channels=1, resize=(16, 16), widths=(4,), squeeze=2)
-    model = DejaVu(features, TemplateMapper(SpectrogramAnalysis(window=64, strongest=1)))
+    model = DejaVu(features, mapper=TemplateMapper(SpectrogramAnalysis(window=64, strongest=1)))
     model.learn(open_source(str(tmp_path / "a.npy"))).save(tmp_path / "a.safetensors")
     pair = tmp_path / "a.npy", tmp_path / "b.npy"
     run("compare", *pair, "--map", tmp_path / "a.safetensors", "--out", tmp_path / "r")

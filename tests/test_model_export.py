@@ -43,7 +43,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
 def learned(backbone: str) -> DejaVu:
     """A model of a route of 60 colour frames."""
     periods = ImposedPeriods([3, 4, 5], bin=4)
-    return DejaVu(BACKBONES[backbone](), TemplateMapper(periods)).learn(torch.rand(60, 3, 32, 24)).eval()
+    return (
+        DejaVu(BACKBONES[backbone](), mapper=TemplateMapper(periods)).learn(torch.rand(60, 3, 32, 24)).eval()
+    )
 
 
 def of_chunks(**settings: Any) -> DejaVu:

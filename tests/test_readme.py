@@ -111,7 +111,7 @@ def test_export_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "road").mkdir()
     shown = re.findall(r"```py\n(.*?)```", TRAINING, re.DOTALL)[-1]
     features = SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2).eval()
-    model = DejaVu(features, TemplateMapper(ImposedPeriods([3, 4]))).learn(torch.rand(50, 3, 64, 64))
+    model = DejaVu(features, mapper=TemplateMapper(ImposedPeriods([3, 4]))).learn(torch.rand(50, 3, 64, 64))
     model.save("road/map.safetensors")
     exec(shown, {})
     frames, program = torch.rand(5, 3, 64, 64), torch.export.load(tmp_path / "road.pt2")

@@ -172,7 +172,7 @@ class SpectralMap(PlaceMap):
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         # an exported program keeps one way, which must not hang on the number of queries
         rebuild = not torch.compiler.is_compiling() and self.rebuilds(queries.shape[0])
-        length = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
+        length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
         parts = [
@@ -181,7 +181,7 @@ class SpectralMap(PlaceMap):
         ]
         products = torch.cat(parts, 1)
         if self.metric == "cosine":
-            return torch.rsub(products * self.per_norm.to(products), 1)
+            return 1 - products * self.per_norm.to(products)
         return (length.square() - 2 * products + self.norms.to(products).square()).clamp(min=0)
 
     def extend(self, features: Tensor) -> None:
@@ -272,6 +272,11 @@ class SpectralMap(PlaceMap):
         heard, lines = self.places - self.silent, len(self.value)
         route["chunks"] = others
         return MapSummary(self.kind, self.places, heard, 0, 0, tuple(chunks), route, {}, lines)
+
+    def mapper_of_equal_size(self) -> SpectralMapper:
+        """Makes maps of other routes with these settings, that take as many bytes a place."""
+        size = self.summary().route_bytes / self.places
+        return SpectralMapper(size, None, self.chunk, self.transform, self.metric)
 
     def _periods(self, energy: Tensor) -> tuple[Fraction, ...]:
         """The periods of the strongest lines, sorted; cosine and sine of one frequency count together."""

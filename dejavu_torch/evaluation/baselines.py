@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from dejavu_torch.database.distance import Metric, phase_distances
+from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.features.hog import HOG
@@ -101,26 +102,10 @@ def baselines_of(
         leave_out: also query the reference with itself, see `leave_out_match`.
         progress: show progress bars on a terminal.
     """
-    frames, dimension = reference.shape
-    summary, itemsize = model.summary(), reference.element_size()
-    backbone = summary.fixed.get("backbone", 0)  # frames need it as well
-    fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
-    strides = {"uncompressed": 1, "stride": fair, "stride_coarsest": max(1, 2 * tolerance)}
-    of = "" if isinstance(model.features, HOG) else "same features, "
+    store = _compact_stores if isinstance(model.map, SpectralMap) else _plain_stores
+    text = "baselines: what is stored as it is" if progress else None
+    found = store(model, reference, query, tolerance, text)
     one = "place" if len(model.map.positions) else "frame"
-    skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
-    names = {
-        "uncompressed": f"{of}all {frames} {one}s{skipped}",
-        "stride": f"{of}{_every(fair, one)} (at least the map's bytes)",
-        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'], one)} (2 x tolerance)",
-    }
-    metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
-    text = "baselines: frames stored as they are" if progress else None
-    nearest = nearest_frames(reference, query, tuple(strides.values()), metric, text)
-    found = {
-        key: Baseline(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k)
-        for (key, k), match in zip(strides.items(), nearest, strict=True)
-    }
     text = "null control: shuffled frames" if progress else None
     foreign = isinstance(getattr(model.mapper, "periods", None), ForeignPeriods)
     if foreign:
@@ -138,6 +123,88 @@ def baselines_of(
         itself = leave_out_match(model, reference, leave_out)
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     return found
+
+
+def _plain_stores(
+    model: DejaVu, reference: Tensor, query: Tensor, tolerance: int, progress: str | None
+) -> dict[str, Baseline]:
+    """The features that a template map is made of, of all frames and of every k-th."""
+    frames, dimension = reference.shape
+    summary, itemsize = model.summary(), reference.element_size()
+    backbone = summary.fixed.get("backbone", 0)  # frames need it as well
+    fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
+    strides = {"uncompressed": 1, "stride": fair, "stride_coarsest": max(1, 2 * tolerance)}
+    of = "" if isinstance(model.features, HOG) else "same features, "
+    one = "place" if len(model.map.positions) else "frame"
+    skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
+    names = {
+        "uncompressed": f"{of}all {frames} {one}s{skipped}",
+        "stride": f"{of}{_every(fair, one)} (at least the map's bytes)",
+        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'], one)} (2 x tolerance)",
+    }
+    metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
+    nearest = nearest_frames(reference, query, tuple(strides.values()), metric, progress)
+    return {
+        key: Baseline(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k)
+        for (key, k), match in zip(strides.items(), nearest, strict=True)
+    }
+
+
+def _compact_stores(
+    model: DejaVu, reference: Tensor, query: Tensor, tolerance: int, progress: str | None
+) -> dict[str, Baseline]:
+    """The descriptors that a spectral map codes: all in float, every k-th and interpolated ones in int8."""
+    frames, dimension = reference.shape
+    summary = model.summary()
+    fixed = summary.fixed_bytes - summary.fixed.get("header", 0)  # whitening and backbone: all need them
+    one = "place" if len(model.map.positions) else "frame"
+    every, spaced = max(1, 2 * tolerance), _spacing(frames, dimension, model.map.summary().route_bytes)
+    short = as_int8(reference)
+    keys = short[torch.arange(0, frames + spaced - 1, spaced).clamp(max=frames - 1)]
+    contenders = {
+        "uncompressed": (f"its descriptors of all {frames} {one}s, float", reference, 1, frames * 4),
+        "stride": (
+            f"its descriptors of {_every(every, one)}, int8",
+            short[::every],
+            every,
+            -(-frames // every),
+        ),
+        "interpolated": (
+            f"interpolated between {_every(spaced, one)}, int8",
+            _interpolated(keys, spaced, frames),
+            spaced,
+            len(keys),
+        ),
+    }
+    metric = model.map.metric
+    found = {}
+    for key, (name, stored, k, numbers) in contenders.items():
+        match = nearest_frames(stored, query, (1,), "l2" if metric == "l2" else "cosine", progress)[0]
+        if key == "stride":
+            match = match._replace(index=torch.where(match.index >= 0, match.index * k, -1))
+        found[key] = Baseline(name, match, numbers * dimension + fixed, k)
+    return found
+
+
+def as_int8(descriptors: Tensor) -> Tensor:
+    """Descriptors as a store of int8 with one scale gives them back. (N,K) -> (N,K) float."""
+    scale = descriptors.abs().max().clamp(min=1e-30) / 127
+    return (descriptors / scale).round() * scale
+
+
+def _spacing(frames: int, dimension: int, route_bytes: int) -> int:
+    """The smallest k whose int8 keyframes, and the last frame, take at most the route's bytes."""
+    fair = (k for k in range(1, frames) if (-(-(frames - 1) // k) + 1) * dimension <= route_bytes)
+    return next(fair, max(1, frames - 1))
+
+
+def _interpolated(keys: Tensor, k: int, frames: int) -> Tensor:
+    """Descriptors of all frames, on straight lines from each keyframe to the next."""
+    position = torch.arange(frames, device=keys.device)
+    low = (position // k).clamp(max=len(keys) - 1)
+    high = (low + 1).clamp(max=len(keys) - 1)
+    width = ((high * k).clamp(max=frames - 1) - low * k).clamp(min=1)
+    return torch.lerp(keys[low], keys[high], ((position - low * k) / width)[:, None].to(keys))
 
 
 def hog_baselines(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dejavu_torch.database.distance import Metric, phase_distances
 from dejavu_torch.database.place_map import Mapper
+from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.database.template_map import TemplateMap, log_posterior
 from dejavu_torch.database.templates import PhaseTemplates
 from dejavu_torch.features.memory import concatenate
@@ -21,8 +22,8 @@ from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 
 def with_mapper(model: DejaVu, mapper: Mapper) -> DejaVu:
-    """A model with the settings and the feature module of another, this mapper, and no map."""
-    return DejaVu(**model.settings() | {"mapper": mapper})
+    """A model for the descriptors of another one, whitened already: its settings, this mapper, no map."""
+    return DejaVu(**model.settings() | {"mapper": mapper, "whitening": None})
 
 
 def template_map_of(model: DejaVu, what: str) -> TemplateMap:
@@ -65,7 +66,10 @@ def null_control(
     """
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
     shuffled = concatenate(reference[part] for part in order.to(reference.device).split(256))
-    null = with_mapper(model, model.mapper)
+    mapper = model.mapper
+    if isinstance(model.map, SpectralMap):  # as many bytes, however the map's own step was chosen
+        mapper = model.map.mapper_of_equal_size()
+    null = with_mapper(model, mapper)
     if same_plan:
         null.map = _same_layers(template_map_of(model, "the null of the same layers"), shuffled)
     else:

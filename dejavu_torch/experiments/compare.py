@@ -24,6 +24,7 @@ from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.summary import MapSummary
+from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
@@ -33,6 +34,7 @@ from dejavu_torch.experiments.evaluate import evaluation_facts
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.views import Views
 from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
@@ -66,6 +68,7 @@ def compare(
     leave_out: int | None = None,
     seed: int = 0,
     interpolate: bool = False,
+    second: Views | None = None,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -81,6 +84,7 @@ def compare(
             the query from every mean; a diagnostic.
         seed: of the shuffle of the null control.
         interpolate: see `find_ground_truth`.
+        second: see `DejaVu.describe_reference`; another traverse than the query.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -89,7 +93,7 @@ def compare(
     model = DejaVu() if model is None else model
     reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
-    _check_sizes(model, reference, query)
+    features = _check_sizes(model, reference, query)
     seconds: dict[str, float] = defaultdict(float)
     has_map = model.map.places > 0
     work = "describe" if has_map else "learn"
@@ -107,15 +111,17 @@ def compare(
     with timed(seconds, work):
         if has_map and reference.length is not None:
             _check_places(model.map, reference.name, reference.length)
-        places = model.extract_all(reference, "describing the reference" if progress else None)
+        text = "describing the reference" if progress else None
         if has_map:
+            places = model.extract_all(reference, text)
             _check_map(model, places, reference.name, tolerance)
         else:
+            places = model.describe_reference(reference, second, text)
             model.learn_features(places, reference)
     with timed(seconds, "localize"):
+        model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)
-        model.check_queries(query.frame_shape, queries.shape[1], query.name)
-        match = model.localize(queries)
+        match = model.localize_descriptors(queries)
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
@@ -153,6 +159,8 @@ def _check_arguments(
     for name, value in (("tolerance", tolerance), ("leave_out", leave_out)):
         if value is not None and value < 0:
             raise InputError(f"{name} is {value}; expected at least 0")
+    if leave_out is not None and not isinstance(model.mapper, TemplateMapper):
+        raise InputError(f"leave_out is {leave_out}, but it is of template maps: expected a TemplateMapper")
     if leave_out is not None and model.map.places and model.trained is not None:
         raise InputError(
             f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"
@@ -161,8 +169,8 @@ def _check_arguments(
         check_ground_truth(truth, interpolate)
 
 
-def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
-    """Refuse, before the long work, traverses whose frames do not give as many features."""
+def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
+    """How many features a frame gives; refuse, before the long work, traverses that do not give as many."""
     counts = [next(feature_batches(traverse, model.pipeline, 1)).shape[1] for traverse in (reference, query)]
     if counts[0] != counts[1]:
         seen = " and ".join(
@@ -170,13 +178,14 @@ def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> None:
             for traverse, count in zip((reference, query), counts, strict=True)
         )
         raise InputError(f"{seen}; expected as many, as frames of one size give")
+    return counts[0]
 
 
 def _check_map(model: DejaVu, features: Tensor, name: str, tolerance: int) -> None:
     """Refuse a map of another number of places, and warn of one that does not find its own reference."""
     _check_places(model.map, name, len(features))
     sample = torch.arange(0, len(features), max(1, len(features) // SAMPLED))
-    found = (model.localize(features[sample]).index - sample).abs() <= max(tolerance, NEAR)
+    found = (model.localize_descriptors(features[sample]).index - sample).abs() <= max(tolerance, NEAR)
     if found.float().mean() < 0.5 and model.map.summary().covered:
         log.warning(
             "the map finds %d of %d frames of %s; expected the reference that it was made of",
@@ -221,7 +230,7 @@ def _is_plain_hog(model: DejaVu) -> bool:
     """Whether the uncompressed baseline is HOG with its defaults, by L1."""
     pairs = (model.preprocess, Preprocess()), (model.features, HOG())
     same = all(recipe_of(own, REGISTRY) == recipe_of(plain, REGISTRY) for own, plain in pairs)
-    return same and getattr(model.map, "metric", "l1") == "l1"
+    return same and model.whitening is None and getattr(model.map, "metric", "l1") == "l1"
 
 
 def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
@@ -238,6 +247,7 @@ def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
         "full_bytes": features.numel() * features.element_size(),
         "templates": summary.templates,
         "template_numbers": summary.template_numbers,
+        "lines": summary.lines,
         "periods": sorted({plain_number(period) for chunk in summary.chunks for period in chunk.periods}),
         "chunks": [
             {

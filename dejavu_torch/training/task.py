@@ -102,7 +102,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         mapper = TemplateMapper(ImposedPeriods()) if mapper is None else mapper
         if not isinstance(mapper, TemplateMapper):
             raise InputError(f"the mapper is {type(mapper).__name__}; expected a TemplateMapper")
-        self.dejavu = DejaVu(backbone, mapper, batch_size=batch_size, preprocess=preprocess)
+        self.dejavu = DejaVu(backbone, mapper=mapper, batch_size=batch_size, preprocess=preprocess)
         if start is not None:
             start_from(backbone, start)
         self.frozen = [module.eval() for module in freeze_parts(backbone, freeze or [], batch_norm)]

@@ -10,7 +10,8 @@ from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, ArrayTraverse, DejaVu, Match, Preprocess, SlidingWindow, SpectrogramAnalysis
+from dejavu_torch import HOG, DejaVu, Match, Preprocess, SlidingWindow, SpectrogramAnalysis
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.evaluation.activation import best_phases

@@ -11,7 +11,8 @@ from footage import footage as ground
 from helpers import Fixed, refused, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, ArrayTraverse, DejaVu, InputError, SpectrogramAnalysis
+from dejavu_torch import HOG, DejaVu, InputError, SpectrogramAnalysis
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.compare import compare

@@ -13,8 +13,9 @@ from footage import QUERY, REFERENCE, camera, everything, footage
 from helpers import Fixed, refused, template_model
 from PIL import Image
 
-from dejavu_torch import FrequencyLayer, ImageFolder
+from dejavu_torch import FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.evaluation.report import score_table, text_table, write_report

@@ -245,7 +245,7 @@ def test_a_map_brings_the_whitening_back(tmp_path: Path) -> None:
     assert net.coder is not None
     net.coder.whiten(*net.describe(torch.rand(40, 3, 16, 16)).detach().split(20))
     net.eval()
-    model = DejaVu(net, TemplateMapper(ImposedPeriods([3], bin=1))).learn(frames)
+    model = DejaVu(net, mapper=TemplateMapper(ImposedPeriods([3], bin=1))).learn(frames)
     model.save(tmp_path / "map.safetensors")
     empty = Embedding(nn.Conv2d(3, 4, 3), dimension=5, resize=(16, 16), grid=2, hidden=6, noise=0.3, kept=7)
     again = DejaVu.load(tmp_path / "map.safetensors", features=empty)

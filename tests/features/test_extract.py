@@ -9,7 +9,8 @@ import torch
 from helpers import refused
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, ArrayTraverse, InputError, Traverse, types
+from dejavu_torch import HOG, InputError, Traverse, types
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.extract import feature_batches, features_of
 
 
