@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -72,9 +72,10 @@ class DejaVu(nn.Module):
 
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
-        whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; None
-            keeps the features as they are.
-        mapper: makes the map from the descriptors of a traverse; None is TemplateMapper with its defaults.
+        whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; "none"
+            keeps the features as they are. None is what suits the mapper: Whitening with its defaults ahead
+            of a SpectralMapper, "none" ahead of templates.
+        mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
@@ -97,7 +98,7 @@ class DejaVu(nn.Module):
     def __init__(
         self,
         features: nn.Module | None = None,
-        whitening: Whitening | None = None,
+        whitening: Whitening | Literal["none"] | None = None,
         mapper: Mapper | None = None,
         threshold: float | None = None,
         batch_size: int = 64,
@@ -105,6 +106,8 @@ class DejaVu(nn.Module):
         velocity: GroundOdometry | None = None,
     ) -> None:
         super().__init__()
+        if whitening not in (None, "none") and not isinstance(whitening, Whitening):
+            raise InputError(f"the whitening is {whitening!r}; expected a Whitening, 'none' or None")
         if mapper is not None and not isinstance(mapper, Mapper):
             raise InputError(
                 f"the mapper is a {type(mapper).__name__}; expected a Mapper such as TemplateMapper"
@@ -115,8 +118,10 @@ class DejaVu(nn.Module):
             raise InputError("the threshold is NaN; expected a number")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
-        self.whitening = whitening
-        self.mapper = TemplateMapper() if mapper is None else mapper
+        self.mapper = SpectralMapper() if mapper is None else mapper
+        if whitening is None and self.mapper.whitens:
+            whitening = Whitening()
+        self.whitening = whitening if isinstance(whitening, Whitening) else None
         self.threshold = threshold
         self.batch_size = batch_size
         self.velocity = velocity
@@ -128,7 +133,8 @@ class DejaVu(nn.Module):
 
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
-        return {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
+        own = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
+        return own | {"whitening": self.whitening or "none"}
 
     def learn(
         self, traverse: Traverse | Tensor, progress: bool = False, second: Views | None = None
@@ -462,7 +468,8 @@ def _build_parts(header: dict[str, Any], features: nn.Module | None) -> dict[str
         own, stored = recipe_of(features, REGISTRY), Recipe(**header["features"])
         if own not in with_parts(stored):
             raise InputError(f"it was learned with {difference(stored, own)}")
-    return {name: _build(header, name, features) for name in PARTS}
+    parts = {name: _build(header, name, features) for name in PARTS}
+    return parts | {"whitening": parts["whitening"] or "none"}
 
 
 def _build(header: dict[str, Any], name: str, features: nn.Module | None) -> nn.Module | None:

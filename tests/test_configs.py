@@ -22,7 +22,7 @@ from dejavu_torch.experiments.reproduce import paper_model
 from dejavu_torch.model import PARTS, REGISTRY
 
 ROOT = Path(__file__).parents[1]
-PRESETS = ["default", "paper"]
+PRESETS = ["default", "local_maxima", "paper"]
 
 
 def model_of(name: str) -> DejaVu:
@@ -34,7 +34,8 @@ def model_of(name: str) -> DejaVu:
 def settings(model: DejaVu) -> dict[str, Any]:
     parts = {name: getattr(model, name) for name in PARTS}
     recipes = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
-    return recipes | {name: value for name, value in model.settings().items() if name not in PARTS}
+    rest = {name: value for name, value in model.settings().items() if name not in PARTS}
+    return recipes | rest | {"whitening": recipes["whitening"] or "none"}
 
 
 def written(name: str) -> dict[str, Any]:

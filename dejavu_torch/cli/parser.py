@@ -17,10 +17,8 @@ COMMAND = "command"  # the parameter that is the command line itself
 # classes whose options can be given alone, where the constructor's type is a base class
 DEFAULT_PARTS = {
     "features": {"class_path": "dejavu_torch.HOG"},
-    "mapper": {
-        "class_path": "dejavu_torch.TemplateMapper",
-        "init_args": {"periods": {"class_path": "dejavu_torch.SpectrogramAnalysis"}},
-    },
+    "whitening": {"class_path": "dejavu_torch.Whitening"},
+    "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
 }
 HINT = (
     "Parts have options of their own, such as --features.cell 4, --mapper.reduction sum, "

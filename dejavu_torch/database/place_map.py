@@ -181,11 +181,13 @@ class Mapper(nn.Module, ABC):
 
     Attributes:
         kind: of its maps, the name that they store.
+        whitens: whether it expects descriptors that are whitened, unless it is told otherwise.
 
     Shape: features (N,D) float -> PlaceMap of N places.
     """
 
     kind: ClassVar[str]
+    whitens: ClassVar[bool] = False
 
     @abstractmethod
     def forward(self, features: Tensor) -> PlaceMap:

@@ -320,6 +320,7 @@ class SpectralMapper(Mapper):
     """
 
     kind = SpectralMap.kind
+    whitens = True
 
     def __init__(
         self,

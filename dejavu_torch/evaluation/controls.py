@@ -23,7 +23,7 @@ from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 def with_mapper(model: DejaVu, mapper: Mapper) -> DejaVu:
     """A model for the descriptors of another one, whitened already: its settings, this mapper, no map."""
-    return DejaVu(**model.settings() | {"mapper": mapper, "whitening": None})
+    return DejaVu(**model.settings() | {"mapper": mapper, "whitening": "none"})
 
 
 def template_map_of(model: DejaVu, what: str) -> TemplateMap:

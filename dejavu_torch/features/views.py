@@ -10,6 +10,8 @@ from torch import Tensor
 
 from dejavu_torch.types import InputError, Traverse
 
+BLOCK = 64  # frames augmented at once
+
 
 class Views(NamedTuple):
     """traverse: frames of places of the reference. places: (n,) int64, which place each of them shows."""
@@ -19,14 +21,14 @@ class Views(NamedTuple):
 
 
 class AugmentedTraverse(Traverse):
-    """Augmented copies of a traverse's frames: all of the first frame, all of the second, and so on.
+    """Augmented copies of a traverse's frames: one of each frame of a block, another of each, and so on.
 
     Args:
         traverse: frames (B,C,H,W).
         frames: their number N.
         copies: of each frame. most: in all; frames are drawn evenly where there would be more.
-        strengths: arguments of `Augmentation`; None is its defaults.
-        seed: of the copies; the same batch size gives the same copies.
+        strengths: arguments of `Augmentation`.
+        seed: of the copies.
 
     Raises:
         InputError: ready features.
@@ -38,7 +40,7 @@ class AugmentedTraverse(Traverse):
         frames: int,
         copies: int,
         most: int,
-        strengths: Mapping[str, Any] | None = None,
+        strengths: Mapping[str, Any],
         seed: int = 0,
     ) -> None:
         from dejavu_torch.features.augmentation import Augmentation  # kornia takes a second to import
@@ -47,18 +49,20 @@ class AugmentedTraverse(Traverse):
             raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
         self.traverse, self.copies, self.seed = traverse, copies, seed
         self.shown = range(0, frames, max(1, -(-frames * copies // most)))
-        self.augmentation = Augmentation(**(strengths or {})).train()
+        self.block = traverse.batch_size(BLOCK)  # of frames, whatever the batch size: the same copies
+        self.augmentation = Augmentation(**strengths).train()
         self.name = f"augmented copies of {traverse.name}"
         self.length = copies * len(self.shown)
 
     def batches(self, size: int) -> Iterator[Tensor]:
         state = torch.Generator().manual_seed(self.seed).get_state()
-        for batch in self.traverse.select(self.shown, max(1, size // self.copies)):
-            with torch.random.fork_rng(devices=[]):
-                torch.set_rng_state(state)
-                copies = torch.stack([self.augmentation(batch) for _ in range(self.copies)], 1)
-                state = torch.get_rng_state()
-            yield copies.flatten(0, 1)
+        for frames in self.traverse.select(self.shown, self.block):
+            for _ in range(self.copies):
+                with torch.random.fork_rng(devices=[]):
+                    torch.set_rng_state(state)
+                    copies: Tensor = self.augmentation(frames)
+                    state = torch.get_rng_state()
+                yield from copies.split(size)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
@@ -68,4 +72,5 @@ class AugmentedTraverse(Traverse):
     @property
     def views(self) -> Views:
         """The copies with the frames that they show."""
-        return Views(self, torch.tensor(self.shown).repeat_interleave(self.copies))
+        blocks = torch.tensor(self.shown).split(self.block)
+        return Views(self, torch.cat([block.repeat(self.copies) for block in blocks]))

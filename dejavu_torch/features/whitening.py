@@ -20,6 +20,18 @@ PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
 COMPONENTS = 400  # that whitening works on
 SPARE = 32  # further directions of the randomised subspace, which make it near the true one
 ROUNDS = 3  # of its iteration
+STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
+    "colour": [0.2, 0.05],
+    "rotation": 3.0,
+    "shift": [0.02, 0.04],
+    "scale": 0.05,
+    "exposure": [0.4, 0.3],
+    "gamma": 0.5,
+    "illumination": 0.25,
+    "blur": 1.2,
+    "occlusion": 0.4,
+    "noise": 0.03,
+}
 ROUNDING = 1e-7  # of the largest variance: what lies below it is none
 
 
@@ -90,7 +102,7 @@ class Whitening(nn.Module):
         shrinkage: of `learned_whitening`.
         views: augmented copies of each frame; frames are drawn evenly where there are more than `most_views`.
         most_views: copies in all.
-        strengths: arguments of `Augmentation`; None is its defaults.
+        strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
         seed: of the copies.
         bits: of each number of the projection, 8 or 16.
 
@@ -142,7 +154,7 @@ class Whitening(nn.Module):
             )
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
         self.most_views, self.seed, self.bits = most_views, seed, bits
-        self.strengths = None if strengths is None else dict(strengths)
+        self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # learned elsewhere: it serves this route as it is
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), in units of `scale`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
