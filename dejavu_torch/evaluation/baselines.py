@@ -111,8 +111,8 @@ def baselines_of(
     skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
     names = {
         "uncompressed": f"{of}all {frames} {one}s{skipped}",
-        "stride": f"{of}{_every(fair, one)} (at least the map's bytes)",
-        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'], one)} (2 x tolerance)",
+        "stride": f"{of}{every(fair, one)} (at least the map's bytes)",
+        "stride_coarsest": f"{of}{every(strides['stride_coarsest'], one)} (2 x tolerance)",
     }
     metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
     text = "baselines: frames stored as they are" if progress else None
@@ -163,12 +163,13 @@ def hog_baselines(
     frames, dimension = stored.shape
     return {
         key: Baseline(
-            f"HOG, {_every(k, one)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
+            f"HOG, {every(k, one)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
         )
         for (key, k), match in zip(strides.items(), nearest, strict=True)
     }
 
 
-def _every(k: int, one: str) -> str:
+def every(k: int, one: str) -> str:
     """In words: every k-th frame, or place where these are not frames."""
-    return f"every {one}" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } {one}"
+    ending = "th" if k % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(k % 10, "th")
+    return f"every {one}" if k == 1 else f"every {k}{ending} {one}"

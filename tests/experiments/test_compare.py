@@ -170,6 +170,15 @@ def test_leaving_out_of_a_trained_map_is_refused_at_once(trained: DejaVu) -> Non
     assert "leave_out" in report.contenders
 
 
+def test_a_traverse_matched_with_itself_is_warned_of(model: DejaVu, caplog: pytest.LogCaptureFixture) -> None:
+    same = route(0)
+    compare(same, same, model=model)
+    assert "matched with itself" in caplog.text
+    caplog.clear()
+    compare(same, route(1), model=template_model())  # two tensors, neither of which has a name
+    assert "matched with itself" not in caplog.text
+
+
 def test_a_map_of_another_route_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     def warnings(reference: Tensor, tolerance: int = 2) -> list[str]:
         caplog.clear()
