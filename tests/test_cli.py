@@ -416,7 +416,7 @@ def test_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 def test_too_few_frames(count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_images(tmp_path / "short", frames(count))
     error = fails(capsys, "learn", folder, "--map", tmp_path / "a.safetensors")
-    assert f"{count} frame" in error
+    assert f"{count} place" in error
     assert "at least 8" in error
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.types import InputError, Traverse
 
+UNNAMED = "the array"
 EXPECTED = (
     "frames (N,H,W) or (N,H,W,3) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) float"
 )
@@ -28,7 +29,7 @@ class ArrayTraverse(IndexedTraverse):
         InputError: another shape or type, or no frames.
     """
 
-    def __init__(self, values: Tensor | np.ndarray, name: str = "the array") -> None:
+    def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
         shape, kind = tuple(values.shape), str(values.dtype).removeprefix("torch.")
         pixels = kind == "uint8" and (len(shape) == 3 or (len(shape) == 4 and shape[3] in (1, 3)))
         floats = kind in ("float16", "bfloat16", "float32", "float64") and len(shape) in (2, 4)

@@ -139,8 +139,8 @@ def _plain_stores(
     skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
     names = {
         "uncompressed": f"{of}all {frames} {one}s{skipped}",
-        "stride": f"{of}{_every(fair, one)} (at least the map's bytes)",
-        "stride_coarsest": f"{of}{_every(strides['stride_coarsest'], one)} (2 x tolerance)",
+        "stride": f"{of}{every(fair, one)} (at least the map's bytes)",
+        "stride_coarsest": f"{of}{every(strides['stride_coarsest'], one)} (2 x tolerance)",
     }
     metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
     nearest = nearest_frames(reference, query, tuple(strides.values()), metric, progress)
@@ -158,19 +158,19 @@ def _compact_stores(
     summary = model.summary()
     fixed = summary.fixed_bytes - summary.fixed.get("header", 0)  # whitening and backbone: all need them
     one = "place" if len(model.map.positions) else "frame"
-    every, spaced = max(1, 2 * tolerance), _spacing(frames, dimension, model.map.summary().route_bytes)
+    apart, spaced = max(1, 2 * tolerance), _spacing(frames, dimension, model.map.summary().route_bytes)
     short = as_int8(reference)
     keys = short[torch.arange(0, frames + spaced - 1, spaced).clamp(max=frames - 1)]
     contenders = {
         "uncompressed": (f"its descriptors of all {frames} {one}s, float", reference, 1, frames * 4),
         "stride": (
-            f"its descriptors of {_every(every, one)}, int8",
-            short[::every],
-            every,
-            -(-frames // every),
+            f"its descriptors of {every(apart, one)}, int8",
+            short[::apart],
+            apart,
+            -(-frames // apart),
         ),
         "interpolated": (
-            f"interpolated between {_every(spaced, one)}, int8",
+            f"interpolated between {every(spaced, one)}, int8",
             _interpolated(keys, spaced, frames),
             spaced,
             len(keys),
@@ -230,12 +230,13 @@ def hog_baselines(
     frames, dimension = stored.shape
     return {
         key: Baseline(
-            f"HOG, {_every(k, one)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
+            f"HOG, {every(k, one)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
         )
         for (key, k), match in zip(strides.items(), nearest, strict=True)
     }
 
 
-def _every(k: int, one: str) -> str:
+def every(k: int, one: str) -> str:
     """In words: every k-th frame, or place where these are not frames."""
-    return f"every {one}" if k == 1 else f"every { ({2: '2nd', 3: '3rd'}.get(k, f'{k}th')) } {one}"
+    ending = "th" if k % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(k % 10, "th")
+    return f"every {one}" if k == 1 else f"every {k}{ending} {one}"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, WIDTH, Plot, canvas, show_frame
+from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, LETTERS, WIDTH, Plot, canvas, show_frame
 
 
 def plot_ground(frame: Tensor, corners: Sequence[Sequence[float]], patch: Tensor) -> Plot:
@@ -38,7 +39,7 @@ def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:
         axis.axhline(0, color=GREY, linewidth=0.6)
         axis.axhline(step, color=DARK, linewidth=0.8, linestyle=":")
         axis.set(xlim=(0, len(travelled)), ylabel="pixels of ground\nper frame")
-        axis.set_title(name, loc="left", fontsize=9)
+        axis.set_title(fill(name, LETTERS - 10), loc="left", fontsize=9)
         axis.grid(alpha=0.25)
     axes[-1, 0].set_xlabel("frame (dotted: step between places)")
     return figure, axes

@@ -320,10 +320,15 @@ def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture
     strip = slit_scan(source_of(run.reference), int(borders[start]), int(borders[stop]))
     number = int(run.query_frames[query])
     covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
+    elsewhere = (
+        " Elsewhere: queries from other chunks, the layer's phase counted on; near chance where its period "
+        "ends with the chunk."
+        if rates is not None and rates.fused.outside is not None
+        else ""
+    )
     explained = (
-        f" Right: within {run.tolerance} {run.unit}, for a layer in phase. Elsewhere: queries from other "
-        "chunks, the layer's phase counted on; near chance where its period ends with the chunk. All layers "
-        "fused choose from the whole route."
+        f" Right: within {run.tolerance} {run.unit}, for a layer in phase.{elsewhere} All layers fused "
+        "choose from the whole route."
     )
     picture = Picture(
         plot_activations(layers, scores, fused, number, borders, places, strip, rates),

@@ -107,10 +107,11 @@ def headline(report: Report) -> str:
             f"{text}. There is no ground truth, so nothing is scored: see the matches and the pictures, or "
             "give one, such as --truth 12 (place = query + 12) or --truth truth.csv (rows of query,place)."
         )
-    text += (
-        f": {percent(scores.recall_at_1)} were found in their right place (recall@1). Sorted by score, the "
-    )
-    text += f"answers have an area under the precision-recall curve (AUC) of {scores.auc:.3f}; 1 is perfect."
+    answerable = facts.get("with_answer", facts["queries"])
+    some = f" Of the {answerable} that have a right place," if answerable < facts["queries"] else ""
+    text += f"{'.' if some else ':'}{some} {percent(scores.recall_at_1)} were found in their right place "
+    text += "(recall@1). Sorted by score, the answers have an area under the precision-recall curve "
+    text += f"(AUC) of {scores.auc:.3f}; 1 is perfect."
     baseline = report.contenders.get("uncompressed")
     if baseline and baseline.scores and baseline.bytes and report.ours.bytes and "frames" in facts:
         ours, full = (size / facts["frames"] for size in (report.ours.bytes, baseline.bytes))

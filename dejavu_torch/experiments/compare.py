@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.arrays import UNNAMED, as_traverse
 from dejavu_torch.data.ground_truth import (
     as_ground_truth,
     check_ground_truth,
@@ -91,6 +91,7 @@ def compare(
         InputError: bad input of any of the stages, or a map of another number of places.
     """
     model = DejaVu() if model is None else model
+    itself = reference is query
     reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
     features = _check_sizes(model, reference, query)
@@ -104,7 +105,7 @@ def compare(
     find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
     lengths_known = reference.length is not None and query.length is not None
     known = find_truth() if lengths_known else None  # one that does not fit is refused before the long work
-    if reference.name == query.name:
+    if itself or (reference.name == query.name != UNNAMED):
         log.warning(
             "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
         )

@@ -109,7 +109,8 @@ def ideal(result: Comparison, tolerance: int) -> dict[str, Contender]:
     """The database queried with itself: the paper's conditions, and the same with the neighbours left out."""
     model, features = result.run.model, result.run.reference_features
     itself = torch.arange(len(features))[:, None]
-    left_out, name = leave_out_match(model, features, tolerance), f"ideal, +-{tolerance} frames left out"
+    left_out = leave_out_match(model, features, tolerance)
+    name = f"ideal, +-{tolerance} {result.run.unit} left out"
     return {
         "ideal": contend("ideal: the database itself", model.localize(features), itself, tolerance),
         "ideal_leave_out": contend(name, left_out, itself, tolerance),

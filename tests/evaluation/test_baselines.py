@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames, stride_bytes
+from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames, stride_bytes
 
 DISTANCES = {
     "l1": lambda a, b: (a - b).abs().sum(),
@@ -99,3 +99,8 @@ def test_convention_8_the_stride_is_at_most_twice_the_tolerance(
 ) -> None:
     """1000 frames of 10 numbers of 4 bytes."""
     assert fair_stride(1000, 10, 4, map_bytes, tolerance) == k
+
+
+def test_strides_in_words() -> None:
+    words = {1: "every", 2: "every 2nd", 3: "every 3rd", 11: "every 11th", 12: "every 12th", 22: "every 22nd"}
+    assert {k: every(k, "frame") for k in words} == {k: f"{text} frame" for k, text in words.items()}

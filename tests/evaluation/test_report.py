@@ -149,6 +149,8 @@ def test_the_page_begins_with_plain_words() -> None:
     text = headline(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ")
     for words in ("20 queries", "32 places", "75.0 %", "0.500", "125 bytes", "2000", "90.0 %"):
         assert words in text
+    some = headline(report({"frames": 32, "with_answer": 16})).replace("\xa0", " ")
+    assert "Of the 16 that have a right place, 75.0 %" in some  # recall is of those, not of all 20
     unscored = report()._replace(ours=Contender("this map", None))
     assert "no ground truth" in headline(unscored)
     assert "None" not in headline(unscored) + summary(unscored)

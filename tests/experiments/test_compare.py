@@ -171,6 +171,15 @@ def test_leaving_out_of_a_trained_map_is_refused_at_once(trained: DejaVu) -> Non
     assert "leave_out" in report.contenders
 
 
+def test_a_traverse_matched_with_itself_is_warned_of(model: DejaVu, caplog: pytest.LogCaptureFixture) -> None:
+    same = route(0)
+    compare(same, same, model=model)
+    assert "matched with itself" in caplog.text
+    caplog.clear()
+    compare(same, route(1), model=template_model())  # two tensors, neither of which has a name
+    assert "matched with itself" not in caplog.text
+
+
 def test_a_map_of_another_route_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     def warnings(reference: Tensor, tolerance: int = 2) -> list[str]:
         caplog.clear()
@@ -240,7 +249,7 @@ def test_the_curves_show_hog_as_well() -> None:
     periods = SpectrogramAnalysis(window=64, min_period=4, strongest=1)
     model = template_model(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()), periods)
     result = compare(pictures(1), pictures(2), "0", model, tolerance=3)
-    labels = [text.get_text() for text in result.pictures["auc"].plot[1].texts]
+    labels = [" ".join(text.get_text().split()) for text in result.pictures["auc"].plot[1].texts]
     assert {one.name for one in result.report.contenders.values()} < set(labels)
     assert {"HOG, every frame", "HOG, every 6th frame"} < set(labels)
 
