@@ -342,7 +342,7 @@ class SpectralMapper(Mapper):
         check_settings(metric, transform, chunk)
         self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
         self.transform, self.metric = transform, metric
-        self.exact = True  # otherwise the entropy alone tells the step: within a tenth or so, and sooner
+        self.exact = True  # otherwise the entropy alone tells the step: within a fifth or so, and sooner
 
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:

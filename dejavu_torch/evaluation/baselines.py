@@ -114,8 +114,10 @@ def baselines_of(
         log.warning("no null control learned anew: what found the map's periods is not of this package")
     if model.trained is None and not foreign:
         anew = null_control(model, reference, query, seed, progress=text)
-        what = "everything learned from" if isinstance(model.map, TemplateMap) else "as many bytes of"
-        found["null"] = Baseline(f"null: {what} shuffled {one}s", anew)
+        name = f"null: everything learned from shuffled {one}s"
+        if isinstance(model.map, SpectralMap):
+            name = f"null: shuffled {one}s, as many bytes"
+        found["null"] = Baseline(name, anew)
     if isinstance(model.map, TemplateMap):
         same = null_control(model, reference, query, seed, same_plan=True, progress=text)
         if model.trained is None:

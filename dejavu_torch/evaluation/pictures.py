@@ -46,6 +46,7 @@ from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Travers
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 EXAMPLES = 4  # places of which the frames of both traverses are shown
+NOTICED = 0.001  # of an area: less is no gain
 STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
 
 
@@ -273,15 +274,19 @@ def draw_storage(
 def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:
     """Bytes of ours, and those at which the others reach the same area, where they do.
 
-    Convention: between two of their points the area grows with the logarithm of the bytes.
+    Convention: between two of their points the area grows with the logarithm of the bytes. Ours counts where
+    it is better, by more than .001, than all that takes less.
 
     Example:
         >>> others = Stored(4, 0.5, 0.5), Stored(16, 0.9, 0.9)
         >>> equally_good([Stored(1, 0.7, 0.7), Stored(2, 0.95, 0.95)], others)
         [(1, 8.0)]
     """
-    found = []
+    found, best = [], -1.0
     for one in ours:
+        if one.auc <= best + NOTICED:
+            continue
+        best = one.auc
         for low, high in pairwise(others):
             if low.auc <= one.auc <= high.auc and low.auc < high.auc:
                 share = (one.auc - low.auc) / (high.auc - low.auc)
@@ -355,7 +360,7 @@ def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]
         plot_answers(curves, int(run.query_frames[query]), run.borders, start, stop, places, sharey=True),
         "a query's score as a sum of periods",
         "How much one query differs from each place, if only the periods that answer it most strongly are "
-        "added up, and all of them: each is a wave along the route, and only at the right place do they agree."
+        "added up, and all of them: each is a wave along the route, and at the right place they agree."
         + (" Written above: how many wrong places fit better than the right one." if places else ""),
         {"places_that_fit_better": better} if better else {},
     )

@@ -45,6 +45,9 @@ def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, u
     ticks = [4**k for k in range(20) if low <= 4**k <= high]
     axis.set_xticks(ticks, [str(tick) for tick in ticks])
     axis.set_yscale("log")
+    largest = max(float(lines.amplitudes.max()) for lines in features.values()) / step
+    sizes = [10.0**k for k in range(-1, 20) if 10.0**k <= max(largest, 1)]
+    axis.set_yticks(sizes, [f"{size:g}" for size in sizes])
     axis.minorticks_off()
     axis.set(xlim=(low / 1.05, high * 1.15), xlabel=f"period ({unit})")
     axis.set_ylim(bottom=FAINTEST)

@@ -132,7 +132,7 @@ def compare(
     contenders = _contenders(run, seed, leave_out, progress)
     storage = None
     if isinstance(model.map, SpectralMap) and contenders["map"].scores is not None:
-        storage = storage_curve(run, seed=seed)
+        storage = storage_curve(run, seed=seed, progress=progress)
     pictures = draw_pictures(run, contenders, storage)
     carried = all(source_of(one).place is not None for one in (reference, query))
     facts = {

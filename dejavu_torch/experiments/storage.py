@@ -7,6 +7,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_frames
@@ -17,18 +18,19 @@ from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.types import InputError, Match
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
+SMALL = 2**17  # numbers that are coded soon enough to meet a budget to 2 %
 
 
 def storage_curve(
-    run: Localization, budgets: Sequence[float] = BUDGETS, seed: int = 0
+    run: Localization, budgets: Sequence[float] = BUDGETS, seed: int = 0, progress: bool = False
 ) -> dict[str, list[Stored]]:
     """The run's descriptors coded anew at several budgets, each evaluated with the run's queries.
 
     Args:
         run: with a spectral map, whose settings are kept, and a ground truth.
-        budgets: route bytes per place; those that a contender cannot meet are left out. A map is within a
-            tenth or so of them, and stands at what it takes.
-        seed: of the null's shuffle.
+        budgets: route bytes per place; those that a contender cannot meet are left out. The map
+            of a long route is within a fifth or so of them, and stands at what it takes.
+        seed: of the null's shuffle. progress: show a progress bar on a terminal.
 
     Returns:
         By key: `map`, `null` (the descriptors in shuffled order) and `interpolated` (keyframes in int8, and
@@ -52,12 +54,12 @@ def storage_curve(
         "interpolated": partial(_keyframes, run, route),
     }
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
-    for key, localized in kinds.items():
-        for budget in budgets:
-            for match, size in localized(budget):
-                match = match._replace(index=route.scored(match.index))
-                scores = evaluate(match, run.truth, run.tolerance)
-                found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1))
+    cases = [(key, budget) for key in kinds for budget in budgets]
+    for key, budget in tqdm(cases, "storage", disable=None if progress else True, leave=False):
+        for match, size in kinds[key](budget):
+            match = match._replace(index=route.scored(match.index))
+            scores = evaluate(match, run.truth, run.tolerance)
+            found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1))
     return found
 
 
@@ -66,7 +68,7 @@ def _coded(
 ) -> Iterator[tuple[Match, int]]:
     """Matches on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
     mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric)
-    mapper.exact = False
+    mapper.exact = features.numel() < SMALL
     model = with_mapper(run.model, mapper)
     try:
         model.learn_features(features)
@@ -75,7 +77,7 @@ def _coded(
     match = model.localize_descriptors(run.query_features)
     if order is not None:
         match = match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
-    yield match, model.map.summary().route_bytes
+    yield match, sum(tensor.nbytes for tensor in model.map.packed().values())
 
 
 def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:
