@@ -279,8 +279,9 @@ def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple
 
     Example:
         >>> others = Stored(4, 0.5, 0.5), Stored(16, 0.9, 0.9)
-        >>> equally_good([Stored(1, 0.7, 0.7), Stored(2, 0.95, 0.95)], others)
-        [(1, 8.0)]
+        >>> [(ours, theirs)] = equally_good([Stored(1, 0.7, 0.7), Stored(2, 0.95, 0.95)], others)
+        >>> ours, round(theirs, 6)
+        (1, 8.0)
     """
     found, best = [], -1.0
     for one in ours:

@@ -32,7 +32,7 @@ PLACES = 240
 def route(seed: int) -> Tensor:
     noise = torch.randn(PLACES, 6, generator=torch.Generator().manual_seed(seed))
     angle = 2 * torch.pi * torch.arange(PLACES)[:, None] / torch.tensor([60.0, 24, 16, 12, 8, 5])
-    return angle.sin() * torch.tensor([3.5, 2, 3, 4, 5, 0.1]) + 0.1 * noise
+    return (angle + 0.7).sin() * torch.tensor([3.5, 2, 3, 4, 5, 0.1]) + 0.1 * noise
 
 
 def localized(chunk: int | str = "route", scored: bool = True) -> Localization:
