@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import torch
@@ -33,7 +34,7 @@ from dejavu_torch.evaluation.match_plots import (
     score_matrix,
 )
 from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
-from dejavu_torch.evaluation.plots import DARK, Picture
+from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture
 from dejavu_torch.evaluation.score_plots import Stored, plot_auc, plot_curves, plot_storage
 from dejavu_torch.evaluation.spectral_plots import Lines, plot_spectrum
 from dejavu_torch.features.hog import HOG
@@ -356,7 +357,7 @@ def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]
         if places:
             better.append(better_places(scores, [place - start for place in places], run.tolerance))
             title += f": {better[-1]} places fit better"
-        curves.append((title, scores, COLOURS["map"] if number == len(sums) - 1 else DARK))
+        curves.append((fill(title, LETTERS), scores, COLOURS["map"] if number == len(sums) - 1 else DARK))
     picture = Picture(
         plot_answers(curves, int(run.query_frames[query]), run.borders, start, stop, places, sharey=True),
         "a query's score as a sum of periods",
