@@ -32,7 +32,8 @@ def encode(levels: Tensor) -> Stream:
     Shape: (W,K) int8 -> (n,) uint8.
     """
     plain = levels.detach().cpu().contiguous().numpy().tobytes()
-    packed = lzma.compress(plain, format=lzma.FORMAT_RAW, filters=FILTERS)
+    filters = [{**FILTERS[0], "dict_size": max(4096, len(plain))}]  # the same bytes, sooner
+    packed = lzma.compress(plain, format=lzma.FORMAT_RAW, filters=filters)
     return Stream(torch.from_numpy(np.frombuffer(packed, np.uint8).copy()), zlib.crc32(plain))
 
 

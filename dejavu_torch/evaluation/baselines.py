@@ -29,13 +29,15 @@ DISTANCES_AT_ONCE = 2**22
 class Baseline(NamedTuple):
     """Matches of another way to store the route.
 
-    name: for tables. bytes: that it stores. k: where it stores every k-th frame.
+    name: for tables. bytes: that it stores. k: where it stores every k-th frame. fixed: those of the bytes
+    that do not grow with the route, such as a backbone's.
     """
 
     name: str
     match: Match
     bytes: int | None = None
     k: int | None = None
+    fixed: int = 0
 
 
 def nearest_frames(
@@ -112,7 +114,10 @@ def baselines_of(
         log.warning("no null control learned anew: what found the map's periods is not of this package")
     if model.trained is None and not foreign:
         anew = null_control(model, reference, query, seed, progress=text)
-        found["null"] = Baseline(f"null: everything learned from shuffled {one}s", anew)
+        name = f"null: everything learned from shuffled {one}s"
+        if isinstance(model.map, SpectralMap):
+            name = f"null: shuffled {one}s, as many bytes"
+        found["null"] = Baseline(name, anew)
     if isinstance(model.map, TemplateMap):
         same = null_control(model, reference, query, seed, same_plan=True, progress=text)
         if model.trained is None:
@@ -145,7 +150,7 @@ def _plain_stores(
     metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
     nearest = nearest_frames(reference, query, tuple(strides.values()), metric, progress)
     return {
-        key: Baseline(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k)
+        key: Baseline(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k, backbone)
         for (key, k), match in zip(strides.items(), nearest, strict=True)
     }
 
@@ -158,9 +163,8 @@ def _compact_stores(
     summary = model.summary()
     fixed = summary.fixed_bytes - summary.fixed.get("header", 0)  # whitening and backbone: all need them
     one = "place" if len(model.map.positions) else "frame"
-    apart, spaced = max(1, 2 * tolerance), _spacing(frames, dimension, model.map.summary().route_bytes)
-    short = as_int8(reference)
-    keys = short[torch.arange(0, frames + spaced - 1, spaced).clamp(max=frames - 1)]
+    apart, short = max(1, 2 * tolerance), as_int8(reference)
+    between, spaced, keys = interpolated(short, model.map.summary().route_bytes)
     contenders = {
         "uncompressed": (f"its descriptors of all {frames} {one}s, float", reference, 1, frames * 4),
         "stride": (
@@ -169,12 +173,7 @@ def _compact_stores(
             apart,
             -(-frames // apart),
         ),
-        "interpolated": (
-            f"interpolated between {every(spaced, one)}, int8",
-            _interpolated(keys, spaced, frames),
-            spaced,
-            len(keys),
-        ),
+        "interpolated": (f"interpolated between {every(spaced, one)}, int8", between, spaced, keys),
     }
     metric = model.map.metric
     found = {}
@@ -182,7 +181,7 @@ def _compact_stores(
         match = nearest_frames(stored, query, (1,), "l2" if metric == "l2" else "cosine", progress)[0]
         if key == "stride":
             match = match._replace(index=torch.where(match.index >= 0, match.index * k, -1))
-        found[key] = Baseline(name, match, numbers * dimension + fixed, k)
+        found[key] = Baseline(name, match, numbers * dimension + fixed, k, fixed)
     return found
 
 
@@ -192,19 +191,24 @@ def as_int8(descriptors: Tensor) -> Tensor:
     return (descriptors / scale).round() * scale
 
 
-def _spacing(frames: int, dimension: int, route_bytes: int) -> int:
-    """The smallest k whose int8 keyframes, and the last frame, take at most the route's bytes."""
+def interpolated(descriptors: Tensor, route_bytes: float) -> tuple[Tensor, int, int]:
+    """Descriptors of all frames on straight lines between keyframes: every k-th, and the last.
+
+    k is the smallest whose keyframes take at most so many bytes, at a byte a number; two of them where none
+    do.
+
+    Shape: (N,K) -> (N,K), k, number of keyframes.
+    """
+    frames, dimension = descriptors.shape
     fair = (k for k in range(1, frames) if (-(-(frames - 1) // k) + 1) * dimension <= route_bytes)
-    return next(fair, max(1, frames - 1))
-
-
-def _interpolated(keys: Tensor, k: int, frames: int) -> Tensor:
-    """Descriptors of all frames, on straight lines from each keyframe to the next."""
+    k = next(fair, max(1, frames - 1))
+    keys = descriptors[torch.arange(0, frames + k - 1, k).clamp(max=frames - 1)]
     position = torch.arange(frames, device=keys.device)
     low = (position // k).clamp(max=len(keys) - 1)
     high = (low + 1).clamp(max=len(keys) - 1)
     width = ((high * k).clamp(max=frames - 1) - low * k).clamp(min=1)
-    return torch.lerp(keys[low], keys[high], ((position - low * k) / width)[:, None].to(keys))
+    share = ((position - low * k) / width)[:, None].to(keys)
+    return torch.lerp(keys[low], keys[high], share), k, len(keys)
 
 
 def hog_baselines(

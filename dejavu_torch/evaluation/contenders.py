@@ -39,7 +39,7 @@ class Contender(NamedTuple):
     """One way to store the route, how well it is recognised, and what it costs.
 
     scores, curve: None where there is no ground truth. bytes: None where nothing is stored, as by a null.
-    k: where every k-th frame is stored.
+    k: where every k-th frame is stored. fixed: those of the bytes that do not grow with the route.
     """
 
     name: str
@@ -47,6 +47,12 @@ class Contender(NamedTuple):
     bytes: int | None = None
     k: int | None = None
     curve: PRCurve | None = None
+    fixed: int = 0
+
+    @property
+    def route_bytes(self) -> int | None:
+        """Those of the bytes that grow with the route."""
+        return None if self.bytes is None else self.bytes - self.fixed
 
     @property
     def starts(self) -> float | None:
@@ -56,7 +62,12 @@ class Contender(NamedTuple):
     def as_json(self) -> dict[str, Any]:
         """The nested entry of report.json."""
         scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
-        extra = {"bytes": self.bytes, "k": self.k, "curve_starts_at_recall": self.starts}
+        extra = {
+            "bytes": self.bytes,
+            "route_bytes": self.route_bytes,
+            "k": self.k,
+            "curve_starts_at_recall": self.starts,
+        }
         return scores | {name: value for name, value in extra.items() if value is not None}
 
 
@@ -67,12 +78,13 @@ def contend(
     tolerance: int,
     bytes: int | None = None,
     k: int | None = None,
+    fixed: int = 0,
 ) -> Contender:
     """Matches as a contender, without scores where there is no ground truth or no query that it scores."""
     if truth is None or not counted(match.index, as_ground_truth(truth), tolerance).any():
-        return Contender(name, None, bytes, k)
+        return Contender(name, None, bytes, k, fixed=fixed)
     scores, curve = evaluate(match, truth, tolerance), curve_of(match, truth, tolerance)
-    return Contender(name, scores, bytes, k, curve)
+    return Contender(name, scores, bytes, k, curve, fixed)
 
 
 def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
@@ -85,6 +97,7 @@ def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
     """
     kept: dict[str, Contender] = {}
     for key, one in contenders.items():
-        if one.k is None or (one.k, one.bytes) not in [(other.k, other.bytes) for other in kept.values()]:
+        same = [(other.k, other.bytes, other.scores) for other in kept.values()]
+        if one.k is None or (one.k, one.bytes, one.scores) not in same:
             kept[key] = one
     return kept

@@ -64,19 +64,24 @@ def null_control(
         Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
         the map reports nothing.
     """
-    order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
-    shuffled = concatenate(reference[part] for part in order.to(reference.device).split(256))
+    order, mixed = shuffled(reference, seed)
     mapper = model.mapper
     if isinstance(model.map, SpectralMap):  # as many bytes, however the map's own step was chosen
         mapper = model.map.mapper_of_equal_size()
     null = with_mapper(model, mapper)
     if same_plan:
-        null.map = _same_layers(template_map_of(model, "the null of the same layers"), shuffled)
+        null.map = _same_layers(template_map_of(model, "the null of the same layers"), mixed)
     else:
         with without_warnings():
-            null.learn_features(shuffled)
+            null.learn_features(mixed)
     match = null.localize(query, progress)
     return match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
+
+
+def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Descriptors in random order: which each is, (N,), and the descriptors (N,D)."""
+    order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
+    return order, concatenate(reference[part] for part in order.to(reference.device).split(256))
 
 
 @contextmanager

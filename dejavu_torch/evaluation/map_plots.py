@@ -106,31 +106,56 @@ def plot_activations(
         strip: (C,H,n) one image column for each frame of the chunk, drawn above; None leaves it out.
         rates: how often each is right, written above it; None leaves it out.
     """
-    where = borders[layers[0].start : layers[0].stop]
-    start, stop = int(where[0]), int(borders[layers[0].stop])
-    figure, rows = canvas(4.2 if strip is None else 5, len(layers) + 1 + (strip is not None), sharex=True)
-    axes = rows[-len(layers) - 1 :]
+    names = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
+    texts = [""] * (len(layers) + 1)
+    if rates is not None:
+        texts = [rate.describe() for rate in (*rates.layers, rates.fused)]
+    titles = [
+        f"{name}:\n{text}" if text else name
+        for name, text in zip([*names, "all layers fused"], texts, strict=True)
+    ]
+    curves = list(zip(titles, [*scores, fused], [*LAYERS[: len(layers)], BLUE], strict=True))
+    return plot_answers(curves, query, borders, layers[0].start, layers[0].stop, places, strip)
+
+
+def plot_answers(
+    curves: Sequence[tuple[str, Tensor, str]],
+    query: int,
+    borders: Tensor,
+    start: int,
+    stop: int,
+    places: Sequence[int] = (),
+    strip: Tensor | None = None,
+    sharey: bool = False,
+) -> Plot:
+    """Scores of one query over the places [start, stop), a row for each way to score them.
+
+    Args:
+        curves: title, scores (n,) and colour of each. query: number of the query frame.
+        borders: (N+1,) see `PlaceMap.borders`. places: the right places of the query, marked.
+        strip: (C,H,n) one image column for each frame of the chunk, drawn above; None leaves it out.
+        sharey: one scale for all rows.
+    """
+    where, begin, end = borders[start:stop], int(borders[start]), int(borders[stop])
+    above = strip is not None
+    figure, rows = canvas(
+        0.6 + 0.9 * (len(curves) + above) + 0.8, len(curves) + above, squeeze=False, sharex=True
+    )
+    rows = rows[:, 0]
+    axes = rows[above:]
     if strip is not None:
-        rows[0].imshow(pixels(strip), extent=(start, stop, 0, 1), aspect="auto")
+        rows[0].imshow(pixels(strip), extent=(begin, end, 0, 1), aspect="auto")
         rows[0].set_yticks([])
         rows[0].set_title("middle image column of each frame", loc="left", fontsize=10)
-    names = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
-    texts = [""] * len(axes) if rates is None else [rate.describe() for rate in (*rates.layers, rates.fused)]
-    drawn = zip(
-        axes,
-        [*names, "all layers fused"],
-        texts,
-        [*scores, fused],
-        [*LAYERS[: len(layers)], BLUE],
-        strict=True,
-    )
-    for axis, name, text, values, colour in drawn:
+    for axis, (title, values, colour) in zip(axes, curves, strict=True):
         axis.plot(where, values, color=colour, linewidth=1.1)
         best = int(values.argmin())
         style = {"color": WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
         axis.plot(where[best], values[best], "v", **style)
-        axis.set_title(f"{name}:\n{text}" if text else name, loc="left", fontsize=9)
+        axis.set_title(title, loc="left", fontsize=9)
         axis.set_yticks([])
+        if sharey:
+            axis.set_ylim(*spread(torch.cat([values for _, values, _ in curves])))
     for axis in rows:
         for place in places:
             axis.axvline(int(borders[place]), color=DARK, linewidth=0.9, linestyle="--", label="true place")
@@ -138,5 +163,12 @@ def plot_activations(
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
     figure.supylabel(f"difference of query {query} (lower is better)", fontsize=10)
-    rows[-1].set(xlabel=PLACE, xlim=(start, stop))
+    rows[-1].set(xlabel=PLACE, xlim=(begin, end))
     return figure, rows
+
+
+def spread(values: Tensor) -> tuple[float, float]:
+    """Limits of an axis that shows all values."""
+    low, high = float(values.min()), float(values.max())
+    room = 0.06 * (high - low) or 1.0
+    return low - room, high + room

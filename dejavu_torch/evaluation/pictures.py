@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from textwrap import fill
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.positions import unit_of
+from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.database.spectrum import period_of, spectrum
 from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.activation import activation_rates, best_phases, layer_distances
-from dejavu_torch.evaluation.contenders import Contender, distinct
+from dejavu_torch.evaluation.components import components
+from dejavu_torch.evaluation.contenders import COLOURS, Contender, distinct
 from dejavu_torch.evaluation.controls import template_map_of
 from dejavu_torch.evaluation.feature_plots import (
     plot_autocorrelogram,
@@ -19,7 +24,7 @@ from dejavu_torch.evaluation.feature_plots import (
     plot_spectrogram,
     plot_templates,
 )
-from dejavu_torch.evaluation.map_plots import plot_activations, plot_chunks, plot_layers
+from dejavu_torch.evaluation.map_plots import plot_activations, plot_answers, plot_chunks, plot_layers
 from dejavu_torch.evaluation.match_plots import (
     Row,
     example_matches,
@@ -29,8 +34,9 @@ from dejavu_torch.evaluation.match_plots import (
     score_matrix,
 )
 from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
-from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.score_plots import plot_auc, plot_curves
+from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture
+from dejavu_torch.evaluation.score_plots import Stored, plot_auc, plot_curves, plot_storage
+from dejavu_torch.evaluation.spectral_plots import Lines, plot_spectrum
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
@@ -41,6 +47,8 @@ from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Travers
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 EXAMPLES = 4  # places of which the frames of both traverses are shown
+NOTICED = 0.001  # of an area: less is no gain
+STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
 
 
 class Localization(NamedTuple):
@@ -84,19 +92,27 @@ class Localization(NamedTuple):
         return unit_of(self.model.map.positions)
 
 
-def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> dict[str, Picture]:
+def draw_pictures(
+    run: Localization,
+    contenders: Mapping[str, Contender],
+    storage: Mapping[str, Sequence[Stored]] | None = None,
+) -> dict[str, Picture]:
     """Every picture that can be drawn: one that needs ground truth, frames or layers is left out without.
 
     Args:
-        contenders: by key, ours under `map`.
+        contenders: by key, ours under `map`. storage: likewise, each at several sizes.
 
     Returns:
-        Of pairs, coverage, scores, pr, auc, ground, velocity, chunks, spectrogram, templates, features and
-        activations those that can be drawn, in this order.
+        Of pairs, coverage, scores, pr, auc, storage, ground, velocity, then of a template map chunks,
+        spectrogram, templates, features and activations, of a spectral one spectrum and components, those
+        that can be drawn, in this order.
     """
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
-    pictures |= draw_scores(run) | draw_curves(contenders, f"{run.tolerance} {run.unit}") | draw_motion(run)
+    pictures |= draw_scores(run) | draw_curves(contenders, f"{run.tolerance} {run.unit}")
+    pictures |= draw_storage(contenders, storage or {}, f"{run.tolerance} {run.unit}") | draw_motion(run)
+    if isinstance(run.model.map, SpectralMap):
+        pictures |= draw_spectrum(run, run.model.map) | draw_components(run, run.model.map)
     if isinstance(run.model.map, TemplateMap):
         pictures |= draw_chunks(run, run.model.map)
         pictures |= draw_features(run, run.model.map) | draw_activations(run, run.model.map)
@@ -214,6 +230,156 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
             "counts to its left.",
         )
     return pictures
+
+
+def draw_storage(
+    contenders: Mapping[str, Contender], storage: Mapping[str, Sequence[Stored]], tolerance: str
+) -> dict[str, Picture]:
+    """Areas over bytes; nothing where there are none.
+
+    Args:
+        contenders: those that store all frames are drawn across. tolerance: with its unit.
+    """
+    names = {
+        "map": "this map",
+        "null": "null: the same in shuffled order",
+        "interpolated": "keyframes in int8, interpolated",
+    }
+    curves = {key: (names[key], points) for key, points in storage.items() if points}
+    if not curves:
+        return {}
+    levels = {
+        key: (one.name, one.scores.auc)
+        for key in ("uncompressed", "hog")
+        if (one := contenders.get(key)) and one.scores
+    }
+    factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
+    factor = ""
+    if factors:
+        least, most = (f"{limit:.2g}" for limit in (min(factors), max(factors)))
+        times = least if least == most else f"{least} to {most}"
+        factor = f" For the same area the null takes {times} times the bytes of this map."
+    numbers: dict[str, Any] = {key: [one._asdict() for one in points] for key, points in storage.items()}
+    return {
+        "storage": Picture(
+            plot_storage(curves, levels, f"right within {tolerance}"),
+            "what more bytes are worth",
+            "The same descriptors coded to several sizes, fixed bytes such as the whitening's not counted: "
+            "this map, which gains from what is smooth and from what repeats; its null, for which nothing is "
+            f"smooth and nothing repeats; keyframes, which gain from what is smooth.{factor}",
+            numbers | {"null_over_map": factors},
+        )
+    }
+
+
+def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:
+    """Bytes of ours, and those at which the others reach the same area, where they do.
+
+    Convention: between two of their points the area grows with the logarithm of the bytes. Ours counts where
+    it is better, by more than .001, than all that takes less.
+
+    Example:
+        >>> others = Stored(4, 0.5, 0.5), Stored(16, 0.9, 0.9)
+        >>> [(ours, theirs)] = equally_good([Stored(1, 0.7, 0.7), Stored(2, 0.95, 0.95)], others)
+        >>> ours, round(theirs, 6)
+        (1, 8.0)
+    """
+    found, best = [], -1.0
+    for one in ours:
+        if one.auc <= best + NOTICED:
+            continue
+        best = one.auc
+        for low, high in pairwise(others):
+            if low.auc <= one.auc <= high.auc and low.auc < high.auc:
+                share = (one.auc - low.auc) / (high.auc - low.auc)
+                sizes = low.route_bytes_per_place, high.route_bytes_per_place
+                found.append((one.route_bytes_per_place, sizes[0] * (sizes[1] / sizes[0]) ** share))
+                break
+    return found
+
+
+def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
+    """The spectra of those numbers of the descriptor of which the longest chunk keeps most energy."""
+    chunk = longest_chunk(route)
+    start, stop = route.chunks[chunk]
+    first, last = route.bounds[chunk : chunk + 2]
+    if stop - start < 2 or first == last:
+        return {}
+    energy = route.value.new_zeros(route.dimension)
+    energy = energy.index_add(0, route.feature[first:last].long(), route.value[first:last].square())
+    chosen = energy.argsort(descending=True, stable=True)[:STRONGEST].cpu()
+    values = run.reference_features[start:stop].cpu()[:, chosen].float() - route.mean.cpu()[chosen].float()
+    amplitudes = spectrum(values.T, route.transform).abs()[:, 1:]
+    kept = (route.levels[start:stop].cpu()[1:, chosen] != 0).T
+    periods = torch.tensor(
+        [float(period_of(j, stop - start, route.transform)) for j in range(1, stop - start)]
+    )
+    features = {int(number): Lines(*lines) for number, *lines in zip(chosen, amplitudes, kept, strict=True)}
+    where = (
+        ""
+        if len(route.chunks) == 1
+        else f" of the chunk of frames {run.borders[start]} to {run.borders[stop]}"
+    )
+    return {
+        "spectrum": Picture(
+            plot_spectrum(features, periods, float(route.steps[chunk]), run.unit),
+            "what the map keeps",
+            f"The spectrum{where} of the numbers of the descriptor that the map keeps most of. A dot is a "
+            "line, the sine or the cosine of one period. Kept is what is larger than about two thirds of the "
+            "step, in whole steps; all numbers of the descriptor share the step.",
+        )
+    }
+
+
+def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]:
+    """One query's scores with its strongest periods only, and with all; nothing where no period is kept.
+
+    In the longest chunk, and for the query whose right place is nearest to the chunk's middle (without ground
+    truth: the middle query).
+    """
+    chunk, truth, queries = longest_chunk(route), run.truth, run.query_features
+    start, stop = route.chunks[chunk]
+    query, places = len(queries) // 2, []
+    if truth is not None:
+        query = nearest_query(truth, (start + stop) / 2)
+        right = truth.positives[query].tolist() if truth.judged[query] else []
+        places = [place for place in right if start <= place < stop]
+    sums = components(route, queries[query], chunk)
+    if not sums[-1].periods:
+        return {}
+    curves, better = [], []
+    for number, (periods, scores) in enumerate(sums):
+        title = f"{len(periods)} strongest periods"
+        if number == len(sums) - 1:
+            title = f"all {len(periods)} periods"
+        elif len(periods) == 1:
+            title = f"strongest period, {float(periods[0]):.4g} {run.unit}"
+        if places:
+            better.append(better_places(scores, [place - start for place in places], run.tolerance))
+            title += f": {better[-1]} places fit better"
+        curves.append((fill(title, LETTERS), scores, COLOURS["map"] if number == len(sums) - 1 else DARK))
+    picture = Picture(
+        plot_answers(curves, int(run.query_frames[query]), run.borders, start, stop, places, sharey=True),
+        "a query's score as a sum of periods",
+        "How much one query differs from each place, if only the periods that answer it most strongly are "
+        "added up, and all of them: each is a wave along the route, and at the right place they agree."
+        + (" Written above: how many wrong places fit better than the right one." if places else ""),
+        {"places_that_fit_better": better} if better else {},
+    )
+    return {"components": picture}
+
+
+def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
+    """How many places score lower than the best of those within the tolerance of a right one."""
+    distance = (torch.arange(len(scores))[:, None] - torch.tensor(right)).abs().amin(1)
+    inside = distance <= tolerance
+    return int((scores[~inside] < scores[inside].min()).sum())
+
+
+def longest_chunk(route: SpectralMap) -> int:
+    """Its number; the first of equals."""
+    lengths = [stop - start for start, stop in route.chunks]
+    return lengths.index(max(lengths))
 
 
 def draw_motion(run: Localization) -> dict[str, Picture]:

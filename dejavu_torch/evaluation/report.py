@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any, NamedTuple
 
 import jinja2
@@ -16,11 +17,17 @@ from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct
 from dejavu_torch.evaluation.plots import Picture
 
 PICTURES = (
-    *("frames", "pairs", "coverage", "scores", "pr", "auc", "ground", "velocity", "chunks", "spectrogram"),
-    *("templates", "features", "activations", "autocorrelogram", "layers"),
+    *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "ground", "velocity", "chunks"),
+    *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
+    *("spectrum", "components"),
 )
 LATE = 0.1  # recall at which a curve starts late
+HEADING = 11  # letters of a line of a heading
 
+SPECTRAL = (
+    "Of every number of the descriptor the map keeps the strongest lines of its spectrum along the route, in "
+    "steps of one size, and nothing else."
+)
 _MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_100_precision": "R@100P"}
 _MORE = {
     "precision_at_100_recall": "P@100R",
@@ -68,13 +75,15 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
     if not any(one.scores for one in report.shown().values()):
         return []
     frames, columns = report.facts.get("frames"), _MAIN | (_MORE if every else {})
-    sizes = [*(["bytes"] if every else []), "bytes per place"] if frames else []
+    sizes = [*(["bytes"] if every else []), "bytes per place", "route bytes per place"] if frames else []
     rows = [["", *columns.values(), *sizes]]
     for one in report.shown().values():
         row = [one.name, *(f"{getattr(one.scores, field):.3f}" if one.scores else "" for field in columns)]
         row[1] += "*" * is_late(one)
         if frames:
-            size = [f"{one.bytes}", f"{one.bytes / frames:.1f}"] if one.bytes else ["", ""]
+            size = ["", "", ""]
+            if one.bytes and one.route_bytes is not None:
+                size = [f"{one.bytes}", f"{one.bytes / frames:.1f}", f"{one.route_bytes / frames:.1f}"]
             row += size if every else size[1:]
         rows.append(row)
     return rows
@@ -86,7 +95,16 @@ def is_late(contender: Contender) -> bool:
 
 
 def text_table(rows: list[list[str]]) -> str:
-    """Rows as aligned text: the first column to the left, the others to the right."""
+    """Rows as aligned text: the first column to the left, the others to the right.
+
+    Long headings take several lines.
+    """
+    if not rows:
+        return ""
+    headings = [wrap(cell, HEADING, break_long_words=False) for cell in rows[0]]
+    height = max(1, *(len(lines) for lines in headings))
+    padded = [[""] * (height - len(lines)) + lines for lines in headings]
+    rows = [*(list(line) for line in zip(*padded, strict=True)), *rows[1:]]
     widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
     return "\n".join(
         "  ".join(
@@ -115,7 +133,13 @@ def headline(report: Report) -> str:
     baseline = report.contenders.get("uncompressed")
     if baseline and baseline.scores and baseline.bytes and report.ours.bytes and "frames" in facts:
         ours, full = (size / facts["frames"] for size in (report.ours.bytes, baseline.bytes))
-        text += f" The map takes {ours:.0f} bytes per place. The features as they are would take {full:.0f} "
+        spectral = facts.get("kind") == "spectral"
+        text += f" {SPECTRAL}" if spectral else ""
+        text += f" The map takes {ours:.0f} bytes per place"
+        if spectral and report.ours.route_bytes is not None:
+            text += f", {report.ours.route_bytes / facts['frames']:.3g} of them for the route: the others do "
+            text += "not grow with it"
+        text += f". The {'descriptors' if spectral else 'features'} as they are would take {full:.0f} "
         text += f"and find {percent(baseline.scores.recall_at_1)}."
     return text
 

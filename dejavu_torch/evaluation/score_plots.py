@@ -15,6 +15,14 @@ _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
 
 
+class Stored(NamedTuple):
+    """What a route is recognised at where it takes so many bytes."""
+
+    route_bytes_per_place: float
+    auc: float
+    recall_at_1: float
+
+
 class Length(NamedTuple):
     """What a map with chunks of `window` places recognises, and what it stores.
 
@@ -98,6 +106,39 @@ def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
     if windows:
         above.legend(loc="best", frameon=False, fontsize=9)
     return figure, (above, below)
+
+
+def plot_storage(
+    curves: Mapping[str, tuple[str, Sequence[Stored]]],
+    levels: Mapping[str, tuple[str, float]],
+    title: str = "",
+) -> Plot:
+    """Area under the precision-recall curve over the bytes that a route takes.
+
+    Args:
+        curves: by key, which gives the colour: name and points. levels: by key: name and area of what takes
+            far more, a line across.
+    """
+    figure, axis = canvas(3.4 + 1.1 * LINE * (len(curves) + len(levels)))
+    for key, (name, area) in levels.items():
+        axis.axhline(area, color=colour_of(key), linestyle=_LINES.get(key, "--"), linewidth=1.2, label=name)
+    for key, (name, points) in curves.items():
+        sizes, areas = [one.route_bytes_per_place for one in points], [one.auc for one in points]
+        width = 2.4 if key == "map" else 1.6
+        axis.plot(sizes, areas, "o-", color=colour_of(key), markersize=5, linewidth=width, label=name)
+    every = [one.route_bytes_per_place for _, points in curves.values() for one in points]
+    ticks = [2**k for k in range(-6, 20) if min(every) / 1.5 <= 2**k <= 1.5 * max(every)]
+    axis.set_xscale("log")
+    axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axis.minorticks_off()
+    axis.set(ylim=(0, 1.02), xlabel="route bytes per place", ylabel="area under the PR curve")
+    axis.set_title(title, fontsize=10)
+    axis.grid(alpha=0.25)
+    handles, labels = axis.get_legend_handles_labels()
+    across = len(levels)
+    handles, labels = [*handles[across:], *handles[:across]], [*labels[across:], *labels[:across]]
+    figure.legend(handles, labels, loc="outside lower left", frameon=False, fontsize=9)
+    return figure, axis
 
 
 def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:

@@ -23,6 +23,7 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.recipe import recipe_of
+from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines
@@ -31,6 +32,7 @@ from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.evaluate import evaluation_facts
+from dejavu_torch.experiments.storage import storage_curve
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
@@ -129,7 +131,10 @@ def compare(
         known = ground_truth_in_places(known, model.map.place_of)
     run = Localization(model, reference, query, places, queries, match, known, tolerance)
     contenders = _contenders(run, seed, leave_out, progress)
-    pictures = draw_pictures(run, contenders)
+    storage = None
+    if isinstance(model.map, SpectralMap) and contenders["map"].scores is not None:
+        storage = storage_curve(run, seed=seed, progress=progress)
+    pictures = draw_pictures(run, contenders, storage)
     carried = all(source_of(one).place is not None for one in (reference, query))
     facts = {
         **_map_facts(model.summary(), places),
@@ -210,20 +215,21 @@ def of_shown_frames(match: Match, route: PlaceMap) -> Match:
 def _contenders(run: Localization, seed: int, leave_out: int | None, progress: bool) -> dict[str, Contender]:
     """The map and what it is set beside, by their keys in report.json; the map's own is `map`."""
     model, tolerance = run.model, run.tolerance
-    ours, size = of_shown_frames(run.match, model.map), model.summary().map_bytes
-    contenders = {"map": contend("this map", ours, run.truth, tolerance, size)}
+    ours, summary = of_shown_frames(run.match, model.map), model.summary()
+    sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
+    contenders = {"map": contend("this map", ours, run.truth, tolerance, **sizes)}
     if run.truth is None and leave_out is None:  # nothing that the others find could be scored
         return contenders
     features = run.reference_features, run.query_features
     baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress)
     if not _is_plain_hog(model):
         baselines |= hog_baselines(run.reference, run.query, model.batch_size, tolerance, progress)
-    for key, (name, match, bytes, k) in baselines.items():
+    for key, (name, match, bytes, k, fixed) in baselines.items():
         truth, match = run.truth, of_shown_frames(match, model.map)
         if key == "leave_out":  # its queries are the places themselves
             own = model.map.frame_of(torch.arange(model.map.places))[:, None]
             truth = ground_truth_in_places(as_ground_truth(own), model.map.place_of)
-        contenders[key] = contend(name, match, truth, tolerance, bytes, k)
+        contenders[key] = contend(name, match, truth, tolerance, bytes, k, fixed)
     return contenders
 
 

@@ -282,8 +282,9 @@ def known_boundaries(
     found = {}
     for key, (name, periods) in contenders.items():
         model = _learned(result, TemplateMapper(periods, mapper.metric, "mean"))
-        match, size = _localized(model, result), model.summary().map_bytes
-        contender = contend(name, match, truth, tolerance, size)
+        match, summary = _localized(model, result), model.summary()
+        sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
+        contender = contend(name, match, truth, tolerance, **sizes)
         found[key] = contender, boundary_effect(match, truth, cuts, tolerance)
     return found
 

@@ -80,13 +80,27 @@ def test_a_match_without_truth_or_that_reports_nothing_is_a_contender_too() -> N
 def test_bytes_per_place_stand_in_the_table_where_the_places_are_known() -> None:
     null = Contender("null", SCORES)
     head, ours, other = score_table(report({"frames": 32}, null=null))
-    assert (head[-1], ours[-1], other[-1]) == ("bytes per place", "125.0", "")
+    assert head[-2:] == ["bytes per place", "route bytes per place"]
+    assert (ours[-2:], other[-2:]) == (["125.0", "125.0"], ["", ""])
     head, ours, _ = score_table(report({"frames": 32}, null=null), every=True)
-    assert head[-2:] == ["bytes", "bytes per place"]
-    assert ours[-2:] == ["4000", "125.0"]
+    assert head[-3:] == ["bytes", "bytes per place", "route bytes per place"]
+    assert ours[-3:] == ["4000", "125.0", "125.0"]
     assert not any("bytes" in cell for cell in score_table(report())[0])
     for every in (False, True):
         assert len({len(row) for row in score_table(report({"frames": 32}, null=null), every)}) == 1
+
+
+def test_bytes_that_do_not_grow_with_the_route_stand_apart() -> None:
+    one = Contender("shared", SCORES, 4000, fixed=3200)
+    assert one.route_bytes == one.as_json()["route_bytes"] == 800
+    assert score_table(report({"frames": 32}, stride=one))[2][-2:] == ["125.0", "25.0"]
+    assert Contender("null", SCORES).route_bytes is None
+
+
+def test_frames_that_are_used_otherwise_are_listed_as_well() -> None:
+    row = Contender("every 2nd", SCORES, 100, 2)
+    other = Contender("between every 2nd", SCORES._replace(auc=0.9), 100, 2)
+    assert len(report(stride=row, interpolated=other).shown()) == 3
 
 
 def test_what_stores_the_same_frames_twice_is_listed_once() -> None:
@@ -111,6 +125,22 @@ def test_scores_are_those_of_the_columns() -> None:
 
 def test_text_tables_are_aligned() -> None:
     assert text_table([["", "AUC"], ["a map", "1"]]).splitlines() == ["       AUC", "a map    1"]
+    assert text_table([]) == ""
+
+
+def test_long_headings_of_a_text_table_take_several_lines() -> None:
+    table = text_table([["", "AUC", "route bytes per place"], ["a map", "0.5", "5.0"]])
+    assert table.splitlines() == [
+        "            route bytes",
+        "       AUC    per place",
+        "a map  0.5          5.0",
+    ]
+
+
+def test_the_terminal_s_table_fits_a_hundred_and_ten_columns() -> None:
+    longest = Contender("same features, every 10th place (at least the map's bytes)", SCORES, 70560000, 10)
+    table = text_table(score_table(report({"frames": 10000}, stride=longest)))
+    assert max(len(line) for line in table.splitlines()) <= 110
 
 
 def test_the_summary_tells_what_was_scored() -> None:
@@ -151,6 +181,11 @@ def test_the_page_begins_with_plain_words() -> None:
         assert words in text
     some = headline(report({"frames": 32, "with_answer": 16})).replace("\xa0", " ")
     assert "Of the 16 that have a right place, 75.0 %" in some  # recall is of those, not of all 20
+    assert "lines" not in text
+    ours = Contender("this map", SCORES, 4000, fixed=3900)
+    spectral = report({"frames": 32, "kind": "spectral"}, uncompressed=baseline)._replace(ours=ours)
+    for words in ("strongest lines of its spectrum along the route", "125 bytes", "3.12 of them", "2000"):
+        assert words in headline(spectral)
     unscored = report()._replace(ours=Contender("this map", None))
     assert "no ground truth" in headline(unscored)
     assert "None" not in headline(unscored) + summary(unscored)
@@ -166,7 +201,8 @@ def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path: Path) -> No
     assert list(key(tmp_path, report())) == ["AUC", "recall@1", "R@100P"]
     null, frames = Contender("null", SCORES), Contender("all", SCORES, 100, 1)
     found = key(tmp_path, report({"frames": 32}, uncompressed=frames, null=null, null_same_plan=null))
-    assert list(found)[3:] == ["bytes per place", "all, every k-th frame", "null"]
+    sizes = ["bytes per place", "route bytes per place"]
+    assert list(found)[3:] == [*sizes, "all, every k-th frame", "null"]
     assert "second" in found["null"]
     steps = {"step": 6.0, "reference_frames": 40, "query_frames": 30}
     found = key(tmp_path, report({"resampling": steps}, uncompressed=frames))
@@ -174,6 +210,19 @@ def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path: Path) -> No
     trained = key(tmp_path, report({"trained": {"steps": 1}}, null=null))["null"]
     assert "backbone" in trained
     assert "second" not in trained
+
+
+def test_the_key_of_a_spectral_map(tmp_path: Path) -> None:
+    null, frames = Contender("null", SCORES), Contender("all", SCORES, 100, 1)
+    facts = {"frames": 32, "kind": "spectral"}
+    found = key(tmp_path, report(facts, uncompressed=frames, interpolated=frames, null=null))
+    assert list(found)[5:] == ["all, every k-th frame", "interpolated", "null"]
+    assert "smoothness" in found["interpolated"]
+    for words in ("same descriptors in shuffled order", "how many bytes it needs"):
+        assert words in found["null"].replace("\n", " ")
+    for kind, words in (("spectral", ["lines", "strongest periods"]), ("templates", ["layer", "together"])):
+        below = written(tmp_path, report({"kind": kind})).partition("the map</h2>")[2]
+        assert re.findall(r"<dt>([^<]+)</dt>", below) == words
 
 
 def test_the_words_of_the_last_table_are_explained_beside_it(tmp_path: Path) -> None:
@@ -188,7 +237,7 @@ def test_report_json_has_the_facts_the_scores_and_an_entry_for_each_contender(tm
     found = json.loads((tmp_path / "report.json").read_text())
     assert found == one.as_json()
     assert found.keys() == FACTS.keys() | {"frames", *Scores._fields, "stride", "null"}
-    assert found["stride"] == SCORES._asdict() | {"bytes": 100, "k": 2}
+    assert found["stride"] == SCORES._asdict() | {"bytes": 100, "route_bytes": 100, "k": 2}
     assert found["null"] == dict.fromkeys(Scores._fields)
 
 

@@ -1,0 +1,66 @@
+"""One query's scores on a spectral map, as the sum of the periods that answer it most strongly."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.database.spectrum import from_spectrum, period_of
+
+COUNTS = (1, 4, 16)  # strongest periods that are added up, beside all
+
+
+class Component(NamedTuple):
+    """periods: those added up, the strongest first. scores: (W,) of the chunk's places with these alone."""
+
+    periods: tuple[Fraction, ...]
+    scores: Tensor
+
+
+@torch.no_grad()
+def components(
+    route: SpectralMap, query: Tensor, chunk: int = 0, counts: Sequence[int] = COUNTS
+) -> list[Component]:
+    """Scores of a query with its strongest periods only, and with all, which are the map's own scores.
+
+    The product of a query with all descriptors of a chunk is a sum of waves, one for each period, besides a
+    constant; the strongest have the largest energy. Cosine and sine of a period count together.
+
+    Args:
+        chunk: its number in the map. counts: of periods; those of all or more are left out.
+
+    Shape: query (K,) -> scores (W,), of the places of the chunk.
+
+    Convention: the constant, and what the metric does with products and norms, are part of every sum.
+    """
+    start, stop = route.chunks[chunk]
+    first, last = route.bounds[chunk : chunk + 2]
+    query = query.to(route.value)
+    length = torch.linalg.vector_norm(query)
+    if route.metric == "cosine":
+        query = query / torch.where(length > 0, length, 1)
+    terms = query[route.feature[first:last].long()] * route.value[first:last]
+    lines = query.new_zeros(stop - start).index_add(0, route.line[first:last].long() - start, terms)
+    lines_of: dict[Fraction, list[int]] = defaultdict(list)
+    for line in range(1, stop - start):
+        if lines[line]:
+            lines_of[period_of(line, stop - start, route.transform)].append(line)
+    strongest = sorted(lines_of, key=lambda period: -float(lines[lines_of[period]].square().sum()))
+    found = []
+    for count in (*(count for count in counts if count < len(strongest)), len(strongest)):
+        kept = torch.zeros_like(lines)
+        for chosen in ([0], *(lines_of[period] for period in strongest[:count])):
+            kept[chosen] = lines[chosen]
+        products = from_spectrum(kept, route.transform) + query @ route.mean.to(query)
+        if route.metric == "cosine":
+            scores = 1 - products * route.per_norm[start:stop]
+        else:
+            scores = length.square() - 2 * products + route.norms[start:stop].square()
+        found.append(Component(tuple(strongest[:count]), scores.cpu()))
+    return found

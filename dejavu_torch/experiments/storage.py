@@ -1,0 +1,88 @@
+"""What a route is recognised at, over the bytes that it may take: the map, its null, and keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_frames
+from dejavu_torch.evaluation.controls import shuffled, with_mapper
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.pictures import Localization
+from dejavu_torch.evaluation.score_plots import Stored
+from dejavu_torch.types import InputError, Match
+
+BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
+SMALL = 2**17  # numbers that are coded soon enough to meet a budget to 2 %
+
+
+def storage_curve(
+    run: Localization, budgets: Sequence[float] = BUDGETS, seed: int = 0, progress: bool = False
+) -> dict[str, list[Stored]]:
+    """The run's descriptors coded anew at several budgets, each evaluated with the run's queries.
+
+    Args:
+        run: with a spectral map, whose settings are kept, and a ground truth.
+        budgets: route bytes per place; those that a contender cannot meet are left out. The map
+            of a long route is within a fifth or so of them, and stands at what it takes.
+        seed: of the null's shuffle. progress: show a progress bar on a terminal.
+
+    Returns:
+        By key: `map`, `null` (the descriptors in shuffled order) and `interpolated` (keyframes in int8, and
+        straight lines between them).
+
+    Raises:
+        InputError: a map of another kind, or no ground truth.
+    """
+    route = run.model.map
+    if not isinstance(route, SpectralMap) or run.truth is None:
+        truth = "no" if run.truth is None else "a"
+        raise InputError(
+            f"a storage curve got a map of kind {route.kind!r} and {truth} ground truth; expected a spectral "
+            "map and a ground truth"
+        )
+    features = run.reference_features
+    order, mixed = shuffled(features, seed)
+    kinds = {
+        "map": partial(_coded, run, route, features),
+        "null": partial(_coded, run, route, mixed, order=order),
+        "interpolated": partial(_keyframes, run, route),
+    }
+    found: dict[str, list[Stored]] = {key: [] for key in kinds}
+    cases = [(key, budget) for key in kinds for budget in budgets]
+    for key, budget in tqdm(cases, "storage", disable=None if progress else True, leave=False):
+        for match, size in kinds[key](budget):
+            match = match._replace(index=route.scored(match.index))
+            scores = evaluate(match, run.truth, run.tolerance)
+            found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1))
+    return found
+
+
+def _coded(
+    run: Localization, route: SpectralMap, features: Tensor, budget: float, order: Tensor | None = None
+) -> Iterator[tuple[Match, int]]:
+    """Matches on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
+    mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric)
+    mapper.exact = features.numel() < SMALL
+    model = with_mapper(run.model, mapper)
+    try:
+        model.learn_features(features)
+    except InputError:  # more than floats, or less than the mean
+        return
+    match = model.localize_descriptors(run.query_features)
+    if order is not None:
+        match = match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
+    yield match, sum(tensor.nbytes for tensor in model.map.packed().values())
+
+
+def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:
+    """Matches of interpolated keyframes of at most so many bytes, and their bytes."""
+    between, _, keys = interpolated(as_int8(run.reference_features), budget * route.places)
+    size = keys * route.dimension
+    if size <= budget * route.places:
+        yield nearest_frames(between, run.query_features, (1,), route.metric)[0], size

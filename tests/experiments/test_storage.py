@@ -1,0 +1,89 @@
+"""Areas over bytes, and what a comparison on a spectral map reports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused, template_model
+from torch import Tensor
+
+from dejavu_torch import DejaVu
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.experiments.compare import Comparison, compare
+from dejavu_torch.experiments.storage import storage_curve
+
+PLACES, NUMBERS = 400, 16
+
+
+def route(seed: int) -> Tensor:
+    """Smooth numbers, some of which repeat, and noise."""
+    profile, noise = (torch.Generator().manual_seed(one) for one in (7, seed))
+    walk = torch.randn(PLACES, NUMBERS // 2, generator=profile).cumsum(0) / 5
+    waves = (torch.arange(PLACES)[:, None] * torch.rand(NUMBERS // 2, generator=profile)).sin()
+    return torch.cat([walk, waves], 1) + 0.2 * torch.randn(PLACES, NUMBERS, generator=noise)
+
+
+@pytest.fixture(scope="module")
+def result() -> Comparison:
+    model = DejaVu(mapper=SpectralMapper(2.0))
+    return compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model, tolerance=2)
+
+
+@pytest.fixture(scope="module")
+def report(result: Comparison) -> dict[str, Any]:
+    return result.report.as_json()
+
+
+def test_the_curve_is_in_the_report(report: dict[str, Any]) -> None:
+    storage = report["storage"]
+    assert {"map", "null", "interpolated", "null_over_map"} == set(storage)
+    sizes = [one["route_bytes_per_place"] for one in storage["map"]]
+    assert sizes[:4] == pytest.approx([1, 2.5, 5, 10], rel=0.02)
+    null = [one["route_bytes_per_place"] for one in storage["null"]]
+    assert null[:4] == pytest.approx([1, 2.5, 5, 10], rel=0.02)
+    assert max(sizes[4], null[4]) < 20  # no finer step changes a score
+    for budget, one in zip((1, 2.5, 5, 10), storage["interpolated"], strict=False):
+        assert one["route_bytes_per_place"] <= budget
+    assert storage["map"][0]["auc"] > storage["null"][0]["auc"]
+    assert all(ratio > 1 for ratio in storage["null_over_map"])
+
+
+def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, report: dict[str, Any]) -> None:
+    curve = storage_curve(result.run, [2.0])
+    (ours,), (null,), (between,) = curve["map"], curve["null"], curve["interpolated"]
+    assert ours.auc == report["auc"]
+    assert ours.route_bytes_per_place == report["route_bytes_per_place"]
+    assert null.auc == pytest.approx(report["null"]["auc"], abs=0.05)  # coded to 2.0, not to the map's own
+    assert between.route_bytes_per_place * PLACES == report["interpolated"]["route_bytes"]
+
+
+def test_budgets_that_cannot_be_met_are_left_out(result: Comparison) -> None:
+    curve = storage_curve(result.run, [0.01, 1000.0])
+    assert curve["map"] == curve["null"] == []
+    # two keyframes at least; all frames at most
+    assert [one.route_bytes_per_place for one in curve["interpolated"]] == [NUMBERS]
+
+
+def test_what_has_no_curve_is_refused(result: Comparison) -> None:
+    with refused("no ground truth", "spectral"):
+        storage_curve(result.run._replace(truth=None))
+    with refused("'templates'", "spectral"):
+        storage_curve(result.run._replace(model=template_model().learn(route(0))))
+
+
+def test_without_truth_there_is_no_curve() -> None:
+    model = DejaVu(mapper=SpectralMapper(2.0))
+    unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model)
+    assert "storage" not in unscored.report.as_json()
+    assert {"spectrum", "components"} <= unscored.pictures.keys()
+
+
+def test_route_bytes_stand_beside_all_bytes(report: dict[str, Any]) -> None:
+    assert report["route_bytes"] == report["map_bytes"] - report["fixed_bytes"]
+    for key, size in (("uncompressed", PLACES * NUMBERS * 4), ("stride", PLACES // 4 * NUMBERS)):
+        assert report[key]["route_bytes"] == report[key]["bytes"] == size  # nothing to whiten with
+    assert report["interpolated"]["route_bytes"] <= report["route_bytes"]
+    assert "route_bytes" not in report["null"]
