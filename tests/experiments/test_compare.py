@@ -248,7 +248,7 @@ def test_the_curves_show_hog_as_well() -> None:
     periods = SpectrogramAnalysis(window=64, min_period=4, strongest=1)
     model = template_model(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()), periods)
     result = compare(pictures(1), pictures(2), "0", model, tolerance=3)
-    labels = [text.get_text() for text in result.pictures["auc"].plot[1].texts]
+    labels = [text.get_text().replace("\n", " ") for text in result.pictures["auc"].plot[1].texts]
     assert {one.name for one in result.report.contenders.values()} < set(labels)
     assert {"HOG, every frame", "HOG, every 6th frame"} < set(labels)
 
