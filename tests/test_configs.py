@@ -22,7 +22,7 @@ from dejavu_torch.experiments.reproduce import paper_model
 from dejavu_torch.model import PARTS, REGISTRY
 
 ROOT = Path(__file__).parents[1]
-PRESETS = ["default", "paper"]
+PRESETS = ["default", "paper", "spectral"]
 
 
 def model_of(name: str) -> DejaVu:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -12,7 +13,10 @@ from dejavu_torch.types import InputError, Traverse
 
 
 class Views(NamedTuple):
-    """traverse: frames of places of the reference. places: (n,) int64, which place each of them shows."""
+    """Frames of places of the reference.
+
+    places: (n,) int64, which place each frame shows; -1 for none, and the frame is left out.
+    """
 
     traverse: Traverse
     places: Tensor
@@ -29,7 +33,7 @@ class AugmentedTraverse(Traverse):
         seed: of the copies; the same batch size gives the same copies.
 
     Raises:
-        InputError: ready features.
+        InputError: ready features, or strengths that `Augmentation` refuses.
     """
 
     def __init__(
@@ -47,7 +51,11 @@ class AugmentedTraverse(Traverse):
             raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
         self.traverse, self.copies, self.seed = traverse, copies, seed
         self.shown = range(0, frames, max(1, -(-frames * copies // most)))
-        self.augmentation = Augmentation(**(strengths or {})).train()
+        try:
+            self.augmentation = Augmentation(**(strengths or {})).train()
+        except TypeError as error:
+            known = ", ".join(inspect.signature(Augmentation).parameters)
+            raise InputError(f"the strengths of whitening are {strengths}; expected {known}") from error
         self.name = f"augmented copies of {traverse.name}"
         self.length = copies * len(self.shown)
 

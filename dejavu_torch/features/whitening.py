@@ -191,7 +191,13 @@ class Whitening(nn.Module):
         if views is None:
             self._store(mean, basis[:, :kept], variances[:kept].sum().sqrt())
             return
-        pairs = [((view - mean) @ basis, place) for view, place in views]
+        pairs = []
+        for view, place in views:
+            if view.shape[1] != len(mean):
+                raise InputError(
+                    f"the views have {view.shape[1]} features; expected {len(mean)}, as the route has"
+                )
+            pairs.append(((view - mean) @ basis, place))
         shown = torch.cat([place for _, place in pairs])
         own = torch.cat([(places[part].to(mean) - mean) @ basis for part in shown.split(ROWS)])
         centre, projection = learned_whitening(
