@@ -201,12 +201,12 @@ class DejaVu(nn.Module):
         """
         self._require_learning_whitening(second.name)
         second = self.resample(second, getattr(reference, "step", None))
-        counts = [_count(traverse) for traverse in (reference, second)]
-        found = ground_truth_of(truth, reference, second, *counts)
+        frames, shown = _count(reference), _count(second)
+        found = ground_truth_of(truth, reference, second, frames, shown)
         if found is None:
             steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
             raise InputError(
-                f"{second.name} has {counts[1]} frames and {reference.name} {counts[0]}{steps}; expected as "
+                f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
                 "many, frame i being place i, or a truth that says which places it shows (--second_truth)"
             )
         if isinstance(reference, ResampledTraverse):

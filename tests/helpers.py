@@ -64,4 +64,4 @@ def template_model(
 ) -> DejaVu:
     """A model whose map is of templates, with what its mapper is told beside the model's own settings."""
     mapper = TemplateMapper(periods, metric, reduction, temperature)  # type: ignore[arg-type]
-    return DejaVu(features, mapper, **settings)  # type: ignore[arg-type]
+    return DejaVu(features, mapper=mapper, **settings)  # type: ignore[arg-type]

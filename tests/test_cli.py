@@ -315,7 +315,7 @@ def trained_map(tmp_path: Path) -> Path:
     np.save(tmp_path / "b.npy", frames(96, seed=5, size=8))
     periods = SpectrogramAnalysis(window=96, strongest=1)
     mapper = TemplateMapper(periods, metric="l2", temperature=0.2)
-    model = DejaVu(torch.nn.Flatten(), mapper, threshold=2.5)
+    model = DejaVu(torch.nn.Flatten(), mapper=mapper, threshold=2.5)
     model.learn(open_source(str(tmp_path / "a.npy")))
     model.map.templates *= 0.9
     model.trained = Training(steps=30, seconds=1000.0, seed=3)
@@ -416,7 +416,7 @@ def test_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 def test_too_few_frames(count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_images(tmp_path / "short", frames(count))
     error = fails(capsys, "learn", folder, "--map", tmp_path / "a.safetensors")
-    assert f"{count} frame" in error
+    assert f"{count} place" in error
     assert "at least 8" in error
 
 

@@ -34,7 +34,7 @@ def run_demo(
     Args:
         out: folder for report and pictures
         seed: which route, and of the whitening and the null control
-        second: another traverse of the route, from which whitening learns what changes between two visits
+        second: another traverse of the route, from which whitening learns what a visit changes
     """
     from dejavu_torch.experiments.compare import compare
 
@@ -64,8 +64,7 @@ def run_learn(
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
         map: map file to write (.safetensors)
         seed: of the whitening, where it has none of its own
-        second: another traverse of the same places, from which whitening learns what changes between two
-            visits; frame i is place i where both have the same length
+        second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
     """
     if map.suffix != ".safetensors":
@@ -157,9 +156,8 @@ def run_compare(
         tolerance: right within this many places, inclusive
         interpolate: fill in a csv that lists some queries only
         leave_out: diagnostic, the reference on itself with this many frames to each side left out
-        seed: of the shuffled null control, and of the whitening
-        second: a third traverse, of the places of the reference, from which whitening learns; as of `dejavu
-            learn`
+        seed: of the null control's shuffle and of the whitening
+        second: a third traverse, as of `dejavu learn`
         second_truth: which places it shows, as --truth
         map: evaluate this map of the reference, with its own settings, instead of learning one
     """
@@ -320,8 +318,8 @@ def _check_report_folder(out: Path, *sources: str | None) -> None:
 
 
 def _set_seed(model: DejaVu, seed: int) -> None:
-    """The command's seed for the whitening, unless it has one of its own or learns nothing."""
-    if model.whitening is not None and not model.whitening.fixed:
+    """The command's seed for a whitening that is to be learned and has none of its own."""
+    if model.whitening is not None and not model.whitening.fixed and not model.map.places:
         model.whitening.seed = model.whitening.seed or seed
 
 

@@ -26,10 +26,9 @@ DEFAULT_PARTS = {
 }
 HINT = (
     "Parts have options of their own, such as --features.cell 4, --whitening.numbers 64, "
-    "--mapper.reduction sum, --mapper.periods.window 512, --preprocess.contrast patch or --velocity.step 5: "
-    "see --features.help HOG, --whitening.help, --mapper.help TemplateMapper or SpectralMapper, "
-    "--preprocess.help and --velocity.help. --whitening also takes none, or the map (.safetensors) whose "
-    "features and whitening serve this route."
+    "--mapper.periods.window 512, --preprocess.contrast patch or --velocity.step 5: see --features.help HOG, "
+    "--whitening.help, --mapper.help TemplateMapper, --preprocess.help and --velocity.help. --whitening "
+    "also takes none, or a map file, whose features it then takes as well."
 )
 LONGEST = 300  # characters of a message that is told whole
 

@@ -380,6 +380,10 @@ class SpectralMapper(Mapper):
             route.needed = (overhead + _coded_bytes(lines, lengths, half)) / len(features)
         return route
 
+    def extra_repr(self) -> str:
+        names = ("route_bytes_per_place", "step", "chunk", "transform", "metric")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+
     def empty(self) -> SpectralMap:
         return SpectralMap(metric=self.metric, transform=self.transform, chunk=self.chunk)
 

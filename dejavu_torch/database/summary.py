@@ -119,11 +119,9 @@ def describe(summary: MapSummary) -> str:
     if summary.lines:
         stored = f"{summary.lines} lines of their spectra"
     lines.append(f"{summary.covered} of {summary.places} places covered; {stored}")
-    growing = (
-        f"{summary.route_bytes} of the route, {summary.route_bytes / max(summary.places, 1):.2f} per place"
-    )
-    stored = f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: {growing}"
-    stored += f" ({_parts(summary.route)})"
+    growing = summary.route_bytes / max(summary.places, 1)
+    stored = f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: "
+    stored += f"{summary.route_bytes} of the route, {growing:.2f} per place ({_parts(summary.route)})"
     if summary.fixed:
         stored += f", and {summary.fixed_bytes} fixed ({_parts(summary.fixed)})"
     lines.append(stored)
