@@ -232,6 +232,10 @@ class SpectralMap(PlaceMap):
         state = dict(tensors)
         table, streams = state.pop("stream_table"), state.pop("streams")
         lengths, columns = state["lengths"], len(state["mean"])
+        if lengths.dtype != torch.int64 or table.dtype != torch.int64:
+            raise InputError(
+                f"the table of chunks has {lengths.dtype} and {table.dtype}; expected whole numbers"
+            )
         if table.shape != (len(lengths), 2) or not len(lengths) or streams.dtype != torch.uint8:
             raise InputError(
                 f"a stream table {tuple(table.shape)} for {len(lengths)} chunks; expected a row each"
