@@ -6,6 +6,7 @@ import inspect
 import logging
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
+from dejavu_torch.data.positions import place_of
 from dejavu_torch.database.mapfile import map_size, read_map, write_map
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
@@ -29,7 +32,7 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import AugmentedTraverse, Views
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.motion.resampling import ResampledTraverse, resampled
+from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -143,7 +146,7 @@ class DejaVu(nn.Module):
 
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
-            second: see `describe_reference`.
+            second: see `describe_reference`; `views` makes it.
             progress: show a progress bar on a terminal.
 
         Returns:
@@ -169,8 +172,13 @@ class DejaVu(nn.Module):
             progress: text of a progress bar on a terminal; None is no bar.
 
         Shape: -> (N,K).
+
+        Raises:
+            InputError: as `learn`, or a second traverse that no whitening learns from.
         """
         whitening = self.whitening
+        if second is not None:
+            self._require_learning_whitening(second.traverse.name)
         if whitening is None or whitening.fixed:
             return self.extract_all(traverse, progress)
         device = self.map.positions.device
@@ -185,6 +193,50 @@ class DejaVu(nn.Module):
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
         return concatenate(self.whitened(part) for part in features.split(ROWS))
+
+    def views(self, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
+        """Another traverse of the reference's places, for `learn`; resampled where the reference is.
+
+        Args:
+            reference: as `resample` gives it.
+            truth: which frames of the reference it shows, see `find_ground_truth`. Of several for one frame
+                the first counts; frames that show none are left out.
+
+        Raises:
+            InputError: no whitening that could learn from it, or nothing says which places it shows.
+        """
+        self._require_learning_whitening(second.name)
+        second = self.resample(second, getattr(reference, "step", None))
+        frames, shown = _count(reference), _count(second)
+        found = ground_truth_of(truth, reference, second, frames, shown)
+        if found is None:
+            steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
+            raise InputError(
+                f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
+                "many, frame i being place i, or a truth that says which places it shows (--second_truth)"
+            )
+        if isinstance(reference, ResampledTraverse):
+            found = ground_truth_in_places(found, partial(place_of, reference.positions))
+        places = found.positives[:, 0]
+        if not (places >= 0).any():
+            raise InputError(f"no frame of {second.name} shows a place of {reference.name}; expected some")
+        return Views(second, places)
+
+    def take_whitening(self, other: DejaVu) -> None:
+        """Describe as another model does: its whitening as it is, and what is ahead of it.
+
+        Raises:
+            InputError: the other has no whitening.
+        """
+        if other.whitening is None or not other.whitening.learned:
+            raise InputError("its map was learned without whitening; expected one that was learned with it")
+        self.preprocess, self.features, self.whitening = other.preprocess, other.features, other.whitening
+        self.whitening.fixed = True
+
+    def _require_learning_whitening(self, name: str) -> None:
+        if self.whitening is None or self.whitening.fixed:
+            seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
+            raise InputError(f"{seen} to learn from {name}; expected one, such as --whitening Whitening")
 
     def resample(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
         """`resampled` by the model's `velocity`; of queries, `step` is the map's, `self.step`."""
@@ -417,11 +469,17 @@ def _joined(matches: Iterator[Match]) -> Match:
 
 
 def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Batches of descriptors, each with the places (B,) that they show."""
+    """Batches of descriptors, each with the places (B,) that they show; those that show none left out."""
     done = 0
     for batch in batches:
-        yield batch, places[done : done + len(batch)]
+        shown = places[done : done + len(batch)]
+        yield batch[shown >= 0], shown[shown >= 0]
         done += len(batch)
+
+
+def _count(traverse: Traverse) -> int:
+    """Frames of a traverse, read where it does not know its length."""
+    return sum(map(len, traverse.batches(64))) if traverse.length is None else traverse.length
 
 
 def check_kind(state: dict[str, Any]) -> None:

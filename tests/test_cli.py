@@ -315,7 +315,7 @@ def trained_map(tmp_path: Path) -> Path:
     np.save(tmp_path / "b.npy", frames(96, seed=5, size=8))
     periods = SpectrogramAnalysis(window=96, strongest=1)
     mapper = TemplateMapper(periods, metric="l2", temperature=0.2)
-    model = DejaVu(torch.nn.Flatten(), mapper, threshold=2.5)
+    model = DejaVu(torch.nn.Flatten(), mapper=mapper, threshold=2.5)
     model.learn(open_source(str(tmp_path / "a.npy")))
     model.map.templates *= 0.9
     model.trained = Training(steps=30, seconds=1000.0, seed=3)

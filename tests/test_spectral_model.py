@@ -104,6 +104,47 @@ def test_whitening_by_a_second_traverse(reference: Traverse, second: Traverse) -
     assert ((found - torch.arange(FRAMES)).abs() <= 5).float().mean() > 0.95
 
 
+def test_frames_that_show_no_place_are_left_out(reference: Traverse, second: Traverse) -> None:
+    part = open_source(f"sim:aerial?frames={FRAMES}&traverse=1&start=100")
+    shown = torch.arange(FRAMES).where(torch.arange(FRAMES) >= 100, -1)
+    learned = [
+        spectral(numbers=20).learn(reference, second=views)
+        for views in (Views(second, shown), Views(part, shown[100:]))
+    ]
+    first, other = (model.state_dict()["whitening.projection"].int() for model in learned)
+    assert (first - other).abs().max() <= 1  # a step of rounding
+
+
+def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> None:
+    model = spectral()
+    views = model.views(reference, second)
+    assert views.traverse is second
+    assert (views.places - torch.arange(FRAMES)).abs().max() <= 2  # by the positions that both carry
+    assert model.views(reference, second, "290").places.tolist() == [*range(290, 300), *[-1] * 290]
+    plain = ArrayTraverse(torch.rand(FRAMES, 1, 9, 9), "plain"), ArrayTraverse(torch.rand(9, 1, 9, 9), "few")
+    assert model.views(plain[0], plain[0]).places.tolist() == list(range(FRAMES))
+    with refused("few has 9 frames", "plain 300", "second_truth"):
+        model.views(*plain)
+    with refused("no whitening", "few"):
+        DejaVu().views(*plain, "0")
+    with refused("no whitening", "few"):
+        DejaVu().learn(plain[0], second=Views(plain[1], torch.arange(9)))
+
+
+def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_path: Path) -> None:
+    model.save(tmp_path / "m.safetensors")
+    known, other = DejaVu.load(tmp_path / "m.safetensors"), DejaVu(mapper=SpectralMapper(3.0))
+    for without in (DejaVu(), spectral()):
+        with refused("without whitening"):
+            other.take_whitening(without)
+    other.take_whitening(known)
+    other.learn(open_source(f"sim:aerial?frames={FRAMES}&traverse=1"))
+    states = [one.state_dict()["whitening.projection"] for one in (model, other)]
+    assert torch.equal(*states)
+    found = other.localize(reference).index
+    assert ((found - torch.arange(FRAMES)).abs() <= 5).float().mean() > 0.9
+
+
 def test_a_fixed_whitening_is_kept(model: DejaVu, second: Traverse) -> None:
     assert model.whitening is not None
     whitening = Whitening()
@@ -142,6 +183,8 @@ def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
     ).float().mean() > 0.7
     with refused("ready features", "frames to augment"):
         AugmentedTraverse(ArrayTraverse(torch.rand(9, 2), "nine"), 9, 1, 9, {})
+    with refused("colour2", "occlusion"):
+        AugmentedTraverse(reference, FRAMES, 1, 9, {"colour2": 1})
 
 
 def test_networks_are_described_in_eval_mode() -> None:

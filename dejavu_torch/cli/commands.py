@@ -14,6 +14,8 @@ from torch import nn
 
 from dejavu_torch.data.files import check_output_file, check_output_folder, make_output_folder
 from dejavu_torch.data.source import open_source
+from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
@@ -24,37 +26,55 @@ if TYPE_CHECKING:
     from dejavu_torch.experiments.compare import Comparison
 
 
-def run_demo(*, out: Path = Path("dejavu_demo"), seed: int = 0, model: DejaVu, command: str) -> None:
+def run_demo(
+    *, out: Path = Path("dejavu_demo"), seed: int = 0, second: str | None = None, model: DejaVu, command: str
+) -> None:
     """The main job on the built-in route: learn, localize a second traverse, report.
 
     Args:
         out: folder for report and pictures
-        seed: which route
+        seed: which route, and of the whitening and the null control
+        second: another traverse of the route, from which whitening learns what a visit changes
     """
     from dejavu_torch.experiments.compare import compare
 
     check_output_folder(out)
+    _set_seed(model, seed)
     reference = open_source(f"sim:aerial?seed={seed}")
     query = open_source(f"sim:aerial?seed={seed}&traverse=1")
     print(f"learning {reference.name}, then finding {query.name} on it")
-    result = compare(reference, query, model=model, progress=True)
+    reference, views = _with_second(model, reference, second, None, query)
+    result = compare(reference, query, model=model, seed=seed, second=views, progress=True)
     _publish(result, out, "dejavu demo: the built-in route", command)
 
 
-def run_learn(source: str, *, map: Path, model: DejaVu) -> None:
+def run_learn(
+    source: str,
+    *,
+    map: Path,
+    seed: int = 0,
+    second: str | None = None,
+    second_truth: str | None = None,
+    model: DejaVu,
+) -> None:
     """Learn a map; print its plan, its summary and the bytes per place.
 
     Args:
         source: folder of images, video (clip.mp4?width=160), .npy of frames or features,
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
         map: map file to write (.safetensors)
+        seed: of the whitening, where it has none of its own
+        second: another traverse of the same places, from which whitening learns what a visit changes
+        second_truth: which places it shows, as --truth of `dejavu compare`
     """
     if map.suffix != ".safetensors":
         raise InputError(f"--map {map} is no name of a map; expected {map.with_suffix('.safetensors')}")
     check_output_file(map)
+    _set_seed(model, seed)
     traverse = model.resample(open_source(source), progress=True)
     _print_steps(traverse)
-    model.learn(traverse, progress=True)
+    traverse, views = _with_second(model, traverse, second, second_truth)
+    model.learn(traverse, progress=True, second=views)
     model.save(map)
     _print_map(model)
     if model.map.summary().covered:
@@ -118,6 +138,9 @@ def run_compare(
     tolerance: int = 5,
     interpolate: bool = False,
     leave_out: int | None = None,
+    seed: int = 0,
+    second: str | None = None,
+    second_truth: str | None = None,
     map: Path | None = None,
     model: DejaVu,
     command: str,
@@ -133,6 +156,9 @@ def run_compare(
         tolerance: right within this many places, inclusive
         interpolate: fill in a csv that lists some queries only
         leave_out: diagnostic, the reference on itself with this many frames to each side left out
+        seed: of the null control's shuffle and of the whitening
+        second: a third traverse, as of `dejavu learn`
+        second_truth: which places it shows, as --truth
         map: evaluate this map of the reference, with its own settings, instead of learning one
     """
     from dejavu_torch.experiments.compare import compare
@@ -142,15 +168,20 @@ def run_compare(
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
         model.threshold = model.threshold if given.threshold is None else given.threshold
-    sources = open_source(reference), open_source(query)
+    first, queries = open_source(reference), open_source(query)
     _check_report_folder(out, reference, query)
+    _set_seed(model, seed)
+    first, views = _with_second(model, first, second, second_truth, queries)
     result = compare(
-        *sources,
+        first,
+        queries,
         truth,
         model,
         tolerance=tolerance,
         leave_out=leave_out,
+        seed=seed,
         interpolate=interpolate,
+        second=views,
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map)
@@ -286,6 +317,27 @@ def _check_report_folder(out: Path, *sources: str | None) -> None:
     check_output_folder(out)
 
 
+def _set_seed(model: DejaVu, seed: int) -> None:
+    """The command's seed for a whitening that is to be learned and has none of its own."""
+    if model.whitening is not None and not model.whitening.fixed and not model.map.places:
+        model.whitening.seed = model.whitening.seed or seed
+
+
+def _with_second(
+    model: DejaVu, reference: Traverse, second: str | None, truth: str | None, query: Traverse | None = None
+) -> tuple[Traverse, Views | None]:
+    """The reference, and the second traverse that whitening learns from."""
+    if second is None:
+        if truth is not None:
+            raise InputError(f"--second_truth {truth} is of no traverse; expected --second SOURCE with it")
+        return reference, None
+    traverse = open_source(second)
+    if query is not None and Path(traverse.name).resolve() == Path(query.name).resolve():
+        raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
+    reference = model.resample(reference, progress=True)
+    return reference, model.views(reference, traverse, truth)
+
+
 def _print_steps(traverse: Traverse) -> None:
     if isinstance(traverse, ResampledTraverse):
         steps = f"even steps of {traverse.step:.4g} pixels of ground"
@@ -297,6 +349,12 @@ def _print_map(model: DejaVu) -> None:
     if not summary.covered:
         print("this route does not repeat")
     print(summary)
+    whitening = model.whitening
+    if whitening is not None:
+        numbers = " to ".join(str(count) for count in whitening.projection.shape)
+        print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
+    if isinstance(model.map, SpectralMap) and model.map.needed is not None:
+        print(f"this route needs about {model.map.needed:.2g} bytes per place")
 
 
 def _print_next(*words: str | Path) -> None:

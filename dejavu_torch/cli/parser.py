@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import docstring_parser
 import jsonargparse
 
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
 
@@ -17,13 +19,13 @@ COMMAND = "command"  # the parameter that is the command line itself
 # classes whose options can be given alone, where the constructor's type is a base class
 DEFAULT_PARTS = {
     "features": {"class_path": "dejavu_torch.HOG"},
-    "whitening": {"class_path": "dejavu_torch.Whitening"},
     "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
 }
 HINT = (
-    "Parts have options of their own, such as --features.cell 4, --mapper.reduction sum, "
+    "Parts have options of their own, such as --features.cell 4, --whitening.numbers 64, "
     "--mapper.periods.window 512, --preprocess.contrast patch or --velocity.step 5: see --features.help HOG, "
-    "--mapper.help TemplateMapper, --preprocess.help and --velocity.help."
+    "--whitening.help, --mapper.help TemplateMapper, --preprocess.help and --velocity.help. --whitening "
+    "also takes none, or a map file, whose features it then takes as well."
 )
 LONGEST = 300  # characters of a message that is told whole
 
@@ -138,6 +140,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         InputError: what the constructor of a part refuses.
     """
     parser = command_parser(name, function)
+    words, whitening = _without_whitening_map(words) if MODEL in function.__annotations__ else (words, None)
     parsed = parser.parse_args(list(words))
     try:
         arguments: dict[str, Any] = parser.instantiate(parsed).as_dict()
@@ -147,10 +150,48 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         settings = list(inspect.signature(DejaVu).parameters)
         changed = [one for one in settings if parsed[one] != parser.get_defaults()[one]]
         lost = set(changed) - {"features", "threshold"}  # a map has all but these itself
-        if name == "compare" and arguments["map"] and lost:
-            told = (word.lstrip("-").partition("=")[0].partition(".")[0] for word in words)
-            one = next((one for one in told if one in lost), "config")
-            raise UsageError(f"--{one}: a --map has its own settings; expected one or the other")
+        told = [word.lstrip("-").partition("=")[0] for word in words if word.startswith("--")]
+        if name == "compare" and arguments["map"]:
+            lost |= {one for one in ("second", "second_truth") if arguments[one] is not None}
+            lost |= {"whitening"} if whitening else set()
+            if lost:
+                named = (one.partition(".")[0] for one in told)
+                one = next((one for one in named if one in lost), "whitening" if whitening else "config")
+                raise UsageError(f"--{one}: a --map has its own settings; expected one or the other")
         arguments.pop("config")
-        arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
+        model = arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
+        if whitening:
+            _take_whitening(model, whitening, told)
     return arguments
+
+
+def _without_whitening_map(words: Sequence[str]) -> tuple[list[str], Path | None]:
+    """The words without `--whitening MAP`, and the map."""
+    kept: list[str] = []
+    whitening = None
+    for word in words:
+        if kept and kept[-1] == "--whitening" and not word.startswith("--"):
+            word = f"{kept.pop()}={word}"
+        if word.startswith("--whitening="):
+            value = word.partition("=")[2]
+            whitening = Path(value) if value.endswith(".safetensors") else None
+            word = "--whitening=null" if whitening else word
+        kept.append(word)
+    return kept, whitening
+
+
+def _take_whitening(model: DejaVu, path: Path, told: Sequence[str]) -> None:
+    """Give a model the whitening of a map file; features of our own come from there as well.
+
+    Args:
+        told: the options of the command line.
+    """
+    other = [one for one in told if one.startswith(("whitening.", "preprocess"))]
+    if other:
+        raise UsageError(f"--{other[0]}: the whitening of {path} has its own; expected one or the other")
+    named = any(one.startswith("features") for one in told)
+    known = DejaVu.load(path, model.features if named or not isinstance(model.features, HOG) else None)
+    try:
+        model.take_whitening(known)
+    except InputError as error:
+        raise InputError(f"--whitening {path}: {error}") from error

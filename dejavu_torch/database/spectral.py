@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from fractions import Fraction
+from functools import partial
 from typing import Any, Literal, get_args
 
 import torch
@@ -23,6 +25,7 @@ STRONGEST = 10  # periods that a summary names
 CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and checksum in the file
 WITHIN = 0.98  # of the budget is near enough
 CODED = 1.13  # bytes that the codec needs for one of entropy, measured
+LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
 LINE_COST = 60  # of a coded line in a query's sum
 TRANSFORM_COST = 200  # of a place in a query's inverse transform
@@ -48,6 +51,10 @@ class SpectralMap(PlaceMap):
         steps: (G,) float32, of each chunk.
         mean: (K,) bfloat16, of the route's descriptors: the lines are of what differs from it.
         positions: see `PlaceMap`.
+
+    Attributes:
+        needed: bytes per place that would hold half the variance of a route of which this map holds under a
+            tenth; None where it holds more, or was loaded.
 
     Args:
         metric: "cosine": 1 - the cosine of the angle between query and rebuilt descriptor. "l2": the square
@@ -77,6 +84,7 @@ class SpectralMap(PlaceMap):
     value: Tensor
     norms: Tensor
     per_norm: Tensor
+    needed: float | None = None
 
     def __init__(
         self,
@@ -225,6 +233,10 @@ class SpectralMap(PlaceMap):
         state = dict(tensors)
         table, streams = state.pop("stream_table"), state.pop("streams")
         lengths, columns = state["lengths"], len(state["mean"])
+        if lengths.dtype != torch.int64 or table.dtype != torch.int64:
+            raise InputError(
+                f"the table of chunks has {lengths.dtype} and {table.dtype}; expected whole numbers"
+            )
         if table.shape != (len(lengths), 2) or not len(lengths) or streams.dtype != torch.uint8:
             raise InputError(
                 f"a stream table {tuple(table.shape)} for {len(lengths)} chunks; expected a row each"
@@ -269,6 +281,7 @@ class SpectralMap(PlaceMap):
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "mean": "mean", "positions": "positions"}
         route = {own: packed[name].nbytes for name, own in names.items() if name in packed}
+        route = {name: size for name, size in route.items() if size}
         others = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         heard, lines = self.places - self.silent, len(self.value)
         route["chunks"] = others
@@ -359,7 +372,7 @@ class SpectralMapper(Mapper):
         step = self._step(lines, lengths, overhead) if self.step is None else self.step
         small, escapes = to_int8(quantise(lines, step))
         steps = features.new_full((len(lengths),), step)
-        return SpectralMap(
+        route = SpectralMap(
             small,
             escapes,
             torch.tensor(lengths, device=features.device),
@@ -369,6 +382,14 @@ class SpectralMapper(Mapper):
             self.transform,
             self.chunk,
         )
+        if _held(lines, step) < LITTLE:
+            half = _smallest_step(lambda step: _held(lines, step) < 0.5, *_steps(lines))
+            route.needed = (overhead + _coded_bytes(lines, lengths, half)) / len(features)
+        return route
+
+    def extra_repr(self) -> str:
+        names = ("route_bytes_per_place", "step", "chunk", "transform", "metric")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
     def empty(self) -> SpectralMap:
         return SpectralMap(metric=self.metric, transform=self.transform, chunk=self.chunk)
@@ -384,12 +405,12 @@ class SpectralMapper(Mapper):
                 f"{overhead / places:.3g}, which the mean and the table of chunks take, and at most "
                 f"{4 * numbers}, {numbers} numbers as floats"
             )
-        finest, coarsest = float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
+        finest, coarsest = _steps(lines)
         if not self.exact:
-            return _step_of_entropy(lines, room / CODED, finest, coarsest)
+            return _smallest_step(partial(_fits, lines, room / CODED), finest, coarsest)
         aim, fitting = room, coarsest
         for _ in range(8):
-            step = _step_of_entropy(lines, aim, finest, coarsest)
+            step = _smallest_step(partial(_fits, lines, aim), finest, coarsest)
             size = _coded_bytes(lines, lengths, step)
             if size <= room:
                 fitting = min(fitting, step)
@@ -477,13 +498,28 @@ def _coded_bytes(lines: Tensor, lengths: list[int], step: float) -> int:
     return escapes.nbytes + sum(len(encode(part).bytes) for part in small.split(lengths))
 
 
-def _step_of_entropy(lines: Tensor, size: float, finest: float, coarsest: float) -> float:
-    """The step at which the levels' entropy is so many bytes, by bisection of its logarithm."""
-    low, high = math.log(finest), math.log(coarsest)
-    if entropy_bytes(quantise(lines, finest)) <= size:
+def _steps(lines: Tensor) -> tuple[float, float]:
+    """The finest step that is worth trying, and one so coarse that no line is left."""
+    return float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
+
+
+def _fits(lines: Tensor, size: float, step: float) -> bool:
+    """Whether the levels' entropy is at most so many bytes."""
+    return entropy_bytes(quantise(lines, step)) <= size
+
+
+def _held(lines: Tensor, step: float) -> float:
+    """The share of the variance that lines in such steps hold."""
+    error = lines - step * quantise(lines, step)
+    return 1 - float(error.square().sum() / lines.square().sum())
+
+
+def _smallest_step(enough: Callable[[float], bool], finest: float, coarsest: float) -> float:
+    """The smallest step that is coarse enough, by bisection of its logarithm."""
+    if enough(finest):
         return finest
+    low, high = math.log(finest), math.log(coarsest)
     for _ in range(20):
         middle = (low + high) / 2
-        fits = entropy_bytes(quantise(lines, math.exp(middle))) <= size
-        low, high = (low, middle) if fits else (middle, high)
+        low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
     return math.exp(high)

@@ -112,16 +112,24 @@ def describe(summary: MapSummary) -> str:
         >>> print(summarise(tuple(layers), places=1024, route={"templates": 2112, "layers": 1984}))
         places 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); together 5301 places
         1024 of 1024 places covered; 264 templates, 528 numbers
-        4096 bytes, 4.0 per place: templates 2112, layers 1984
+        4096 bytes, 4.0 per place: 4096 of the route, 4.00 per place (templates 2112, layers 1984)
     """
     lines = [_chunk_line(chunk) for chunk in summary.chunks]
     stored = f"{summary.templates} templates, {summary.template_numbers} numbers"
     if summary.lines:
         stored = f"{summary.lines} lines of their spectra"
     lines.append(f"{summary.covered} of {summary.places} places covered; {stored}")
-    parts = ", ".join(f"{name} {size}" for name, size in {**summary.route, **summary.fixed}.items())
-    lines.append(f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: {parts}")
+    growing = summary.route_bytes / max(summary.places, 1)
+    stored = f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: "
+    stored += f"{summary.route_bytes} of the route, {growing:.2f} per place ({_parts(summary.route)})"
+    if summary.fixed:
+        stored += f", and {summary.fixed_bytes} fixed ({_parts(summary.fixed)})"
+    lines.append(stored)
     return "\n".join(lines)
+
+
+def _parts(parts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {size}" for name, size in parts.items())
 
 
 def _chunk_line(chunk: ChunkSummary) -> str:

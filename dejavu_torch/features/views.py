@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -14,7 +15,10 @@ BLOCK = 64  # frames augmented at once
 
 
 class Views(NamedTuple):
-    """traverse: frames of places of the reference. places: (n,) int64, which place each of them shows."""
+    """Frames of places of the reference.
+
+    places: (n,) int64, which place each frame shows; -1 for none, and the frame is left out.
+    """
 
     traverse: Traverse
     places: Tensor
@@ -31,7 +35,7 @@ class AugmentedTraverse(Traverse):
         seed: of the copies.
 
     Raises:
-        InputError: ready features.
+        InputError: ready features, or strengths that `Augmentation` refuses.
     """
 
     def __init__(
@@ -50,7 +54,11 @@ class AugmentedTraverse(Traverse):
         self.traverse, self.copies, self.seed = traverse, copies, seed
         self.shown = range(0, frames, max(1, -(-frames * copies // most)))
         self.block = traverse.batch_size(BLOCK)  # of frames, whatever the batch size: the same copies
-        self.augmentation = Augmentation(**strengths).train()
+        try:
+            self.augmentation = Augmentation(**strengths).train()
+        except TypeError as error:
+            known = ", ".join(inspect.signature(Augmentation).parameters)
+            raise InputError(f"the strengths of whitening are {strengths}; expected {known}") from error
         self.name = f"augmented copies of {traverse.name}"
         self.length = copies * len(self.shown)
 

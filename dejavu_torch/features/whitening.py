@@ -152,6 +152,8 @@ class Whitening(nn.Module):
                 f"Whitening got shrinkage={shrinkage}, bits={bits}; expected a shrinkage above 0 and at most "
                 "1, 8 or 16 bits"
             )
+        if not isinstance(strengths, Mapping | None):
+            raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
         self.most_views, self.seed, self.bits = most_views, seed, bits
         self.strengths = {**STRENGTHS, **(strengths or {})}
@@ -203,7 +205,13 @@ class Whitening(nn.Module):
         if views is None:
             self._store(mean, basis[:, :kept], variances[:kept].sum().sqrt())
             return
-        pairs = [((view - mean) @ basis, place) for view, place in views]
+        pairs = []
+        for view, place in views:
+            if view.shape[1] != len(mean):
+                raise InputError(
+                    f"the views have {view.shape[1]} features; expected {len(mean)}, as the route has"
+                )
+            pairs.append(((view - mean) @ basis, place))
         shown = torch.cat([place for _, place in pairs])
         own = torch.cat([(places[part].to(mean) - mean) @ basis for part in shown.split(ROWS)])
         centre, projection = learned_whitening(
@@ -226,7 +234,9 @@ class Whitening(nn.Module):
         self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
-        for name, own in self.named_buffers(recurse=False):
+        buffers = dict(self.named_buffers(recurse=False))
+        _check_buffers(**{name: state.get(prefix + name, own) for name, own in buffers.items()})
+        for name, own in buffers.items():
             if prefix + name in state:
                 setattr(self, name, torch.empty_like(state[prefix + name], device=own.device))
         super()._load_from_state_dict(state, prefix, *args)
@@ -234,6 +244,19 @@ class Whitening(nn.Module):
     def extra_repr(self) -> str:
         names = ("numbers", "components", "shrinkage", "views", "most_views", "strengths", "seed", "bits")
         return ", ".join(f"{name}={getattr(self, name)}" for name in names)
+
+
+def _check_buffers(projection: Tensor, scale: Tensor, offset: Tensor, length: Tensor) -> None:
+    """Refuse what is no projection and its scale."""
+    seen = [tuple(tensor.shape) for tensor in (projection, scale, offset, length)]
+    numbers = seen[0][1:]
+    whole = projection.dtype in (torch.int8, torch.int16) and seen[1:3] == [numbers] * 2
+    finite = all(bool(tensor.isfinite().all()) for tensor in (scale, offset, length))
+    if len(seen[0]) != 2 or not whole or not finite or seen[3] not in ((0,), (1,)):
+        raise InputError(
+            f"the whitening has a projection, scale, offset and length of {seen}; expected finite (D,K), "
+            "(K,), (K,), and one number or none"
+        )
 
 
 def principal_components(rows: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:

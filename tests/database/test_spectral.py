@@ -207,6 +207,18 @@ def test_summary() -> None:
     assert summary.route_bytes == sum(summary.route.values())
 
 
+def test_noise_tells_what_half_of_its_variance_needs() -> None:
+    noise = torch.randn(800, 60, generator=torch.Generator().manual_seed(0))
+    needed = SpectralMapper(0.8)(noise).needed
+    assert needed is not None
+    learned = SpectralMapper(needed)(noise)
+    assert learned.needed is None
+    share = 1 - (held(learned) - noise).square().mean() / noise.var()
+    assert 0.45 < share < 0.55
+    assert SpectralMapper(0.8)(route(800, 60)).needed is None
+    assert SpectralMapper(None, step=100.0)(noise).needed == pytest.approx(needed, rel=0.01)
+
+
 def test_code_trains_lines_and_step() -> None:
     generator = torch.Generator().manual_seed(0)
     lines = torch.randn(12, 3, dtype=torch.float64, generator=generator)
@@ -292,6 +304,8 @@ def damaged(tensors: dict[str, Tensor], change: str) -> dict[str, Tensor]:
         tensors["streams"][40] ^= 1
     elif change == "huge":
         tensors["lengths"][0] = 2**50
+    elif change == "nan":
+        tensors["lengths"] = torch.full((4,), math.nan)
     elif change == "table":
         tensors["stream_table"] = tensors["stream_table"][:, :1]
     elif change == "step":
@@ -303,7 +317,9 @@ def damaged(tensors: dict[str, Tensor], change: str) -> dict[str, Tensor]:
     return tensors
 
 
-@pytest.mark.parametrize("change", ["truncated", "altered", "huge", "table", "step", "mean", "escapes"])
+@pytest.mark.parametrize(
+    "change", ["truncated", "altered", "huge", "nan", "table", "step", "mean", "escapes"]
+)
 def test_a_damaged_map_is_refused(change: str) -> None:
     learned = SpectralMapper(chunk=100)(route())
     other = SpectralMapper(chunk=100).empty()

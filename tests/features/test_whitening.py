@@ -202,3 +202,19 @@ def test_a_route_that_cannot_be_whitened() -> None:
     whitening.learn(places)
     with refused("(600, 7)", "(B, 40)"):
         whitening(views[:, :7])
+    with refused("7 features", "expected 40"):
+        whitening.learn(places, [(views[:, :7], torch.arange(600))])
+    with refused("strengths", "'all'"):
+        Whitening(strengths="all")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["projection", "scale", "offset", "length"])
+def test_a_state_that_does_not_fit_is_refused(name: str) -> None:
+    places, views = route()
+    whitening, other = Whitening(numbers=4), Whitening()
+    whitening.learn(places, [(views, torch.arange(600))])
+    state = whitening.state_dict()
+    state[name] = torch.ones(3) if name == "length" else state[name][..., :3]
+    with refused("(K,)", "(40, 3)" if name == "projection" else "(40, 4)"):
+        other.load_state_dict(state)
+    assert not other.learned

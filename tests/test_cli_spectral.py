@@ -1,0 +1,310 @@
+"""Whitening and spectral maps as a user of the commands meets them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, frames, report_of, run
+from footage import QUERY, REFERENCE, SIDE, STEP, footage
+from helpers import refused
+
+from dejavu_torch import DejaVu, SpectralMap, SpectralMapper
+from dejavu_torch.cli.commands import run_learn
+from dejavu_torch.cli.parser import parse
+from dejavu_torch.cli.presets import with_configs
+from dejavu_torch.database.mapfile import read_map
+
+ROUTE = "sim:aerial?frames=96"
+SECOND = "sim:aerial?frames=96&traverse=1"
+THIRD = "sim:aerial?frames=96&traverse=2"
+SPECTRAL = ("--config", "spectral")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A spectral map of the route, and frames and features in files."""
+    folder = tmp_path_factory.mktemp("spectral")
+    run("learn", ROUTE, "--map", folder / "m.safetensors", *SPECTRAL)
+    noise = np.random.default_rng(0)
+    np.save(folder / "a.npy", frames(64, seed=1))
+    np.save(folder / "b.npy", frames(64, seed=2))
+    np.save(folder / "c.npy", frames(50, seed=3))
+    np.save(folder / "noise.npy", noise.normal(size=(900, 100)).astype(np.float32))
+    return folder
+
+
+def model_of(*words: str | Path) -> DejaVu:
+    model = parse("learn", run_learn, with_configs(["x", "--map", "y", *map(str, words)]))["model"]
+    assert isinstance(model, DejaVu)
+    return model
+
+
+def same_maps(first: Path, second: Path) -> bool:
+    (one, header), (other, other_header) = read_map(first), read_map(second)
+    return header == other_header and all(torch.equal(one[name], other[name]) for name in one)
+
+
+# what works
+
+
+def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = folder / "told.safetensors"
+    run("learn", ROUTE, "--map", path, *SPECTRAL, "--whitening.views", "2")
+    learned = capsys.readouterr().out
+    run("info", path)
+    info = capsys.readouterr().out
+    summary = DejaVu.load(path).summary()
+    assert summary.map_bytes == path.stat().st_size
+    per_place = summary.route_bytes / 96
+    for told in (learned, info):
+        assert f"{summary.map_bytes} bytes" in told
+        assert f"{summary.route_bytes} of the route, {per_place:.2f} per place" in told
+        assert f"{summary.fixed_bytes} fixed" in told
+        assert f"whitening {summary.fixed['whitening']}" in told
+        assert "1764 to 24 numbers" in told
+        assert "views=2" in told
+        assert "needs about" not in told
+    assert "route_bytes_per_place=5.0" in info
+
+
+def test_a_seed_makes_the_copies_and_nothing_else_is_drawn(folder: Path) -> None:
+    paths = [folder / f"seed{i}.safetensors" for i in range(3)]
+    run("learn", ROUTE, "--map", paths[0], *SPECTRAL, "--seed", "3")
+    run("learn", ROUTE, "--map", paths[1], *SPECTRAL, "--seed", "3")
+    run("learn", ROUTE, "--map", paths[2], *SPECTRAL, "--seed", "4", "--whitening.seed", "3")
+    assert same_maps(paths[0], paths[1])
+    assert same_maps(paths[0], paths[2])
+    assert not same_maps(paths[0], folder / "m.safetensors")
+
+
+def test_options_of_parts() -> None:
+    options = ["--whitening.views", "2", "--mapper.route_bytes_per_place", "2.5", "--mapper.chunk", "100"]
+    model = model_of(*SPECTRAL, *options)
+    assert isinstance(model.mapper, SpectralMapper)
+    assert model.whitening is not None
+    assert (model.whitening.views, model.mapper.route_bytes_per_place, model.mapper.chunk) == (2, 2.5, 100)
+    plain = model_of("--whitening", "dejavu_torch.Whitening", "--whitening.numbers", "64")
+    assert plain.whitening is not None
+    assert plain.whitening.numbers == 64
+    stepped = model_of(*SPECTRAL, "--mapper.route_bytes_per_place", "null", "--mapper.step", "0.1")
+    assert stepped.mapper.step == 0.1
+
+
+@pytest.mark.parametrize("option", [["--whitening", "none"], ["--whitening=none"], ["--whitening", "null"]])
+def test_no_whitening(option: list[str]) -> None:
+    model = model_of(*SPECTRAL, *option)
+    assert model.whitening is None
+    assert isinstance(model.mapper, SpectralMapper)
+
+
+def test_the_whitening_of_another_map_with_what_is_ahead_of_it(folder: Path) -> None:
+    path, own = folder / "coarse.safetensors", folder / "own.safetensors"
+    options = "--features.cell", "16", "--preprocess.contrast", "patch", "--whitening.numbers", "9"
+    run("learn", ROUTE, "--map", path, *SPECTRAL, *options)
+    run("learn", THIRD, "--map", own, *SPECTRAL, "--whitening", path, "--seed", "5")
+    known, model = DejaVu.load(path), DejaVu.load(own)
+    assert known.whitening is not None
+    assert model.whitening is not None
+    assert torch.equal(model.whitening.projection, known.whitening.projection)
+    assert repr(model.whitening) == repr(known.whitening)
+    assert (model.features.cell, model.preprocess.contrast) == (16, "patch")
+    run("compare", ROUTE, SECOND, *SPECTRAL, "--whitening", path, "--out", folder / "fixed")
+    assert report_of(folder / "fixed")["recall_at_1"] > 0.8
+
+
+def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> None:
+    out = folder / "third"
+    run("compare", ROUTE, SECOND, *SPECTRAL, "--second", THIRD, "--seed", "1", "--out", out)
+    run("learn", ROUTE, "--map", folder / "third.safetensors", *SPECTRAL, "--second", THIRD, "--seed", "1")
+    assert same_maps(out / "map.safetensors", folder / "third.safetensors")
+    assert not same_maps(out / "map.safetensors", folder / "m.safetensors")
+    assert report_of(out)["recall_at_1"] > 0.9
+    assert report_of(out)["kind"] == "spectral"
+
+
+def test_the_seed_of_compare_shuffles_the_null(folder: Path) -> None:
+    pair = folder / "a.npy", folder / "b.npy", "--config", "default"
+    for seed in (0, 1):
+        run("compare", *pair, "--seed", str(seed), "--out", folder / f"null{seed}")
+    first, second = (report_of(folder / f"null{seed}") for seed in (0, 1))
+    assert first["auc"] == second["auc"]
+    assert first["null_same_plan"] != second["null_same_plan"]
+
+
+def test_a_second_traverse_of_another_length_by_its_truth(folder: Path) -> None:
+    (folder / "some.csv").write_text("query,place\n" + "".join(f"{q},{q + 8}\n" for q in range(20, 50)))
+    for name, truth in (("offset", "8"), ("csv", folder / "some.csv")):
+        path = folder / f"{name}.safetensors"
+        second = "--second", folder / "c.npy", "--second_truth", truth
+        run("learn", folder / "a.npy", "--map", path, *SPECTRAL, *second)
+        assert DejaVu.load(path).map.places == 64
+
+
+def test_a_second_traverse_is_resampled_as_the_reference_is(tmp_path: Path) -> None:
+    for name, where in (("reference", REFERENCE), ("second", QUERY)):
+        np.save(tmp_path / f"{name}.npy", (255 * footage(where, 0.02)[:, 0]).byte().numpy())
+    nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
+    rows = "".join(f"{q},{p}\n" for q, p in enumerate(nearest))
+    (tmp_path / "truth.csv").write_text("query,place\n" + rows)
+    corners = ["--velocity.corners", "[[0,0],[1,0],[1,1],[0,1]]", "--velocity.size", f"[{SIDE},{SIDE}]"]
+    options = [*SPECTRAL, *corners, "--velocity.step", str(STEP), "--second", tmp_path / "second.npy"]
+    path = tmp_path / "m.safetensors"
+    truth = "--second_truth", tmp_path / "truth.csv"
+    run("learn", tmp_path / "reference.npy", "--map", path, *options, *truth)
+    assert DejaVu.load(path).map.places == 101
+
+
+def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, options = folder / "noise.npy", ("--config", "spectral", "--whitening", "none")
+    budget = "--mapper.route_bytes_per_place", "1"
+    run("learn", source, "--map", folder / "noise.safetensors", *options, *budget)
+    (line,) = [told for told in capsys.readouterr().out.splitlines() if "needs about" in told]
+    needed = line.removeprefix("this route needs about ").removesuffix(" bytes per place")
+    assert 5 < float(needed) < 20
+    run("compare", source, source, *options, *budget, "--out", folder / "noise")
+    assert line in capsys.readouterr().out.splitlines()
+    run("learn", source, "--map", folder / "n.safetensors", *options, *budget[:1], needed)
+    assert "needs about" not in capsys.readouterr().out
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--mapper.route_bytes_per_place", "0.5"], ("route_bytes_per_place is 0.5", "the mean")),
+        (["--mapper.route_bytes_per_place", "900"], ("route_bytes_per_place is 900", "at most 96")),
+        (["--mapper.step", "0.1"], ("5.0", "step is 0.1", "one of them")),
+        (["--whitening.numbers", "120"], ("numbers is 120", "rank 95")),
+        (["--whitening.strengths.colour2", "0"], ("colour2", "expected colour, rotation")),
+        (["--whitening", "none.such"], ("whitening", "'none'")),
+        (["--whitening", "dejavu_torch.HOG"], ("whitening", "dejavu_torch.HOG")),
+        (["--whitening", "nowhere.safetensors"], ("nowhere.safetensors is not there",)),
+        (["--whitening.colour", "1"], ("whitening", "colour")),
+        (["--mapper.periods.window", "64"], ("mapper", "periods.window")),
+        (["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"], ("route_bytes_per_place",)),
+        (["--second_truth", "0"], ("--second_truth 0", "--second")),
+        (["--second", "nowhere"], ("nowhere is not there",)),
+        (["--second", ROUTE], ("views", "a second traverse")),
+        (["--second", SECOND, "--whitening", "none"], ("no whitening", "traverse=1")),
+        (["--second", SECOND, "--second_truth", "maybe"], ("'maybe'",)),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_settings_that_do_not_fit(
+    options: list[str], words: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "m.safetensors"
+    source = "sim:aerial?frames=96"
+    error = fails(capsys, "learn", source, "--map", path, *SPECTRAL, *options)
+    assert [word for word in words if word not in error] == [], error
+    assert not path.exists()
+
+
+def test_views_that_do_not_vary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pairs = {"colour": [0, 0], "exposure": [0, 0], "shift": [0, 0]}
+    numbers = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion", "noise"), 0)
+    strengths = f"--whitening.strengths={json.dumps(pairs | numbers)}"
+    error = fails(capsys, "learn", ROUTE, "--map", tmp_path / "m.safetensors", *SPECTRAL, strengths)
+    assert "views differ from those of their places by 0 " in error
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (np.full((80, 20), 0.5, np.float32), ("80 descriptors", "all alike")),
+        (np.full((80, 20), np.nan, np.float32), ("frame 0", "NaN")),
+        (np.ones((1, 20), np.float32), ("(1, 20)", "at least 2")),
+        (np.full((40, 32, 32), 90, np.uint8), ("40 descriptors", "all alike")),
+        (frames(1), ("(1, 324)", "at least 2")),
+    ],
+    ids=["constant", "nan", "one", "grey", "one frame"],
+)
+@pytest.mark.parametrize("whitening", ["none", "Whitening"])
+def test_what_is_no_route(
+    whitening: str,
+    values: np.ndarray,
+    words: tuple[str, ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    np.save(tmp_path / "a.npy", values)
+    path = tmp_path / "m.safetensors"
+    error = fails(capsys, "learn", tmp_path / "a.npy", "--map", path, *SPECTRAL, "--whitening", whitening)
+    assert [word for word in words if word not in error] == [], error
+
+
+def test_a_second_traverse_that_does_not_fit(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    np.save("other.npy", frames(64, size=48))
+    learn = "learn", "a.npy", "--map", "new.safetensors", *SPECTRAL
+    error = fails(capsys, *learn, "--second", "c.npy")
+    assert "c.npy has 50 frames and a.npy 64" in error
+    assert "--second_truth" in error
+    assert "no query has a right answer" in fails(capsys, *learn, "--second", "c.npy", "--second_truth", "70")
+    assert "900 features; expected 324" in fails(capsys, *learn, "--second", "other.npy")
+    for same in ("b.npy", folder / "b.npy"):
+        error = fails(capsys, "compare", "a.npy", "b.npy", *SPECTRAL, "--second", same, "--out", "r")
+        assert f"--second {same} is the query itself" in error
+    assert not Path("r").exists()
+    assert not Path("new.safetensors").exists()
+
+
+def test_a_whitening_that_does_not_fit(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    known, new = folder / "m.safetensors", folder / "new.safetensors"
+    learn = "learn", folder / "a.npy", "--map", new, *SPECTRAL
+    error = fails(capsys, *learn, "--whitening", known)
+    assert "(64, 324)" in error
+    assert "(B, 1764)" in error
+    assert "--whitening.views" in fails(capsys, *learn, "--whitening", known, "--whitening.views", "2")
+    assert "--preprocess.patch" in fails(capsys, *learn, f"--whitening={known}", "--preprocess.patch", "5")
+    assert "cell=16" in fails(capsys, *learn, "--whitening", known, "--features.cell", "16")
+    assert "another map's" in fails(capsys, *learn, "--whitening", known, "--second", folder / "b.npy")
+    plain = folder / "plain.safetensors"
+    run("learn", folder / "a.npy", "--map", plain)
+    assert "without whitening" in fails(capsys, *learn, "--whitening", plain)
+    assert not new.exists()
+
+
+@pytest.mark.parametrize("option", ["--second", "--second_truth", "--whitening"])
+def test_compare_with_a_map_takes_none_of_it(
+    option: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = {"--second": THIRD, "--second_truth": "0"}
+    known = folder / "m.safetensors"
+    other = "--out", folder / "r", option, values.get(option, known)
+    error = fails(capsys, "compare", ROUTE, SECOND, "--map", known, *other)
+    assert f"{option}: a --map has its own settings" in error
+    assert not (folder / "r").exists()
+
+
+@pytest.mark.parametrize("damage", ["cut", "altered", "short", "whitening"])
+def test_a_damaged_map_is_refused(
+    damage: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bad.safetensors"
+    whole = (folder / "m.safetensors").read_bytes()
+    route = DejaVu.load(folder / "m.safetensors").map
+    assert isinstance(route, SpectralMap)
+    lines = route.packed()["streams"].numpy().tobytes()
+    at = whole.index(lines)
+    if damage == "cut":
+        path.write_bytes(whole[:-50])
+    elif damage == "altered":
+        path.write_bytes(whole[: at + 9] + bytes([whole[at + 9] ^ 16]) + whole[at + 10 :])
+    elif damage == "short":
+        path.write_bytes(whole[:at] + bytes(len(lines)) + whole[at + len(lines) :])
+    else:
+        path.write_bytes(whole.replace(b"whitening.scale", b"whitening.skale"))
+    error = fails(capsys, "localize", path, SECOND, "--out", tmp_path / "m.csv")
+    assert str(path) in error
+    with refused(str(path)):
+        DejaVu.load(path)
+    assert not (tmp_path / "m.csv").exists()
