@@ -173,7 +173,7 @@ def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path: Path) ->
 
 def test_ready_features_are_not_preprocessed() -> None:
     model = template_model(preprocess=Preprocess("R-B")).learn(waves())
-    assert torch.equal(model.map.templates, DejaVu().learn(waves()).map.templates)
+    assert torch.equal(model.map.templates, template_model().learn(waves()).map.templates)
 
 
 def test_gradients_pass_through_the_preprocessing() -> None:
@@ -188,13 +188,13 @@ def test_gradients_pass_through_the_preprocessing() -> None:
 def test_so_many_features_are_told_of(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    DejaVu().learn(pictures())
-    DejaVu().learn(torch.rand(40, 200))
+    template_model().learn(pictures())
+    template_model().learn(torch.rand(40, 200))
     assert caplog.text == "" or "smaller frames" not in caplog.text
     monkeypatch.setattr(model_module, "MANY_FEATURES", 50)
-    DejaVu().learn(torch.rand(40, 200))  # ready features: nothing to be done about them
+    template_model().learn(torch.rand(40, 200))  # ready features: nothing to be done about them
     assert "smaller frames" not in caplog.text
-    DejaVu().learn(pictures())
+    template_model().learn(pictures())
     assert "each frame gives 108 features; smaller frames" in caplog.text
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers import refused
+from helpers import refused, template_model
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, best_match, evaluate
@@ -124,7 +124,7 @@ def test_what_is_of_templates_alone_is_refused_in_one_line() -> None:
 def test_a_state_of_another_kind_or_of_other_settings_is_refused() -> None:
     state = DejaVu(mapper=StoredMapper()).learn(torch.rand(9, 2)).state_dict()
     with refused("kind is 'stored'", "'templates'"):
-        DejaVu().load_state_dict(state)
+        template_model().load_state_dict(state)
     other = DejaVu(mapper=StoredMapper(power=2.0))
     with refused("power is 1.0", "2.0"):
         other.load_state_dict(state)
@@ -186,7 +186,7 @@ def test_templates_become_parameters_by_an_argument() -> None:
     gradient = dict(model.named_parameters())["map.templates"].grad
     assert gradient is not None
     assert gradient.abs().max() > 0
-    plain = DejaVu().learn(wave)
+    plain = template_model().learn(wave)
     assert torch.equal(model(wave), plain(wave))
 
 
@@ -206,7 +206,7 @@ def test_a_trainable_map_is_saved_loaded_and_compared(tmp_path: Path) -> None:
 @pytest.mark.parametrize("change", ["templates", "_extra_state", "layers"])
 def test_a_state_that_is_refused_leaves_the_map_as_it_was(change: str) -> None:
     wave = torch.arange(128)[:, None] % torch.tensor([8.0, 9.0])
-    model, other = DejaVu().learn(wave), DejaVu().learn(wave[:64] + 1)
+    model, other = template_model().learn(wave), template_model().learn(wave[:64] + 1)
     expected, state = model(wave), other.map.state_dict()
     if change == "templates":
         state[change] = state[change][:-1]

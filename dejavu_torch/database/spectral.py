@@ -123,6 +123,7 @@ class SpectralMap(PlaceMap):
         problem = self.disagreement()
         if problem:
             raise InputError(f"the map does not fit together: {problem}")
+        self._streams: list[Stream] | None = None  # coded when they are asked for
         self.chunks: list[tuple[int, int]] = []
         for length in self.lengths.tolist():
             start = self.chunks[-1][1] if self.chunks else 0
@@ -222,8 +223,9 @@ class SpectralMap(PlaceMap):
 
     def packed(self) -> dict[str, Tensor]:
         """As `PlaceMap.packed`: the levels of each chunk compressed, with a table of the chunks."""
-        streams = [encode(self.levels[start:stop]) for start, stop in self.chunks]
-        tensors = super().packed()
+        if self._streams is None:
+            self._streams = [encode(self.levels[start:stop]) for start, stop in self.chunks]
+        streams, tensors = self._streams, super().packed()
         del tensors["levels"]
         sizes = torch.tensor([[len(stream.bytes), stream.checksum] for stream in streams], dtype=torch.int64)
         return tensors | {"streams": torch.cat([stream.bytes for stream in streams]), "stream_table": sizes}
@@ -294,11 +296,13 @@ class SpectralMap(PlaceMap):
 
     def _periods(self, energy: Tensor) -> tuple[Fraction, ...]:
         """The periods of the strongest lines, sorted; cosine and sine of one frequency count together."""
-        total: dict[Fraction, float] = {}
-        for line in energy[1:].nonzero().flatten().tolist():
-            period = period_of(line + 1, len(energy), self.transform)
-            total[period] = total.get(period, 0.0) + float(energy[line + 1])
-        return tuple(sorted(sorted(total, key=lambda period: -total[period])[:STRONGEST]))
+        if self.transform == "dft" and len(energy) > 2:  # the line of W / 2 cycles has no sine
+            pairs = torch.cat([energy[1:], energy.new_zeros(1 - len(energy) % 2)]).view(-1, 2)
+            energy = torch.cat([energy[:1], pairs.sum(1).repeat_interleave(2)[: len(energy) - 1]])
+            energy[2::2] = 0
+        lines = energy[1:].argsort(descending=True)[:STRONGEST] + 1
+        kept = lines[energy[lines] > 0].tolist()
+        return tuple(sorted(period_of(line, len(energy), self.transform) for line in kept))
 
     def extra_repr(self) -> str:
         return (

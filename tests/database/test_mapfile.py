@@ -157,7 +157,7 @@ def test_a_map_of_frames_comes_back_with_its_features_and_periods(path: Path) ->
 
 
 def test_a_map_without_layers_comes_back(path: Path) -> None:
-    DejaVu().learn(torch.ones(64, 3)).save(path)
+    template_model().learn(torch.ones(64, 3)).save(path)
     again = DejaVu.load(path)
     assert (again.map.plan, again.map.places, again.map.dimension) == ((), 64, 3)
     assert again.localize(torch.ones(2, 3)).index.tolist() == [-1, -1]

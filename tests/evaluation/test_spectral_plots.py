@@ -36,7 +36,7 @@ def route(seed: int) -> Tensor:
 
 
 def localized(chunk: int | str = "route", scored: bool = True) -> Localization:
-    model = DejaVu(mapper=SpectralMapper(None, 1.0, chunk)).learn(route(0))  # type: ignore[arg-type]
+    model = DejaVu(whitening="none", mapper=SpectralMapper(None, 1.0, chunk)).learn(route(0))  # type: ignore[arg-type]
     truth = as_ground_truth(offset_truth(PLACES, PLACES)) if scored else None
     match = model.localize(route(1))
     traverses = ArrayTraverse(route(0)), ArrayTraverse(route(1))
