@@ -96,6 +96,8 @@ class DejaVu(nn.Module):
         >>> model = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(window=64, strongest=1))).learn(wave)
         >>> model.localize(wave[20:22]).index
         tensor([20, 21])
+        >>> DejaVu().learn(wave).localize(wave[20:22]).index  # the spectral map
+        tensor([20, 21])
     """
 
     def __init__(
@@ -159,7 +161,13 @@ class DejaVu(nn.Module):
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
         text = "learning" if progress else None
-        return self.learn_features(self.describe_reference(traverse, second, text), traverse)
+        before = None if self.whitening is None else self.whitening.state_dict()
+        try:
+            return self.learn_features(self.describe_reference(traverse, second, text), traverse)
+        except InputError:  # the map that there was is of its own whitening
+            if self.whitening is not None and before is not None:
+                self.whitening.load_state_dict(before)
+            raise
 
     def describe_reference(
         self, traverse: Traverse, second: Views | None = None, progress: str | None = None
@@ -213,7 +221,7 @@ class DejaVu(nn.Module):
             steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
             raise InputError(
                 f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
-                "many, frame i being place i, or a truth that says which places it shows (--second_truth)"
+                "many, frame i being place i, or a second_truth that says which places it shows"
             )
         if isinstance(reference, ResampledTraverse):
             found = ground_truth_in_places(found, partial(place_of, reference.positions))
@@ -236,7 +244,7 @@ class DejaVu(nn.Module):
     def _require_learning_whitening(self, name: str) -> None:
         if self.whitening is None or self.whitening.fixed:
             seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
-            raise InputError(f"{seen} to learn from {name}; expected one, such as --whitening Whitening")
+            raise InputError(f"{seen} to learn from {name}; expected one that is learned")
 
     def resample(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
         """`resampled` by the model's `velocity`; of queries, `step` is the map's, `self.step`."""

@@ -145,6 +145,15 @@ def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_
     assert ((found - torch.arange(FRAMES)).abs() <= 5).float().mean() > 0.9
 
 
+def test_a_failed_relearning_keeps_map_and_whitening(reference: Traverse, second: Traverse) -> None:
+    model = DejaVu(mapper=SpectralMapper(200.0)).learn(reference)
+    frames = next(iter(second.batches(8)))
+    before = model(frames)
+    with refused("route_bytes_per_place is 200"):
+        model.learn(open_source("sim:aerial?frames=40"))  # 10 numbers
+    assert torch.equal(model(frames), before)
+
+
 def test_a_fixed_whitening_is_kept(model: DejaVu, second: Traverse) -> None:
     assert model.whitening is not None
     whitening = Whitening()
