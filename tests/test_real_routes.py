@@ -259,7 +259,10 @@ def test_spectral_maps(column: int, options: tuple[str, ...], data_dir: Path, tm
         if told:  # the corridor is too short for every 10th frame
             entry = report[key] if key else report
             assert told == pytest.approx([entry["auc"], entry["recall_at_1"]], abs=0.03), name
-    for name, key in (("route bytes per place", "route_bytes_per_place"), ("bytes per place", "bytes_per_place")):
+    for name, key in (
+        ("route bytes per place", "route_bytes_per_place"),
+        ("bytes per place", "bytes_per_place"),
+    ):
         assert numbers(table[name][column]) == pytest.approx([report[key]], rel=0.02)
 
 
