@@ -60,6 +60,6 @@ def test_the_paper_recognises_the_second_flight_and_its_null_is_clearly_worse(
 
 def test_with_a_test_against_noise_the_shuffled_flight_has_no_layers(flights: tuple[Tensor, Tensor]) -> None:
     reference, query = flights
-    model = DejaVu().learn(reference)
+    model = DejaVu(mapper=TemplateMapper()).learn(reference)
     assert evaluate(model.localize(query), TRUTH, 5).auc > 0.8
     assert evaluate(null_control(model, reference, query), TRUTH, 5) == (0.0,) * 6

@@ -22,6 +22,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 ROOT = Path(__file__).parents[1]
 TOLD = (ROOT / "docs" / "real_routes.md").read_text()
 KEYS = ("auc", "recall_at_1", "recall_at_100_precision", "auc_reported")
+TEMPLATES = ("--config", "local_maxima")
 
 
 def compare(out: Path, *arguments: str | Path) -> dict[str, Any]:
@@ -92,7 +93,7 @@ def test_the_dashes_of_the_motorway_are_found(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clip = f"{data_dir}/highway/solidWhiteRight.mp4?width=160"
-    main(["learn", clip, "--map", str(tmp_path / "map.safetensors")])
+    main(["learn", clip, "--map", str(tmp_path / "map.safetensors"), *TEMPLATES])
     told, measured = layers(section("A motorway")), layers(capsys.readouterr().out)
     assert max(measured, key=lambda period: measured[period]) == 12
     assert max((p for p in measured if p < 44 and p != 12), key=lambda period: measured[period]) == 6
@@ -143,7 +144,7 @@ def test_even_steps_leave_the_period_of_a_constant_speed(
     clip = f"{data_dir}/highway/solidWhiteRight.mp4?width=320"
     corners = str([list(corner) for corner in ROAD]).replace(" ", "")
     velocity = ["--velocity.corners", corners] if resampled else []
-    main(["learn", clip, "--map", str(tmp_path / "map.safetensors"), *velocity])
+    main(["learn", clip, "--map", str(tmp_path / "map.safetensors"), *TEMPLATES, *velocity])
     told = re.search(r"layer of 12 frames has (\d+) features before and (\d+)", section("The same motorway"))
     assert told is not None
     measured = layers(capsys.readouterr().out)[12]
@@ -192,7 +193,7 @@ def test_the_dash_of_the_road_is_the_strongest_layer_in_the_difference_of_red_an
     flights = [
         f"strip:{data_dir}/aerial_road/pass{flight}.png?halve=1&rows=32:128&width=96" for flight in (1, 2)
     ]
-    report = compare(tmp_path, *flights, "--preprocess.channel", channel)
+    report = compare(tmp_path, *flights, *TEMPLATES, "--preprocess.channel", channel)
     cells = rows(section("A road from above"))[channel]
     for cell, chunk in zip(cells, report["chunks"], strict=False):
         features = dict(zip(chunk["periods"], chunk["features"], strict=True))
@@ -230,8 +231,44 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
     assert report["template_numbers"] == 53 * 192
 
 
+@pytest.mark.parametrize(
+    ("column", "options"),
+    [(0, ()), (1, ("--mapper.route_bytes_per_place", "2.5")), (2, ("--tolerance", "0")), (3, ())],
+    ids=["road", "road, small", "corridor", "railway"],
+)
+def test_spectral_maps(column: int, options: tuple[str, ...], data_dir: Path, tmp_path: Path) -> None:
+    cut = "halve=1&rows=32:128&width=96"
+    flights = [f"strip:{data_dir}/aerial_road/pass{flight}.png?{cut}" for flight in (1, 2)]
+    walks = [data_dir / "corridor" / name for name in ("ref", "query")]
+    seasons = [data_dir / "nordland" / name for name in ("summer", "winter")]
+    if column == 2:
+        options = (*options, "--truth", str(data_dir / "corridor" / "truth.csv"))
+    report = compare(tmp_path, *(flights, flights, walks, seasons)[column], *options)
+    table = rows(section("Spectral maps"))
+    names = {
+        "**this map**": "",
+        "its descriptors of all frames, float": "uncompressed",
+        "its descriptors, int8, of every 10th frame (corridor: of all)": "stride",
+        "interpolated, as many route bytes": "interpolated",
+        "null: shuffled frames, as many bytes": "null",
+        "HOG of all frames": "hog",
+        "HOG of every 10th frame": "hog_stride_coarsest",
+    }
+    for name, key in names.items():
+        told = numbers(table[name][column])
+        if told:  # the corridor is too short for every 10th frame
+            entry = report[key] if key else report
+            assert told == pytest.approx([entry["auc"], entry["recall_at_1"]], abs=0.03), name
+    for name, key in (
+        ("route bytes per place", "route_bytes_per_place"),
+        ("bytes per place", "bytes_per_place"),
+    ):
+        assert numbers(table[name][column]) == pytest.approx([report[key]], rel=0.02)
+
+
 def test_the_railway_in_two_seasons(data_dir: Path, tmp_path: Path) -> None:
-    report = compare(tmp_path, data_dir / "nordland" / "summer", data_dir / "nordland" / "winter")
+    seasons = (data_dir / "nordland" / name for name in ("summer", "winter"))
+    report = compare(tmp_path, *seasons, *TEMPLATES)
     names = {
         "this map": "",
         "all 1800 frames": "uncompressed",
@@ -245,7 +282,7 @@ def test_the_railway_in_two_seasons(data_dir: Path, tmp_path: Path) -> None:
 def test_the_corridor_and_its_truth_file(data_dir: Path, tmp_path: Path) -> None:
     folder = data_dir / "corridor"
     truth = ("--truth", str(folder / "truth.csv"), "--tolerance", "0")
-    report = compare(tmp_path / "compare", folder / "ref", folder / "query", *truth)
+    report = compare(tmp_path / "compare", folder / "ref", folder / "query", *TEMPLATES, *truth)
     names = {
         "this map": "",
         "all 111 frames": "uncompressed",
