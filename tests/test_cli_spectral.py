@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import fails, frames, report_of, run
+from command_line import TEMPLATES, fails, frames, report_of, run
 from footage import QUERY, REFERENCE, SIDE, STEP, footage
 from helpers import refused
 
@@ -93,11 +93,16 @@ def test_options_of_parts() -> None:
     assert stepped.mapper.step == 0.1
 
 
-@pytest.mark.parametrize("option", [["--whitening", "none"], ["--whitening=none"], ["--whitening", "null"]])
+@pytest.mark.parametrize("option", [["--whitening", "none"], ["--whitening=none"]])
 def test_no_whitening(option: list[str]) -> None:
     model = model_of(*option)
     assert model.whitening is None
     assert isinstance(model.mapper, SpectralMapper)
+
+
+def test_null_is_the_whitening_that_suits_the_mapper() -> None:
+    assert model_of("--whitening", "null").whitening is not None
+    assert model_of(*TEMPLATES, "--whitening", "null").whitening is None
 
 
 def test_the_whitening_of_another_map_with_what_is_ahead_of_it(folder: Path) -> None:
@@ -126,7 +131,7 @@ def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> Non
 
 
 def test_the_seed_of_compare_shuffles_the_null(folder: Path) -> None:
-    pair = folder / "a.npy", folder / "b.npy", "--config", "default"
+    pair = folder / "a.npy", folder / "b.npy", *TEMPLATES
     for seed in (0, 1):
         run("compare", *pair, "--seed", str(seed), "--out", folder / f"null{seed}")
     first, second = (report_of(folder / f"null{seed}") for seed in (0, 1))
@@ -172,6 +177,8 @@ def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.Captur
 
 # what is refused
 
+OWNER = "has no such setting", "TemplateMapper has"
+
 
 @pytest.mark.parametrize(
     ("options", "words"),
@@ -185,8 +192,10 @@ def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.Captur
         (["--whitening", "dejavu_torch.HOG"], ("whitening", "dejavu_torch.HOG")),
         (["--whitening", "nowhere.safetensors"], ("nowhere.safetensors is not there",)),
         (["--whitening.colour", "1"], ("whitening", "colour")),
-        (["--mapper.periods.window", "64"], ("mapper", "periods.window")),
-        (["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"], ("route_bytes_per_place",)),
+        (["--mapper.periods.window", "64"], ("--mapper.periods.window: Spectral", *OWNER, "local_maxima")),
+        (["--mapper.reduction=sum"], ("--mapper.reduction: SpectralMapper", *OWNER)),
+        (["--mapper.step=1", *TEMPLATES], ("--mapper.step: TemplateMapper", "SpectralMapper has", "default")),
+        (["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"], ("route_bytes_per_place: Templ",)),
         (["--second_truth", "0"], ("--second_truth 0", "--second")),
         (["--second", "nowhere"], ("nowhere is not there",)),
         (["--second", ROUTE], ("views", "a second traverse")),
@@ -267,7 +276,7 @@ def test_a_whitening_that_does_not_fit(folder: Path, capsys: pytest.CaptureFixtu
     assert "cell=16" in fails(capsys, *learn, "--whitening", known, "--features.cell", "16")
     assert "another map's" in fails(capsys, *learn, "--whitening", known, "--second", folder / "b.npy")
     plain = folder / "plain.safetensors"
-    run("learn", folder / "a.npy", "--map", plain)
+    run("learn", folder / "a.npy", "--map", plain, *TEMPLATES)
     assert "without whitening" in fails(capsys, *learn, "--whitening", plain)
     assert not new.exists()
 
