@@ -76,8 +76,7 @@ class DejaVu(nn.Module):
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
         whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; "none"
-            keeps the features as they are; None is Whitening with its defaults ahead of a SpectralMapper,
-            "none" ahead of templates.
+            keeps the features; None is Whitening ahead of a SpectralMapper, "none" ahead of templates.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
         batch_size: frames in memory at a time.

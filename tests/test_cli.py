@@ -129,7 +129,9 @@ def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
     assert model.mapper.metric == "cosine"
 
 
-@pytest.mark.parametrize("templates", [TEMPLATES, ("--mapper", "TemplateMapper"), ("--mapper=TemplateMapper",)])
+@pytest.mark.parametrize(
+    "templates", [TEMPLATES, ("--mapper", "TemplateMapper"), ("--mapper=TemplateMapper",)]
+)
 def test_parts_of_a_mapper_of_templates_as_options(templates: tuple[str, ...], tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
     run("learn", SMALL, "--map", route, *templates, "--mapper.periods.window", "128")

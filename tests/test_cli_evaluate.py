@@ -265,11 +265,23 @@ def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -
         ("compare a b --threshold high --out x", ["threshold", "high", "float"]),
         ("learn a --map b.safetensors --preprocess.contrast high", ["contrast", "high", "patch", "clahe"]),
         ("learn a --map b.safetensors --preprocess.grid 2,2", ["grid", "2,2", "tuple"]),
-        ("learn a --map b.safetensors --config local_maxima --mapper.reduction avg", ["reduction", "avg", "mean", "sum"]),
-        ("learn a --map b.safetensors --config local_maxima --mapper.metric manhattan", ["manhattan", "l1", "l2", "cosine"]),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.reduction avg",
+            ["reduction", "avg", "mean", "sum"],
+        ),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.metric manhattan",
+            ["manhattan", "l1", "l2", "cosine"],
+        ),
         ("learn a --map b.safetensors --config local_maxima --mapper.periods.windw 3", ["windw"]),
-        ("learn a --map b.safetensors --config local_maxima --mapper.periods.window x", ["window", "x", "int"]),
-        ("learn a --map b.safetensors --config local_maxima --mapper.periods.window 3", ["window=3", "min_period"]),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.periods.window x",
+            ["window", "x", "int"],
+        ),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.periods.window 3",
+            ["window=3", "min_period"],
+        ),
         ("learn a --map b.safetensors --mapper Nowhere", ["mapper", "Nowhere"]),
         ("learn a --map b.safetensors --features nowhere.Net", ["features", "'nowhere'"]),
         ("learn a --map b.safetensors --features 3", ["features", "3", "import path"]),

@@ -195,7 +195,10 @@ OWNER = "has no such setting", "TemplateMapper has"
         (["--mapper.periods.window", "64"], ("--mapper.periods.window: Spectral", *OWNER, "local_maxima")),
         (["--mapper.reduction=sum"], ("--mapper.reduction: SpectralMapper", *OWNER)),
         (["--mapper.step=1", *TEMPLATES], ("--mapper.step: TemplateMapper", "SpectralMapper has", "default")),
-        (["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"], ("route_bytes_per_place: Templ",)),
+        (
+            ["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"],
+            ("route_bytes_per_place: Templ",),
+        ),
         (["--second_truth", "0"], ("--second_truth 0", "--second")),
         (["--second", "nowhere"], ("nowhere is not there",)),
         (["--second", ROUTE], ("views", "a second traverse")),

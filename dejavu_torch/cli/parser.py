@@ -28,8 +28,8 @@ HINT = (
     "Parts have options of their own, such as --features.cell 4, --whitening.numbers 64 or "
     "--mapper.route_bytes_per_place 2.5: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
-    "with options such as --mapper.periods.window 512. --whitening also takes none, or a map file, whose "
-    "features it then takes as well."
+    "with options such as --mapper.periods.window 512. --whitening also takes none, or a map file, with "
+    "the features that it was learned from."
 )
 MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 LONGEST = 300  # characters of a message that is told whole
@@ -132,8 +132,9 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
 def add_model(parser: Parser) -> None:
     """Every argument of DejaVu as an option, and --config."""
     parser.description = f"{parser.description} {HINT}"
-    presets = "preset (default, local_maxima, paper) or YAML file of settings"
-    parser.add_argument("--config", action="config", help=presets)
+    parser.add_argument(
+        "--config", action="config", help="preset (default, local_maxima, paper) or YAML file"
+    )
     parser.add_class_arguments(DejaVu, None)
     parser.set_defaults(DEFAULT_PARTS)
 
