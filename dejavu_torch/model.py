@@ -76,14 +76,13 @@ class DejaVu(nn.Module):
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
         whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; "none"
-            keeps the features as they are. None is what suits the mapper: Whitening with its defaults ahead
-            of a SpectralMapper, "none" ahead of templates.
+            keeps the features; None is Whitening ahead of a SpectralMapper, "none" ahead of templates.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
-        velocity: measures how the ground moves, so that places and queries are even steps along it (section
-            IV-B), see `resample`; None takes the frames as they are.
+        velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
+            None takes the frames as they are.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 

@@ -12,6 +12,8 @@ from PIL import Image
 
 from dejavu_torch.cli import main
 
+TEMPLATES = ("--config", "local_maxima")  # the defaults are a spectral map
+
 
 def run(*arguments: str | Path) -> None:
     main([str(argument) for argument in arguments])

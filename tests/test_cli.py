@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import fails, frames, report_of, run, write_images
+from command_line import TEMPLATES, fails, frames, report_of, run, write_images
 from PIL import Image
 
 from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
@@ -40,8 +40,9 @@ def small_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_learn_prints_plan_summary_and_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("learn", SMALL, "--map", tmp_path / "a.safetensors")
     out = capsys.readouterr().out
-    assert "periods" in out
+    assert "strongest periods" in out
     assert "places covered" in out
+    assert "lines of their spectra" in out
     assert f"{(tmp_path / 'a.safetensors').stat().st_size} bytes" in out
     assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
 
@@ -90,7 +91,7 @@ def test_info_says_what_learn_said(small_map: Path, capsys: pytest.CaptureFixtur
 def test_folder_of_images_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = write_images(tmp_path / "first", frames(128, seed=1))
     second = write_images(tmp_path / "second", frames(128, seed=2))
-    run("compare", first, second, "--out", tmp_path / "report")
+    run("compare", first, second, *TEMPLATES, "--out", tmp_path / "report")
     report = report_of(tmp_path / "report")
     assert report["frames"] == report["queries"] == 128
     assert 16 in report["periods"]
@@ -121,10 +122,22 @@ def test_config_and_options(tmp_path: Path) -> None:
 
 def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
-    run("learn", SMALL, "--map", route, "--mapper.periods.window", "128", "--features.cell", "16")
+    options = "--mapper.route_bytes_per_place", "2.5", "--features.cell", "16", "--whitening.views", "1"
+    run("learn", SMALL, "--map", route, *options)
     model = DejaVu.load(route)
-    assert (model.mapper.periods.window, model.features.cell) == (128, 16)
-    assert model.mapper.periods.peaks == "local"
+    assert (model.mapper.route_bytes_per_place, model.features.cell, model.whitening.views) == (2.5, 16, 1)
+    assert model.mapper.metric == "cosine"
+
+
+@pytest.mark.parametrize(
+    "templates", [TEMPLATES, ("--mapper", "TemplateMapper"), ("--mapper=TemplateMapper",)]
+)
+def test_parts_of_a_mapper_of_templates_as_options(templates: tuple[str, ...], tmp_path: Path) -> None:
+    route = tmp_path / "a.safetensors"
+    run("learn", SMALL, "--map", route, *templates, "--mapper.periods.window", "128")
+    model = DejaVu.load(route)
+    assert (model.mapper.periods.window, model.mapper.periods.peaks) == (128, "local")
+    assert model.whitening is None
 
 
 def test_features_by_class_path(tmp_path: Path) -> None:
@@ -168,10 +181,10 @@ def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixt
     noise = np.random.default_rng(0)
     for name in ("a", "b"):
         np.save(tmp_path / f"{name}.npy", noise.normal(size=(200, 40)).astype(np.float32))
-    run("learn", tmp_path / "a.npy", "--map", tmp_path / "a.safetensors")
+    run("learn", tmp_path / "a.npy", "--map", tmp_path / "a.safetensors", *TEMPLATES)
     assert "this route does not repeat" in capsys.readouterr().out.splitlines()
     assert DejaVu.load(tmp_path / "a.safetensors").map.plan == ()
-    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--out", tmp_path / "report")
+    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", *TEMPLATES, "--out", tmp_path / "report")
     report = report_of(tmp_path / "report")
     assert report["recall_at_1"] == report["auc"] == 0
     assert report["accepted"] == 0
@@ -346,7 +359,7 @@ def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.Capt
 
 @pytest.mark.parametrize(
     "option",
-    [["--mapper.metric", "cosine"], ["--batch_size", "9"], ["--velocity"], ["--config", "c.yaml"]],
+    [["--mapper.metric", "l2"], ["--batch_size", "9"], ["--velocity"], ["--config", "c.yaml"]],
 )
 def test_compare_with_a_map_takes_no_settings(
     trained_map: Path, option: list[str], capsys: pytest.CaptureFixture[str]
@@ -393,6 +406,7 @@ def test_a_map_that_cannot_be_judged(trained_map: Path, capsys: pytest.CaptureFi
     assert "short.npy gives 95 places, the map holds 96" in error
     assert "not there" in told("a.npy", "--map", folder / "nowhere.safetensors")
     assert "trained templates" in told("a.npy", "--map", trained_map, "--leave_out", "2")
+    assert "expected a TemplateMapper" in told("a.npy", "--leave_out", "2", "--whitening.views", "1")
     pair = folder / "a.npy", folder / "b.npy"
     assert "Flatten" in fails(capsys, "compare", *pair, "--map", trained_map, "--out", folder / "r")
 
@@ -415,7 +429,7 @@ def test_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 @pytest.mark.parametrize("count", [1, 7])
 def test_too_few_frames(count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_images(tmp_path / "short", frames(count))
-    error = fails(capsys, "learn", folder, "--map", tmp_path / "a.safetensors")
+    error = fails(capsys, "learn", folder, "--map", tmp_path / "a.safetensors", *TEMPLATES)
     assert f"{count} place" in error
     assert "at least 8" in error
 
@@ -456,7 +470,7 @@ def test_nan_features(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_constant_features_do_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.save(tmp_path / "flat.npy", np.full((100, 8), 0.3, dtype=np.float32))
-    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "a.safetensors")
+    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "a.safetensors", *TEMPLATES)
     assert "this route does not repeat" in capsys.readouterr().out
 
 

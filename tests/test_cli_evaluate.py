@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import fails, frames, report_of, run
+from command_line import TEMPLATES, fails, frames, report_of, run
 from PIL import Image
 
 from dejavu_torch import DejaVu
@@ -265,11 +265,23 @@ def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -
         ("compare a b --threshold high --out x", ["threshold", "high", "float"]),
         ("learn a --map b.safetensors --preprocess.contrast high", ["contrast", "high", "patch", "clahe"]),
         ("learn a --map b.safetensors --preprocess.grid 2,2", ["grid", "2,2", "tuple"]),
-        ("learn a --map b.safetensors --mapper.reduction avg", ["reduction", "avg", "mean", "sum"]),
-        ("learn a --map b.safetensors --mapper.metric manhattan", ["manhattan", "l1", "l2", "cosine"]),
-        ("learn a --map b.safetensors --mapper.periods.windw 3", ["windw"]),
-        ("learn a --map b.safetensors --mapper.periods.window x", ["window", "x", "int"]),
-        ("learn a --map b.safetensors --mapper.periods.window 3", ["window=3", "min_period"]),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.reduction avg",
+            ["reduction", "avg", "mean", "sum"],
+        ),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.metric manhattan",
+            ["manhattan", "l1", "l2", "cosine"],
+        ),
+        ("learn a --map b.safetensors --config local_maxima --mapper.periods.windw 3", ["windw"]),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.periods.window x",
+            ["window", "x", "int"],
+        ),
+        (
+            "learn a --map b.safetensors --config local_maxima --mapper.periods.window 3",
+            ["window=3", "min_period"],
+        ),
         ("learn a --map b.safetensors --mapper Nowhere", ["mapper", "Nowhere"]),
         ("learn a --map b.safetensors --features nowhere.Net", ["features", "'nowhere'"]),
         ("learn a --map b.safetensors --features 3", ["features", "3", "import path"]),
@@ -293,7 +305,7 @@ def test_mistakes_are_one_plain_line(
 
 def test_a_map_without_layers_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.save(tmp_path / "flat.npy", np.full((40, 16, 16), 99, np.uint8))
-    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "map.safetensors")
+    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "map.safetensors", *TEMPLATES)
     run("localize", tmp_path / "map.safetensors", tmp_path / "flat.npy", "--out", tmp_path / "m.csv")
     assert "the map holds no layers: no place can be reported" in capsys.readouterr().out
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import fails, report_of
+from command_line import TEMPLATES, fails, report_of
 from footage import QUERY, REFERENCE, SIDE, STEP, camera, everything, footage
 from helpers import template_model
 
@@ -18,7 +18,8 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.experiments.compare import compare
 
 CORNERS = ["--velocity.corners", "[[0,0],[1,0],[1,1],[0,1]]", "--velocity.size", f"[{SIDE},{SIDE}]"]
-OPTIONS = [*CORNERS, "--velocity.step", str(STEP), "--mapper.periods.false_alarm", "null"]
+STEPS = [*CORNERS, "--velocity.step", str(STEP)]
+OPTIONS = [*STEPS, *TEMPLATES, "--mapper.periods.false_alarm", "null"]
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +156,6 @@ def test_a_bare_velocity_is_understood(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_part_of_a_part_can_be_null(folder: Path, tmp_path: Path) -> None:
-    command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors"]
+    command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors", *TEMPLATES]
     main([*command, "--mapper.periods.hop", "50", "--mapper.periods.hop", "null"])
     assert DejaVu.load(tmp_path / "m.safetensors").mapper.periods.hop is None

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import fails, frames, report_of, run
+from command_line import TEMPLATES, fails, frames, report_of, run
 from footage import QUERY, REFERENCE, SIDE, STEP, footage
 from helpers import refused
 
@@ -21,14 +21,13 @@ from dejavu_torch.database.mapfile import read_map
 ROUTE = "sim:aerial?frames=96"
 SECOND = "sim:aerial?frames=96&traverse=1"
 THIRD = "sim:aerial?frames=96&traverse=2"
-SPECTRAL = ("--config", "spectral")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A spectral map of the route, and frames and features in files."""
     folder = tmp_path_factory.mktemp("spectral")
-    run("learn", ROUTE, "--map", folder / "m.safetensors", *SPECTRAL)
+    run("learn", ROUTE, "--map", folder / "m.safetensors")
     noise = np.random.default_rng(0)
     np.save(folder / "a.npy", frames(64, seed=1))
     np.save(folder / "b.npy", frames(64, seed=2))
@@ -53,7 +52,7 @@ def same_maps(first: Path, second: Path) -> bool:
 
 def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "told.safetensors"
-    run("learn", ROUTE, "--map", path, *SPECTRAL, "--whitening.views", "2")
+    run("learn", ROUTE, "--map", path, "--whitening.views", "2")
     learned = capsys.readouterr().out
     run("info", path)
     info = capsys.readouterr().out
@@ -73,9 +72,9 @@ def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.Cap
 
 def test_a_seed_makes_the_copies_and_nothing_else_is_drawn(folder: Path) -> None:
     paths = [folder / f"seed{i}.safetensors" for i in range(3)]
-    run("learn", ROUTE, "--map", paths[0], *SPECTRAL, "--seed", "3")
-    run("learn", ROUTE, "--map", paths[1], *SPECTRAL, "--seed", "3")
-    run("learn", ROUTE, "--map", paths[2], *SPECTRAL, "--seed", "4", "--whitening.seed", "3")
+    run("learn", ROUTE, "--map", paths[0], "--seed", "3")
+    run("learn", ROUTE, "--map", paths[1], "--seed", "3")
+    run("learn", ROUTE, "--map", paths[2], "--seed", "4", "--whitening.seed", "3")
     assert same_maps(paths[0], paths[1])
     assert same_maps(paths[0], paths[2])
     assert not same_maps(paths[0], folder / "m.safetensors")
@@ -83,43 +82,48 @@ def test_a_seed_makes_the_copies_and_nothing_else_is_drawn(folder: Path) -> None
 
 def test_options_of_parts() -> None:
     options = ["--whitening.views", "2", "--mapper.route_bytes_per_place", "2.5", "--mapper.chunk", "100"]
-    model = model_of(*SPECTRAL, *options)
+    model = model_of(*options)
     assert isinstance(model.mapper, SpectralMapper)
     assert model.whitening is not None
     assert (model.whitening.views, model.mapper.route_bytes_per_place, model.mapper.chunk) == (2, 2.5, 100)
     plain = model_of("--whitening", "dejavu_torch.Whitening", "--whitening.numbers", "64")
     assert plain.whitening is not None
     assert plain.whitening.numbers == 64
-    stepped = model_of(*SPECTRAL, "--mapper.route_bytes_per_place", "null", "--mapper.step", "0.1")
+    stepped = model_of("--mapper.route_bytes_per_place", "null", "--mapper.step", "0.1")
     assert stepped.mapper.step == 0.1
 
 
-@pytest.mark.parametrize("option", [["--whitening", "none"], ["--whitening=none"], ["--whitening", "null"]])
+@pytest.mark.parametrize("option", [["--whitening", "none"], ["--whitening=none"]])
 def test_no_whitening(option: list[str]) -> None:
-    model = model_of(*SPECTRAL, *option)
+    model = model_of(*option)
     assert model.whitening is None
     assert isinstance(model.mapper, SpectralMapper)
+
+
+def test_null_is_the_whitening_that_suits_the_mapper() -> None:
+    assert model_of("--whitening", "null").whitening is not None
+    assert model_of(*TEMPLATES, "--whitening", "null").whitening is None
 
 
 def test_the_whitening_of_another_map_with_what_is_ahead_of_it(folder: Path) -> None:
     path, own = folder / "coarse.safetensors", folder / "own.safetensors"
     options = "--features.cell", "16", "--preprocess.contrast", "patch", "--whitening.numbers", "9"
-    run("learn", ROUTE, "--map", path, *SPECTRAL, *options)
-    run("learn", THIRD, "--map", own, *SPECTRAL, "--whitening", path, "--seed", "5")
+    run("learn", ROUTE, "--map", path, *options)
+    run("learn", THIRD, "--map", own, "--whitening", path, "--seed", "5")
     known, model = DejaVu.load(path), DejaVu.load(own)
     assert known.whitening is not None
     assert model.whitening is not None
     assert torch.equal(model.whitening.projection, known.whitening.projection)
     assert repr(model.whitening) == repr(known.whitening)
     assert (model.features.cell, model.preprocess.contrast) == (16, "patch")
-    run("compare", ROUTE, SECOND, *SPECTRAL, "--whitening", path, "--out", folder / "fixed")
+    run("compare", ROUTE, SECOND, "--whitening", path, "--out", folder / "fixed")
     assert report_of(folder / "fixed")["recall_at_1"] > 0.8
 
 
 def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> None:
     out = folder / "third"
-    run("compare", ROUTE, SECOND, *SPECTRAL, "--second", THIRD, "--seed", "1", "--out", out)
-    run("learn", ROUTE, "--map", folder / "third.safetensors", *SPECTRAL, "--second", THIRD, "--seed", "1")
+    run("compare", ROUTE, SECOND, "--second", THIRD, "--seed", "1", "--out", out)
+    run("learn", ROUTE, "--map", folder / "third.safetensors", "--second", THIRD, "--seed", "1")
     assert same_maps(out / "map.safetensors", folder / "third.safetensors")
     assert not same_maps(out / "map.safetensors", folder / "m.safetensors")
     assert report_of(out)["recall_at_1"] > 0.9
@@ -127,7 +131,7 @@ def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> Non
 
 
 def test_the_seed_of_compare_shuffles_the_null(folder: Path) -> None:
-    pair = folder / "a.npy", folder / "b.npy", "--config", "default"
+    pair = folder / "a.npy", folder / "b.npy", *TEMPLATES
     for seed in (0, 1):
         run("compare", *pair, "--seed", str(seed), "--out", folder / f"null{seed}")
     first, second = (report_of(folder / f"null{seed}") for seed in (0, 1))
@@ -140,7 +144,7 @@ def test_a_second_traverse_of_another_length_by_its_truth(folder: Path) -> None:
     for name, truth in (("offset", "8"), ("csv", folder / "some.csv")):
         path = folder / f"{name}.safetensors"
         second = "--second", folder / "c.npy", "--second_truth", truth
-        run("learn", folder / "a.npy", "--map", path, *SPECTRAL, *second)
+        run("learn", folder / "a.npy", "--map", path, *second)
         assert DejaVu.load(path).map.places == 64
 
 
@@ -151,7 +155,7 @@ def test_a_second_traverse_is_resampled_as_the_reference_is(tmp_path: Path) -> N
     rows = "".join(f"{q},{p}\n" for q, p in enumerate(nearest))
     (tmp_path / "truth.csv").write_text("query,place\n" + rows)
     corners = ["--velocity.corners", "[[0,0],[1,0],[1,1],[0,1]]", "--velocity.size", f"[{SIDE},{SIDE}]"]
-    options = [*SPECTRAL, *corners, "--velocity.step", str(STEP), "--second", tmp_path / "second.npy"]
+    options = [*corners, "--velocity.step", str(STEP), "--second", tmp_path / "second.npy"]
     path = tmp_path / "m.safetensors"
     truth = "--second_truth", tmp_path / "truth.csv"
     run("learn", tmp_path / "reference.npy", "--map", path, *options, *truth)
@@ -159,7 +163,7 @@ def test_a_second_traverse_is_resampled_as_the_reference_is(tmp_path: Path) -> N
 
 
 def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source, options = folder / "noise.npy", ("--config", "spectral", "--whitening", "none")
+    source, options = folder / "noise.npy", ("--whitening", "none")
     budget = "--mapper.route_bytes_per_place", "1"
     run("learn", source, "--map", folder / "noise.safetensors", *options, *budget)
     (line,) = [told for told in capsys.readouterr().out.splitlines() if "needs about" in told]
@@ -172,6 +176,8 @@ def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.Captur
 
 
 # what is refused
+
+OWNER = "has no such setting", "TemplateMapper has"
 
 
 @pytest.mark.parametrize(
@@ -186,8 +192,13 @@ def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.Captur
         (["--whitening", "dejavu_torch.HOG"], ("whitening", "dejavu_torch.HOG")),
         (["--whitening", "nowhere.safetensors"], ("nowhere.safetensors is not there",)),
         (["--whitening.colour", "1"], ("whitening", "colour")),
-        (["--mapper.periods.window", "64"], ("mapper", "periods.window")),
-        (["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"], ("route_bytes_per_place",)),
+        (["--mapper.periods.window", "64"], ("--mapper.periods.window: Spectral", *OWNER, "local_maxima")),
+        (["--mapper.reduction=sum"], ("--mapper.reduction: SpectralMapper", *OWNER)),
+        (["--mapper.step=1", *TEMPLATES], ("--mapper.step: TemplateMapper", "SpectralMapper has", "default")),
+        (
+            ["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"],
+            ("route_bytes_per_place: Templ",),
+        ),
         (["--second_truth", "0"], ("--second_truth 0", "--second")),
         (["--second", "nowhere"], ("nowhere is not there",)),
         (["--second", ROUTE], ("views", "a second traverse")),
@@ -201,7 +212,7 @@ def test_settings_that_do_not_fit(
 ) -> None:
     path = tmp_path / "m.safetensors"
     source = "sim:aerial?frames=96"
-    error = fails(capsys, "learn", source, "--map", path, *SPECTRAL, *options)
+    error = fails(capsys, "learn", source, "--map", path, *options)
     assert [word for word in words if word not in error] == [], error
     assert not path.exists()
 
@@ -210,7 +221,7 @@ def test_views_that_do_not_vary(tmp_path: Path, capsys: pytest.CaptureFixture[st
     pairs = {"colour": [0, 0], "exposure": [0, 0], "shift": [0, 0]}
     numbers = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion", "noise"), 0)
     strengths = f"--whitening.strengths={json.dumps(pairs | numbers)}"
-    error = fails(capsys, "learn", ROUTE, "--map", tmp_path / "m.safetensors", *SPECTRAL, strengths)
+    error = fails(capsys, "learn", ROUTE, "--map", tmp_path / "m.safetensors", strengths)
     assert "views differ from those of their places by 0 " in error
 
 
@@ -235,7 +246,7 @@ def test_what_is_no_route(
 ) -> None:
     np.save(tmp_path / "a.npy", values)
     path = tmp_path / "m.safetensors"
-    error = fails(capsys, "learn", tmp_path / "a.npy", "--map", path, *SPECTRAL, "--whitening", whitening)
+    error = fails(capsys, "learn", tmp_path / "a.npy", "--map", path, "--whitening", whitening)
     assert [word for word in words if word not in error] == [], error
 
 
@@ -244,14 +255,14 @@ def test_a_second_traverse_that_does_not_fit(
 ) -> None:
     monkeypatch.chdir(folder)
     np.save("other.npy", frames(64, size=48))
-    learn = "learn", "a.npy", "--map", "new.safetensors", *SPECTRAL
+    learn = "learn", "a.npy", "--map", "new.safetensors"
     error = fails(capsys, *learn, "--second", "c.npy")
     assert "c.npy has 50 frames and a.npy 64" in error
     assert "--second_truth" in error
     assert "no query has a right answer" in fails(capsys, *learn, "--second", "c.npy", "--second_truth", "70")
     assert "900 features; expected 324" in fails(capsys, *learn, "--second", "other.npy")
     for same in ("b.npy", folder / "b.npy"):
-        error = fails(capsys, "compare", "a.npy", "b.npy", *SPECTRAL, "--second", same, "--out", "r")
+        error = fails(capsys, "compare", "a.npy", "b.npy", "--second", same, "--out", "r")
         assert f"--second {same} is the query itself" in error
     assert not Path("r").exists()
     assert not Path("new.safetensors").exists()
@@ -259,7 +270,7 @@ def test_a_second_traverse_that_does_not_fit(
 
 def test_a_whitening_that_does_not_fit(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known, new = folder / "m.safetensors", folder / "new.safetensors"
-    learn = "learn", folder / "a.npy", "--map", new, *SPECTRAL
+    learn = "learn", folder / "a.npy", "--map", new
     error = fails(capsys, *learn, "--whitening", known)
     assert "(64, 324)" in error
     assert "(B, 1764)" in error
@@ -268,7 +279,7 @@ def test_a_whitening_that_does_not_fit(folder: Path, capsys: pytest.CaptureFixtu
     assert "cell=16" in fails(capsys, *learn, "--whitening", known, "--features.cell", "16")
     assert "another map's" in fails(capsys, *learn, "--whitening", known, "--second", folder / "b.npy")
     plain = folder / "plain.safetensors"
-    run("learn", folder / "a.npy", "--map", plain)
+    run("learn", folder / "a.npy", "--map", plain, *TEMPLATES)
     assert "without whitening" in fails(capsys, *learn, "--whitening", plain)
     assert not new.exists()
 

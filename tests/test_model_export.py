@@ -12,7 +12,16 @@ import torch
 from helpers import Fixed
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, DejaVu, Embedding, ImposedPeriods, Preprocess, TemplateMapper
+from dejavu_torch import (
+    HOG,
+    DejaVu,
+    Embedding,
+    ImposedPeriods,
+    Preprocess,
+    SpectralMapper,
+    TemplateMapper,
+    Whitening,
+)
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.types import FrequencyLayer, Plan
 
@@ -40,6 +49,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
+def spectral(backbone: str = "HOG", **settings: Any) -> DejaVu:
+    """The default, a spectral map of whitened descriptors, of a route of 60 colour frames."""
+    model = DejaVu(BACKBONES[backbone](), Whitening(views=1), SpectralMapper(16.0, **settings))
+    return model.learn(torch.rand(60, 3, 32, 24)).eval()
+
+
 def learned(backbone: str) -> DejaVu:
     """A model of a route of 60 colour frames."""
     periods = ImposedPeriods([3, 4, 5], bin=4)
@@ -62,6 +77,37 @@ def exported(model: DejaVu, queries: Tensor) -> torch.export.ExportedProgram:
 def test_the_exported_model_scores_frames_as_the_model_does(backbone: str) -> None:
     model = learned(backbone)
     run = exported(model, torch.rand(2, 3, 32, 24)).module()
+    for batch in BATCHES:
+        queries = torch.rand(batch, 3, 32, 24)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("backbone", ["HOG", "Embedding"])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"chunk": 25}, {"transform": "dct", "metric": "l2"}],
+    ids=["default", "chunks", "dct, l2"],
+)
+def test_the_exported_model_of_a_spectral_map_scores_frames_as_the_model_does(
+    backbone: str, settings: dict[str, Any]
+) -> None:
+    model = spectral(backbone, **settings)
+    program, buffer = exported(model, torch.rand(2, 3, 32, 24)), io.BytesIO()
+    torch.export.save(program, buffer)
+    buffer.seek(0)
+    runs = program.module(), torch.export.load(buffer).module()
+    for batch in BATCHES:
+        queries = torch.rand(batch, 3, 32, 24)
+        for run in runs:
+            torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backbone", ["HOG", "Embedding"])
+def test_the_compiled_model_of_a_spectral_map_scores_frames_as_the_model_does(backbone: str) -> None:
+    model = spectral(backbone)
+    torch.compiler.reset()
+    run = torch.compile(model, fullgraph=True, backend="eager")
     for batch in BATCHES:
         queries = torch.rand(batch, 3, 32, 24)
         torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)

@@ -12,7 +12,15 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from dejavu_torch import DejaVu, ImposedPeriods, SpectrogramAnalysis, TemplateMapper, open_source
+from dejavu_torch import (
+    DejaVu,
+    ImposedPeriods,
+    SpectralMapper,
+    SpectrogramAnalysis,
+    TemplateMapper,
+    Whitening,
+    open_source,
+)
 from dejavu_torch.periods.finder import PeriodFinder
 
 # operations whose result, or the size of it, the host has to read
@@ -100,6 +108,33 @@ def test_forward_makes_none(frames: Tensor, monkeypatch: pytest.MonkeyPatch) -> 
                 scores = model(queries)
             assert found == [], model.map
             assert scores.shape == (5, 96)
+
+
+@pytest.fixture(scope="module")
+def spectral(frames: Tensor) -> list[DejaVu]:
+    """The default, and maps of several chunks, whatever the transform and the metric."""
+    models = [DejaVu(whitening=Whitening(views=1)).learn(frames).eval()]
+    features = models[0].whitened(models[0].describe(frames))
+    for settings in ({"chunk": 32}, {"transform": "dct", "metric": "l2", "chunk": 40}):
+        mapper = SpectralMapper(8.0, **settings)  # type: ignore[arg-type]
+        models.append(DejaVu(whitening="none", mapper=mapper).learn_features(features.detach()).eval())
+    return models
+
+
+@pytest.mark.parametrize("count", [5, 96])
+def test_forward_of_spectral_maps_makes_none(
+    count: int, spectral: list[DejaVu], frames: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    features = spectral[0].describe(frames[:count])
+    descriptors = spectral[0].whitened(features)
+    both = zip(spectral, (frames[:count], descriptors, descriptors), strict=True)
+    for model, queries in [*both, (spectral[0], features)]:
+        with host_synchronisations(monkeypatch) as found:
+            scores = model(queries)
+        assert found == [], model.map
+        assert scores.shape == (count, 96)
+        with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+            assert model(mode.from_tensor(queries)).shape == (count, 96)
 
 
 def test_backward_makes_none(frames: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:

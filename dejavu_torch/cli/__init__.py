@@ -90,11 +90,17 @@ def overview(word: str) -> NoReturn:
 
 
 def _spelt_out(words: Sequence[str]) -> list[str]:
-    """The command line with a bare --velocity given the one value it can have."""
-    return [
+    """The command line with a bare --velocity given the one value it can have, and the options of a template
+    mapper's periods the class that they are of, where nothing else says it."""
+    spelt = [
         "--velocity=GroundOdometry" if word == "--velocity" and after.startswith("--") else word
         for word, after in pairwise([*words, "--"])
     ]
+    named = any(word.partition("=")[0] in ("--config", "--mapper.periods") for word in words)
+    first = next((i for i, word in enumerate(spelt) if word.startswith("--mapper.periods.")), None)
+    if first is not None and not named and any(word.endswith("TemplateMapper") for word in words):
+        spelt.insert(first, "--mapper.periods=SpectrogramAnalysis")
+    return spelt
 
 
 def _config_first(words: Sequence[str]) -> list[str]:

@@ -155,11 +155,11 @@ def run_compare(
             coordinates in image names
         tolerance: right within this many places, inclusive
         interpolate: fill in a csv that lists some queries only
-        leave_out: diagnostic, the reference on itself with this many frames to each side left out
+        leave_out: diagnostic of templates, the reference on itself, this many frames to each side left out
         seed: of the null control's shuffle and of the whitening
         second: a third traverse, as of `dejavu learn`
         second_truth: which places it shows, as --truth
-        map: evaluate this map of the reference, with its own settings, instead of learning one
+        map: evaluate this map of the reference as it is, and learn none
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
 import docstring_parser
 import jsonargparse
 
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
@@ -22,11 +25,13 @@ DEFAULT_PARTS = {
     "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
 }
 HINT = (
-    "Parts have options of their own, such as --features.cell 4, --whitening.numbers 64, "
-    "--mapper.periods.window 512, --preprocess.contrast patch or --velocity.step 5: see --features.help HOG, "
-    "--whitening.help, --mapper.help TemplateMapper, --preprocess.help and --velocity.help. --whitening "
-    "also takes none, or a map file, whose features it then takes as well."
+    "Parts have options of their own, such as --features.cell 4, --whitening.numbers 64 or "
+    "--mapper.route_bytes_per_place 2.5: see --features.help HOG, --whitening.help, --mapper.help "
+    "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
+    "with options such as --mapper.periods.window 512. --whitening also takes none, or a map file, with "
+    "the features that it was learned from."
 )
+MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 LONGEST = 300  # characters of a message that is told whole
 
 
@@ -127,7 +132,9 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
 def add_model(parser: Parser) -> None:
     """Every argument of DejaVu as an option, and --config."""
     parser.description = f"{parser.description} {HINT}"
-    parser.add_argument("--config", action="config", help="preset (default, paper) or YAML file of settings")
+    parser.add_argument(
+        "--config", action="config", help="preset (default, local_maxima, paper) or YAML file"
+    )
     parser.add_class_arguments(DejaVu, None)
     parser.set_defaults(DEFAULT_PARTS)
 
@@ -141,7 +148,11 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     """
     parser = command_parser(name, function)
     words, whitening = _without_whitening_map(words) if MODEL in function.__annotations__ else (words, None)
-    parsed = parser.parse_args(list(words))
+    try:
+        parsed = parser.parse_args(list(words))
+    except UsageError as error:
+        told = _of_another_mapper(parser, words) if MODEL in function.__annotations__ else None
+        raise (UsageError(told) if told else error) from error
     try:
         arguments: dict[str, Any] = parser.instantiate(parsed).as_dict()
     except Exception as error:
@@ -163,6 +174,30 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         if whitening:
             _take_whitening(model, whitening, told)
     return arguments
+
+
+def _of_another_mapper(parser: Parser, words: Sequence[str]) -> str | None:
+    """The first option of a mapper that the chosen mapper does not have and another has, if there is one."""
+    rest, settings = [], []
+    for before, word in pairwise(["", *words]):
+        if word.startswith("--mapper."):
+            settings.append(word.partition("=")[0])
+        elif word.startswith("--") or not before.startswith("--mapper.") or "=" in before:
+            rest.append(word)  # and not the value of such an option
+    try:
+        chosen = parser.parse_args(rest).mapper.class_path.rpartition(".")[2]
+    except UsageError:
+        return None
+    known = {mapper.__name__: inspect.signature(mapper).parameters for mapper in MAPPERS}
+    for setting in settings if chosen in known else []:
+        name = setting.split(".")[1]
+        having = [mapper for mapper in MAPPERS if name in known[mapper.__name__]]
+        if having and name not in known[chosen]:
+            return (
+                f"{setting}: {chosen} has no such setting; {having[0].__name__} has, as with "
+                f"--config {MAPPERS[having[0]]}"
+            )
+    return None
 
 
 def _without_whitening_map(words: Sequence[str]) -> tuple[list[str], Path | None]:
