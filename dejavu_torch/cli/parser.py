@@ -151,8 +151,8 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     try:
         parsed = parser.parse_args(list(words))
     except UsageError as error:
-        told = _of_another_mapper(parser, words) if MODEL in function.__annotations__ else None
-        raise (UsageError(told) if told else error) from error
+        strange = _of_another_mapper(parser, words) if MODEL in function.__annotations__ else None
+        raise (UsageError(strange) if strange else error) from error
     try:
         arguments: dict[str, Any] = parser.instantiate(parsed).as_dict()
     except Exception as error:
