@@ -584,9 +584,10 @@ def test_a_command_that_fails_leaves_no_folder(
 
 
 def test_a_map_that_is_given_is_not_learned(
-    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    run("compare", SMALL, QUERY, "--out", tmp_path / "learned")
+    small_map = tmp_path / "learned" / "map.safetensors"
+    run("compare", SMALL, QUERY, *TEMPLATES, "--out", tmp_path / "learned")
     assert "Learning took" in capsys.readouterr().out
     assert len([line for line in caplog.messages if "window shrunk" in line]) == 1
     caplog.clear()

@@ -207,7 +207,7 @@ def test_a_curve_that_starts_late_is_marked(
     pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Stored frames find themselves at distance 0, all of them: one threshold, and no area."""
-    run("compare", pair[0], pair[0], "--tolerance", "0", "--out", tmp_path / "itself")
+    run("compare", pair[0], pair[0], *TEMPLATES, "--tolerance", "0", "--out", tmp_path / "itself")
     out = capsys.readouterr().out
     report = report_of(tmp_path / "itself")
     assert report["uncompressed"]["recall_at_1"] == report["uncompressed"]["curve_starts_at_recall"] == 1

@@ -65,10 +65,11 @@ def bin_shares(
     if bins == "linear":
         # atan2 has no gradient at 0, nor where the square underflows: such a pixel has no vote to share
         columns = columns.masked_fill(rows.square() + columns.square() < torch.finfo(rows.dtype).tiny, 1)
-    with torch.set_grad_enabled(bins == "linear" and torch.is_grad_enabled()):
-        # in degrees 45, 90 and 135 are exact, also in float32: they lie on bin edges
-        degrees = torch.rad2deg(torch.atan2(rows, columns)).remainder(180)
-        position = degrees / (180 / orientations)
+    else:  # detached, not under no_grad: a program with that in it is exported, but cannot be saved
+        rows, columns = rows.detach(), columns.detach()
+    # in degrees 45, 90 and 135 are exact, also in float32: they lie on bin edges
+    degrees = torch.rad2deg(torch.atan2(rows, columns)).remainder(180)
+    position = degrees / (180 / orientations)
     if bins == "hard":
         lower = position.long()
         # rounding may reach the end of the circle; NaN may be anything, and stays NaN in the magnitude
