@@ -258,7 +258,7 @@ def test_a_second_traverse_that_does_not_fit(
     learn = "learn", "a.npy", "--map", "new.safetensors"
     error = fails(capsys, *learn, "--second", "c.npy")
     assert "c.npy has 50 frames and a.npy 64" in error
-    assert "--second_truth" in error
+    assert "second_truth" in error
     assert "no query has a right answer" in fails(capsys, *learn, "--second", "c.npy", "--second_truth", "70")
     assert "900 features; expected 324" in fails(capsys, *learn, "--second", "other.npy")
     for same in ("b.npy", folder / "b.npy"):

@@ -28,7 +28,7 @@ def route(seed: int) -> Tensor:
 
 @pytest.fixture(scope="module")
 def result() -> Comparison:
-    model = DejaVu(mapper=SpectralMapper(2.0))
+    model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     return compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model, tolerance=2)
 
 
@@ -75,7 +75,7 @@ def test_what_has_no_curve_is_refused(result: Comparison) -> None:
 
 
 def test_without_truth_there_is_no_curve() -> None:
-    model = DejaVu(mapper=SpectralMapper(2.0))
+    model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model)
     assert "storage" not in unscored.report.as_json()
     assert {"spectrum", "components"} <= unscored.pictures.keys()
