@@ -243,7 +243,8 @@ class Whitening(nn.Module):
 
     def extra_repr(self) -> str:
         names = ("numbers", "components", "shrinkage", "views", "most_views", "strengths", "seed", "bits")
-        return ", ".join(f"{name}={getattr(self, name)}" for name in names)
+        shown = [name for name in names if name != "strengths" or self.strengths != STRENGTHS]
+        return ", ".join(f"{name}={getattr(self, name)}" for name in shown)
 
 
 def _check_buffers(projection: Tensor, scale: Tensor, offset: Tensor, length: Tensor) -> None:
