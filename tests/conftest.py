@@ -24,6 +24,7 @@ SLOW = (
     *("training", "experiments", "motion", "test_cli", "test_readme", "test_real_routes"),
     *(
         "test_periods_on_real_data",
+        "test_spectral_model",
         "test_model_export",
         "data/test_simulate_railway",
         "evaluation/test_pictures",
