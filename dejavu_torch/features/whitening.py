@@ -193,7 +193,9 @@ class Whitening(nn.Module):
             views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
         """
         kept = self._kept(len(places), views is not None)
-        mean, basis, variances = principal_components(places, self.components if views else kept, self.seed)
+        mean, basis, variances = principal_components(
+            places, kept if views is None else self.components, self.seed
+        )
         rank = int((variances > ROUNDING * variances[0]).sum())
         if kept > rank:
             if self.numbers is not None:
@@ -212,6 +214,8 @@ class Whitening(nn.Module):
                     f"the views have {view.shape[1]} features; expected {len(mean)}, as the route has"
                 )
             pairs.append(((view - mean) @ basis, place))
+        if not pairs:
+            raise InputError("there are no views to whiten with; expected some, or None for none")
         shown = torch.cat([place for _, place in pairs])
         own = torch.cat([(places[part].to(mean) - mean) @ basis for part in shown.split(ROWS)])
         centre, projection = learned_whitening(

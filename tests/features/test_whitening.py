@@ -196,6 +196,8 @@ def test_a_route_that_cannot_be_whitened() -> None:
         Whitening().learn(torch.ones(600, 4))
     with refused("(1, 40)", "N at least 2"):
         Whitening().learn(places[:1])
+    with refused("no views", "None for none"):
+        Whitening().learn(places, [])
     with refused("views", "augmentation"):
         Whitening().learn(places, [(places, torch.arange(600))])
     whitening = Whitening()
