@@ -16,7 +16,7 @@ from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
 from dejavu_torch.cli.parser import Parser, refusal
-from dejavu_torch.data.files import check_output_folder, make_output_folder
+from dejavu_torch.data.files import check_output_folder, make_output_folder, remove_empty_folders
 from dejavu_torch.database.summary import describe
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport, load_weights
@@ -167,8 +167,14 @@ class TrainCLI(LightningCLI):
 
     def fit(self, **arguments: Any) -> None:
         """Train, and print what was written, also where the user interrupts."""
+        root = Path(self.trainer.default_root_dir)
+        new = not root.exists()
         try:
             self.trainer.fit(**arguments)
+        except InputError:
+            if new:
+                remove_empty_folders(root)
+            raise
         finally:
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, MapExport):

@@ -81,6 +81,13 @@ def make_output_folder(path: Path) -> None:
         raise InputError(f"{path} cannot be made a folder: {error.strerror}; expected a new path") from error
 
 
+def remove_empty_folders(path: Path) -> None:
+    """Remove a folder that holds nothing but folders; files, and the folders they lie in, stay."""
+    for folder, _, _ in os.walk(path, topdown=False):
+        if not os.listdir(folder):
+            os.rmdir(folder)
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` that takes its place only when the block ends well.

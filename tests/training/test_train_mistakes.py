@@ -85,11 +85,19 @@ ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
     ids=str,
 )
 def test_a_mistake_is_one_line(
-    folder: Path, capfd: pytest.CaptureFixture[str], command: str, options: list[str], words: list[str]
+    folder: Path,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    command: str,
+    options: list[str],
+    words: list[str],
 ) -> None:
+    written = tmp_path / "run"
     if command == "fit":
-        options = ["--trainer.default_root_dir", "bad", *options]
+        options = ["--trainer.default_root_dir", str(written), *options]
     fails(capfd, [command, "--config", "train.yaml", *options], words)
+    # a training that fails on the way leaves what it wrote, but no empty folders
+    assert not written.exists() or any(path.is_file() for path in written.rglob("*"))
 
 
 @pytest.mark.parametrize(
