@@ -14,9 +14,10 @@ from torch import nn
 
 from dejavu_torch.data.files import check_output_file, check_output_folder, make_output_folder
 from dejavu_torch.data.source import open_source
+from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import DejaVu
+from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.types import InputError, Match, Traverse
@@ -37,15 +38,26 @@ def run_demo(
         second: another traverse of the route, from which whitening learns what a visit changes
     """
     from dejavu_torch.experiments.compare import compare
+    from dejavu_torch.experiments.reproduce import paper_model
 
     check_output_folder(out)
     _set_seed(model, seed)
-    reference = open_source(f"sim:aerial?seed={seed}")
-    query = open_source(f"sim:aerial?seed={seed}&traverse=1")
+    learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
+    reference, query = open_source(learned), open_source(localized)
     print(f"learning {reference.name}, then finding {query.name} on it")
     reference, views = _with_second(model, reference, second, None, query)
-    result = compare(reference, query, model=model, seed=seed, second=views, progress=True)
+    paper = paper_model()
+    named = [recipe_of(one.mapper, REGISTRY) for one in (model, paper)]
+    others = {"paper": ("the paper to the letter", paper)} if named[0] != named[1] else {}
+    result = compare(reference, query, model=model, seed=seed, second=views, others=others, progress=True)
     _publish(result, out, "dejavu demo: the built-in route", command)
+    tries = (
+        ["localize", str(out / "map.safetensors"), localized, "--out", "matches.csv"],
+        ["compare", learned, localized, "--config", "local_maxima", "--out", "templates"],
+        ["compare", "MORNING", "EVENING", "--out", "report"],
+    )
+    for words in tries:
+        print(f"or try: {shlex.join(['dejavu', *words])}")
 
 
 def run_learn(

@@ -20,6 +20,7 @@ COLOURS = {
     "interpolated": "#5d0b81",
     "hog": "#10b248",
     "hog_stride_coarsest": "#8fdccb",
+    "paper": "#e377c2",
     "null": "#adadad",
     "null_same_plan": "#785567",
     "leave_out": "#8c6d1f",

@@ -71,6 +71,7 @@ def compare(
     seed: int = 0,
     interpolate: bool = False,
     second: Views | None = None,
+    others: Mapping[str, tuple[str, DejaVu]] | None = None,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -87,6 +88,8 @@ def compare(
         seed: of the shuffle of the null control.
         interpolate: see `find_ground_truth`.
         second: see `DejaVu.describe_reference`; another traverse than the query.
+        others: further models that learn the same reference, by their keys in report.json, with their names
+            in tables; none of them resamples.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -131,6 +134,8 @@ def compare(
         known = ground_truth_in_places(known, model.map.place_of)
     run = Localization(model, reference, query, places, queries, match, known, tolerance)
     contenders = _contenders(run, seed, leave_out, progress)
+    for key, (name, other) in (others or {}).items():
+        contenders[key] = _learned_beside(run, name, other)
     storage = None
     if isinstance(model.map, SpectralMap) and contenders["map"].scores is not None:
         storage = storage_curve(run, seed=seed, progress=progress)
@@ -231,6 +236,13 @@ def _contenders(run: Localization, seed: int, leave_out: int | None, progress: b
             truth = ground_truth_in_places(as_ground_truth(own), model.map.place_of)
         contenders[key] = contend(name, match, truth, tolerance, bytes, k, fixed)
     return contenders
+
+
+def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
+    """Another model that learns the run's reference."""
+    match, summary = other.learn(run.reference).localize(run.query), other.summary()
+    match = of_shown_frames(match, run.model.map)
+    return contend(name, match, run.truth, run.tolerance, bytes=summary.map_bytes, fixed=summary.fixed_bytes)
 
 
 def _is_plain_hog(model: DejaVu) -> bool:

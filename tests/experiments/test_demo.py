@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from dejavu_torch.cli import main
 
 README = Path(__file__).parents[2] / "README.md"
 PICTURES = ("pairs", "coverage", "scores", "pr", "auc", "storage", "spectrum", "components")
-OTHERS = ("uncompressed", "stride", "interpolated", "null", "hog", "hog_stride_coarsest")
+OTHERS = ("uncompressed", "stride", "interpolated", "null", "hog", "hog_stride_coarsest", "paper")
 OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}
 SCORES = {
     "auc",
@@ -30,7 +32,8 @@ SCORES = {
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("demo")
-    main(["demo", "--out", str(out)])
+    with (out / "printed.txt").open("w") as printed, redirect_stdout(printed):
+        main(["demo", "--out", str(out)])
     return out
 
 
@@ -79,6 +82,15 @@ def test_order_saves_bytes_and_most_of_all_where_they_are_few(report: dict[str, 
     told = README.read_text().split("At 1.1 route bytes per place the map")[1].split(":")[0]
     figures = [float(figure) for figure in re.findall(r"\d\.\d+", told)]
     assert figures == pytest.approx([one[0]["auc"] for one in (map, null, interpolated)], abs=0.02)
+
+
+def test_it_ends_with_commands_to_try(demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = (demo / "printed.txt").read_text().splitlines()[-3:]
+    commands = [shlex.split(line.partition("or try: dejavu ")[2]) for line in lines]
+    assert [words[0] for words in commands] == ["localize", "compare", "compare"]
+    main(commands[0])
+    assert (tmp_path / "matches.csv").read_text() == (demo / "matches.csv").read_text()
 
 
 def test_map_bytes_is_the_size_of_the_file(demo: Path, report: dict[str, Any]) -> None:
@@ -142,11 +154,10 @@ def test_readme_tells_what_the_demo_measures(report: dict[str, Any]) -> None:
             assert figures[3:] == pytest.approx(measured, rel=0.02)
 
 
-@pytest.mark.parametrize("config", ["paper", "local_maxima"])
-def test_the_maps_of_templates_are_what_readme_tells(config: str, tmp_path: Path) -> None:
-    main(["demo", "--config", config, "--out", str(tmp_path)])
+def test_maps_of_templates_are_what_readme_tells(tmp_path: Path) -> None:
+    main(["demo", "--config", "local_maxima", "--out", str(tmp_path)])
     report = json.loads((tmp_path / "report.json").read_text())
-    (figures,) = (figures for name, figures in told().items() if f"--config {config}" in name)
+    (figures,) = (figures for name, figures in told().items() if "--config local_maxima" in name)
     assert_told(figures, report)
     measured = [report["bytes_per_place"], report["route_bytes_per_place"]]
     assert figures[3:] == pytest.approx(measured, rel=0.02)
