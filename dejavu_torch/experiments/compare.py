@@ -32,7 +32,7 @@ from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.evaluate import evaluation_facts
-from dejavu_torch.experiments.storage import storage_curve
+from dejavu_torch.experiments.storage import noise_over_map, storage_curve
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
@@ -136,14 +136,16 @@ def compare(
     contenders = _contenders(run, seed, leave_out, progress)
     for key, (name, other) in (others or {}).items():
         contenders[key] = _learned_beside(run, name, other)
-    storage = None
+    storage, noise = None, {}
     if isinstance(model.map, SpectralMap) and contenders["map"].scores is not None:
         storage = storage_curve(run, seed=seed, progress=progress)
+        noise = {"noise_over_map": noise_over_map(model.map, places, seed)}
     pictures = draw_pictures(run, contenders, storage)
     carried = all(source_of(one).place is not None for one in (reference, query))
     facts = {
         **_map_facts(model.summary(), places),
         **_run_facts(run, seconds),
+        **noise,
         **evaluation_facts(
             of_shown_frames(match, model.map),
             known,

@@ -10,6 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.database.spectrum import from_spectrum, spectrum
 from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_frames
 from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
@@ -61,6 +62,27 @@ def storage_curve(
             scores = evaluate(match, run.truth, run.tolerance)
             found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1))
     return found
+
+
+def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float:
+    """Bytes of noise that is as smooth as the route, coded in the map's steps, over those of the map.
+
+    The noise is Gaussian with the spectrum of each number of the descriptor, its energy averaged over half
+    octaves: nothing in it repeats. What a map takes less than this it owes to repetition, all else to
+    smoothness.
+
+    Args:
+        route: the map. features: (N,K) the descriptors that it holds. seed: of the noise.
+    """
+    lines = spectrum((features.float() - route.mean.float()).T, route.transform)
+    band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).log2()).long()
+    sums = lines.new_zeros(len(lines), int(band[-1]) + 1).index_add(1, band, lines.square())
+    energy = (sums / band.bincount().clamp(min=1))[:, band]
+    normal = torch.randn(lines.shape, generator=torch.Generator().manual_seed(seed))
+    noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.mean.float()
+    mapper = SpectralMapper(None, float(route.steps.mean()), route.chunk, route.transform, route.metric)
+    streams = [one.packed()["streams"].nbytes for one in (mapper(noise), route)]
+    return streams[0] / streams[1]
 
 
 def _coded(

@@ -13,7 +13,7 @@ from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.storage import storage_curve
+from dejavu_torch.experiments.storage import noise_over_map, storage_curve
 
 PLACES, NUMBERS = 400, 16
 
@@ -58,6 +58,16 @@ def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, rep
     assert ours.route_bytes_per_place == report["route_bytes_per_place"]
     assert null.auc == pytest.approx(report["null"]["auc"], abs=0.05)  # coded to 2.0, not to the map's own
     assert between.route_bytes_per_place * PLACES == report["interpolated"]["route_bytes"]
+
+
+def test_noise_as_smooth_as_the_route_costs_what_repetition_saves(report: dict[str, Any]) -> None:
+    assert report["noise_over_map"] > 1  # half of the numbers are waves, and noise has no lines
+    order = torch.Generator().manual_seed(3)
+    noise = torch.randn(PLACES, NUMBERS, generator=order).cumsum(0)
+    waves = (torch.arange(PLACES)[:, None] * (0.2 + torch.arange(NUMBERS) / 9)).sin()
+    kept = [noise_over_map(SpectralMapper(3.0)(series), series) for series in (noise, waves)]
+    assert kept[0] == pytest.approx(1, abs=0.1)
+    assert kept[1] > 2
 
 
 def test_budgets_that_cannot_be_met_are_left_out(result: Comparison) -> None:
