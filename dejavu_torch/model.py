@@ -191,8 +191,14 @@ class DejaVu(nn.Module):
         device = self.map.positions.device
         features = concatenate(self._features(traverse, progress))
         if second is None and len(traverse.frame_shape) == 3:
-            copies = whitening.views, whitening.most_views, whitening.strengths, whitening.seed
-            second = AugmentedTraverse(traverse, len(features), *copies).views
+            second = AugmentedTraverse(
+                traverse,
+                len(features),
+                whitening.copies(*features.shape),
+                whitening.most_views,
+                whitening.strengths,
+                whitening.seed,
+            ).views
         if second is None:
             whitening.learn(features)
         else:
