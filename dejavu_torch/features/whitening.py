@@ -192,7 +192,7 @@ class Whitening(nn.Module):
             places: (N,D), the descriptors of the route; they may lie in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
         """
-        kept = self._kept(len(places), views is not None)
+        kept = self._kept(len(places), places.shape[1], views is not None)
         mean, basis, variances = principal_components(
             places, kept if views is None else self.components, self.seed
         )
@@ -223,10 +223,10 @@ class Whitening(nn.Module):
         )
         self._store(mean + basis @ centre, basis @ projection, None)
 
-    def _kept(self, places: int, views: bool) -> int:
+    def _kept(self, places: int, features: int, views: bool) -> int:
         if self.numbers is not None:
             return self.numbers
-        return min(NUMBERS, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS
+        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS
 
     def _store(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
         """Take over a projection in whole numbers, and its mean."""
