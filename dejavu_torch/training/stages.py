@@ -80,12 +80,19 @@ class DescriptorStage(Stage):
                 f"nothing of {type(task.dejavu.features).__name__} can be trained; expected a network with "
                 "parameters that are not frozen, or `dejavu learn`, which trains nothing"
             )
+        reference = task.data.sets["reference"]
+        every = int(self.every) if len(self.proxies) else max(1, task.data.tolerance)
+        count = -(-len(reference) // every)
         if not len(self.proxies):
-            self.every.fill_(max(1, task.data.tolerance))
-            count = -(-len(task.data.sets["reference"]) // int(self.every))
+            self.every.fill_(every)
             with torch.no_grad(), in_mode(task.dejavu.features, False):
-                one = described(task, task.data.sets["reference"].values[:1], descriptor_of(task))
+                one = described(task, reference.values[:1], descriptor_of(task))
             self.proxies = nn.Parameter(torch.randn(count, one.shape[1], device=task.device))
+        elif len(self.proxies) != count:
+            raise InputError(
+                f"the descriptor was learned on {len(self.proxies)} stretches of {every} frames, "
+                f"{task.data.reference.name} has {count}; expected the route that it was learned on"
+            )
 
     def end(self, task: PlaceRecognitionTask) -> None:
         self.proxies = nn.Parameter(self.proxies.detach()[:0])  # no later checkpoint needs them

@@ -138,6 +138,10 @@ def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogC
     whitening.learn(places, [(views, torch.arange(600))])
     assert len(whitening.scale) == 12
     assert "rank 12" in caplog.text
+    caplog.clear()
+    whitening.learn(places[:, :8], [(views[:, :8], torch.arange(600))])
+    assert len(whitening.scale) == 8  # all there are
+    assert not caplog.text
     with refused("numbers is 20", "rank 12"):
         Whitening(numbers=20).learn(places, [(views, torch.arange(600))])
 
