@@ -191,8 +191,14 @@ class DejaVu(nn.Module):
         device = self.map.positions.device
         features = concatenate(self._features(traverse, progress))
         if second is None and len(traverse.frame_shape) == 3:
-            copies = whitening.views, whitening.most_views, whitening.strengths, whitening.seed
-            second = AugmentedTraverse(traverse, len(features), *copies).views
+            second = AugmentedTraverse(
+                traverse,
+                len(features),
+                whitening.copies(*features.shape),
+                whitening.most_views,
+                whitening.strengths,
+                whitening.seed,
+            ).views
         if second is None:
             whitening.learn(features)
         else:
@@ -265,22 +271,24 @@ class DejaVu(nn.Module):
             )
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast are left as they are")
+        step: float | None = None
+        source, frames, positions = traverse, len(features), self.map.positions.new_zeros(0)
+        if isinstance(traverse, ResampledTraverse):
+            step, source, frames = traverse.step, traverse.traverse, len(traverse.positions)
+            positions = traverse.positions.to(positions.device)
+        names = [] if source is None else names_of(source, frames)
+        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names), len(features))
         with torch.no_grad():
-            route: PlaceMap = self.mapper(features).to(
-                self.map.positions.device
-            )  # spilled ones are on the CPU
+            route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
         if route.places != len(features) or route.dimension != features.shape[1]:
             raise InputError(
                 f"{type(self.mapper).__name__} made a map of {route.places} places of {route.dimension} "
                 f"features from features {tuple(features.shape)}; expected as many"
             )
-        self.step, source, frames = None, traverse, len(features)
-        if isinstance(traverse, ResampledTraverse):
-            self.step, source, frames = traverse.step, traverse.traverse, len(traverse.positions)
-            route.positions = traverse.positions.to(self.map.positions.device)
+        if len(positions):
+            route.positions = positions
             route.check()
-        self.map = route
-        self.frame_names = [] if source is None else names_of(source, frames)
+        self.map, self.step, self.frame_names = route, step, names
         self.frame_shape, self.trained = shape or None, None
         return self
 
@@ -449,7 +457,7 @@ class DejaVu(nn.Module):
             name: sum(tensor.nbytes for tensor in self._weights(part).values())
             for name, part in (("backbone", "features"), ("whitening", "whitening"))
         }
-        summary = self.map.summary().with_parts(route={"names": len(header["names"] or "")})
+        summary = self.map.summary().with_parts(route={"names": _bytes_of(self.frame_names)})
         rest = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
         return summary.with_parts(fixed=fixed | {"header": rest})
 
@@ -482,6 +490,11 @@ def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tenso
         shown = places[done : done + len(batch)]
         yield batch[shown >= 0], shown[shown >= 0]
         done += len(batch)
+
+
+def _bytes_of(names: list[str]) -> int:
+    """What the names of frames take in a map file."""
+    return len(encode_names(names)) if names else 0
 
 
 def _count(traverse: Traverse) -> int:

@@ -31,7 +31,8 @@ def second() -> Traverse:
 
 
 def spectral(**settings: object) -> DejaVu:
-    return DejaVu(whitening=Whitening(**settings), mapper=SpectralMapper())  # type: ignore[arg-type]
+    few: dict[str, object] = {"views": 4}  # sooner than those of a short route
+    return DejaVu(whitening=Whitening(**(few | settings)), mapper=SpectralMapper())  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +147,7 @@ def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_
 
 
 def test_a_failed_relearning_keeps_map_and_whitening(reference: Traverse, second: Traverse) -> None:
-    model = DejaVu(mapper=SpectralMapper(200.0)).learn(reference)
+    model = DejaVu(whitening=Whitening(views=4), mapper=SpectralMapper(200.0)).learn(reference)
     frames = next(iter(second.batches(8)))
     before = model(frames)
     with refused("route_bytes_per_place is 200"):
@@ -172,7 +173,7 @@ def test_two_features_beside_a_larger_drift_are_localized() -> None:
 
 
 def test_a_whitening_goes_with_templates_as_well(reference: Traverse, second: Traverse) -> None:
-    model = DejaVu(whitening=Whitening(), mapper=TemplateMapper()).learn(reference)
+    model = DejaVu(whitening=Whitening(views=4), mapper=TemplateMapper()).learn(reference)
     assert model.map.dimension == 75  # a quarter of the frames
     assert model.localize(second).index.shape == (FRAMES,)
 

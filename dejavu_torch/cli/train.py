@@ -79,6 +79,12 @@ class MapTrainer(Trainer):
         load_weights(model, ckpt_path)
         model.require_map()
         model.dejavu.velocity = datamodule.velocity
+        if model.made:  # of the frames of the reference
+            self.strategy.connect(model)
+            model.trainer, self.datamodule, datamodule.trainer = self, datamodule, self
+            datamodule.setup("fit")
+            model.setup("fit")
+            model.relearn()
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
         export.write(model, folder)

@@ -196,3 +196,10 @@ class Mapper(nn.Module, ABC):
     @abstractmethod
     def empty(self) -> PlaceMap:
         """A map without places, which can load any map of this mapper."""
+
+    def beside(self, taken: int, places: int) -> Mapper:
+        """The mapper that leaves room for what a file holds of the places beside the map, in bytes.
+
+        A mapper without a budget is itself.
+        """
+        return self

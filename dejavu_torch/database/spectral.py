@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import logging
 import math
 from collections.abc import Callable
 from fractions import Fraction
@@ -16,6 +18,8 @@ from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.spectrum import Transform, from_spectrum, period_of, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
+
+log = logging.getLogger("dejavu_torch")
 
 SpectralMetric = Literal["cosine", "l2"]
 ROUNDING = 0.35  # what is added ahead of rounding down: a dead zone of 1.3 steps around 0
@@ -291,7 +295,7 @@ class SpectralMap(PlaceMap):
 
     def mapper_of_equal_size(self) -> SpectralMapper:
         """Makes maps of other routes with these settings, that take as many bytes a place."""
-        size = self.summary().route_bytes / self.places
+        size = (self.summary().route_bytes - self.positions.nbytes) / self.places
         return SpectralMapper(size, None, self.chunk, self.transform, self.metric)
 
     def _periods(self, energy: Tensor) -> tuple[Fraction, ...]:
@@ -316,7 +320,8 @@ class SpectralMapper(Mapper):
 
     Args:
         route_bytes_per_place: what the map may take for each place, without what does not grow with the
-            route; the step is chosen so that its coded lines fit.
+            route; the step is chosen so that its coded lines fit. Names and positions of frames count, but
+            come on top where they alone take over half of it.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -360,6 +365,7 @@ class SpectralMapper(Mapper):
         check_settings(metric, transform, chunk)
         self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
         self.transform, self.metric = transform, metric
+        self.taken = 0  # bytes of the budget, see `beside`
         self.exact = True  # otherwise the entropy alone tells the step: within a fifth or so, and sooner
 
     @torch.no_grad()
@@ -372,7 +378,7 @@ class SpectralMapper(Mapper):
         scale = float(lines.square().mean().sqrt())
         if not scale > 1e-6 * float(features.square().mean().sqrt()):
             raise InputError(f"the {len(features)} descriptors are all alike; expected a route that changes")
-        overhead = mean.nbytes + CHUNK_BYTES * len(lengths)
+        overhead = self.taken + mean.nbytes + CHUNK_BYTES * len(lengths)
         step = self._step(lines, lengths, overhead) if self.step is None else self.step
         small, escapes = to_int8(quantise(lines, step))
         steps = features.new_full((len(lengths),), step)
@@ -398,6 +404,23 @@ class SpectralMapper(Mapper):
     def empty(self) -> SpectralMap:
         return SpectralMap(metric=self.metric, transform=self.transform, chunk=self.chunk)
 
+    def beside(self, taken: int, places: int) -> SpectralMapper:
+        """See `Mapper`; what takes over half of the budget comes on top of it, and a line says so."""
+        budget = self.route_bytes_per_place
+        if budget is None or not taken:
+            return self
+        if taken > budget * places / 2:
+            log.warning(
+                "names and positions of frames take %.3g bytes per place, over half of "
+                "route_bytes_per_place=%g: they come on top of it",
+                taken / places,
+                budget,
+            )
+            return self
+        other = copy.copy(self)
+        other.taken = taken
+        return other
+
     def _step(self, lines: Tensor, lengths: list[int], overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %."""
         assert self.route_bytes_per_place is not None
@@ -406,7 +429,7 @@ class SpectralMapper(Mapper):
         if room <= 0 or self.route_bytes_per_place > 4 * numbers:
             raise InputError(
                 f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
-                f"{overhead / places:.3g}, which the mean and the table of chunks take, and at most "
+                f"{overhead / places:.3g}, which names, the mean and the table of chunks take, and at most "
                 f"{4 * numbers}, {numbers} numbers as floats"
             )
         finest, coarsest = _steps(lines)

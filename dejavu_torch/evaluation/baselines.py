@@ -112,7 +112,7 @@ def baselines_of(
     foreign = isinstance(getattr(model.mapper, "periods", None), ForeignPeriods)
     if foreign:
         log.warning("no null control learned anew: what found the map's periods is not of this package")
-    if model.trained is None and not foreign:
+    if (model.trained is None or isinstance(model.map, SpectralMap)) and not foreign:
         anew = null_control(model, reference, query, seed, progress=text)
         name = f"null: everything learned from shuffled {one}s"
         if isinstance(model.map, SpectralMap):

@@ -103,7 +103,7 @@ class Embedding(nn.Module):
     Args:
         network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K) or vectors (B,K), such as
             `kornia.feature.HardNet()`, which takes 1 channel of 32 x 32.
-        dimension: D, number of features.
+        dimension: D, number of features; None gives the pooled output itself.
         channels: that the network takes, 3 or 1; grey frames are repeated, colours become luminance.
         resize: (height, width) in pixels that frames are brought to, antialiased.
         grid: cells along each side that maps are averaged over.
@@ -129,7 +129,7 @@ class Embedding(nn.Module):
     def __init__(
         self,
         network: nn.Module,
-        dimension: int = 96,
+        dimension: int | None = 96,
         channels: int = 3,
         resize: tuple[int, int] = (96, 96),
         grid: int = 1,
@@ -139,13 +139,15 @@ class Embedding(nn.Module):
         kept: int = 128,
     ) -> None:
         super().__init__()
-        at_least_0 = min(cell, hidden) >= 0
-        if len(resize) != 2 or min(dimension, grid, *resize) < 1 or channels not in (1, 3) or not at_least_0:
+        sizes = [grid, *resize, *([] if dimension is None else [dimension])]
+        if len(resize) != 2 or min(sizes) < 1 or channels not in (1, 3) or min(cell, hidden) < 0:
             raise InputError(
                 f"Embedding got dimension={dimension}, channels={channels}, resize={tuple(resize)}, "
                 f"grid={grid}, cell={cell}, hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 "
                 "or more, the others at least 1"
             )
+        if dimension is None and hidden:
+            raise InputError(f"Embedding got hidden={hidden}, but no dimension; expected both, or neither")
         self.network = network
         self.dimension = dimension
         self.channels = channels
@@ -165,10 +167,12 @@ class Embedding(nn.Module):
                 f"{' '.join(str(error).split())}"
             ) from error
         inputs = self._pooled(output).shape[1]
-        self.linear = (
-            Coder(inputs, dimension, hidden, noise, kept) if hidden else nn.Linear(inputs, dimension)
-        )
-        self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
+        self.linear: nn.Module = nn.Identity()
+        self.standardise: nn.Module = nn.Identity()
+        if dimension is not None:
+            coded = Coder(inputs, dimension, hidden, noise, kept) if hidden else nn.Linear(inputs, dimension)
+            self.linear = coded
+            self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
     def _pooled(self, output: object) -> Tensor:
         """The network's output, one row per frame."""
@@ -187,6 +191,10 @@ class Embedding(nn.Module):
     def coder(self) -> Coder | None:
         """The whitening and the code, where there is a hidden layer."""
         return self.linear if isinstance(self.linear, Coder) else None
+
+    def without_code(self) -> Embedding:
+        """An Embedding of the same network that gives the descriptor itself."""
+        return Embedding(self.network, None, self.channels, self.resize, self.grid, self.cell)
 
     def describe(self, frames: Tensor) -> Tensor:
         """Descriptors, the pooled output of the network: (B,C,H,W) -> (B,K)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -18,6 +19,9 @@ SAMPLED = 4096  # rows that principal components are found in
 NUMBERS = 128  # of a descriptor, unless said otherwise
 PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
 COMPONENTS = 400  # that whitening works on
+VIEWS = 4  # of a frame, on a long route
+VIEWS_PER_COMPONENT = 30  # on any: what 4 views of each of 3000 frames are
+SHRINKAGE = 0.03  # at least
 SPARE = 32  # further directions of the randomised subspace, which make it near the true one
 ROUNDS = 3  # of its iteration
 STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
@@ -36,7 +40,7 @@ ROUNDING = 1e-7  # of the largest variance: what lies below it is none
 
 
 def learned_whitening(
-    views: Tensor, places: Tensor, kept: int, shrinkage: float = 0.5
+    views: Tensor, places: Tensor, kept: int, shrinkage: float | None = 0.5
 ) -> tuple[Tensor, Tensor]:
     """The projection to what tells places apart and changes little between two views of one place.
 
@@ -48,7 +52,7 @@ def learned_whitening(
     Args:
         views, places: descriptors of one place each, K numbers.
         kept: K', at most K.
-        shrinkage: a, above 0 and at most 1.
+        shrinkage: a, above 0 and at most 1; None is `oracle_shrinkage`, and at least 0.03.
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,K'), float32.
 
@@ -81,12 +85,36 @@ def learned_whitening(
             "in the mean square; expected a finite number, and more than rounding: an augmentation, or a "
             "second traverse"
         )
+    if shrinkage is None:
+        shrinkage = max(SHRINKAGE, oracle_shrinkage(within, len(views)))
     within = (1 - shrinkage) * within
     within.diagonal().add_(shrinkage * scale)
     # P = L^-T E, where W = L L^T and E holds the eigenvectors of L^-1 B L^-T
     unit = torch.linalg.inv(torch.linalg.cholesky(within))
     vectors = torch.linalg.eigh(unit @ (second - torch.outer(mean, mean)) @ unit.T).eigenvectors.flip(1)
     return mean.float(), (unit.T @ vectors[:, :kept]).float()
+
+
+def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
+    """How much of a sample covariance to replace by a multiple of the identity that has its trace.
+
+    Args:
+        covariance: of Gaussian samples, about their known mean. samples: their number n.
+
+    Shape: (K,K) -> a number from 0 to 1, the larger the fewer samples and the more alike the variances.
+
+    Source: oracle approximating shrinkage: Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal
+        Processing 58 (2010), eq. 23.
+
+    Example:
+        >>> oracle_shrinkage(torch.diag(torch.tensor([3.0, 1.0])), 10)
+        0.8
+    """
+    size, trace = len(covariance), float(covariance.trace())
+    square = float(covariance.square().sum())
+    spread = (samples + 1 - 2 / size) * (square - trace**2 / size)
+    wanted = (1 - 2 / size) * square + trace**2
+    return min(1.0, wanted / spread) if spread > 0 else 1.0
 
 
 class Whitening(nn.Module):
@@ -99,8 +127,9 @@ class Whitening(nn.Module):
     Args:
         numbers: K. None is 128, fewer on a short route (a quarter of its places), and at most the rank.
         components: principal components that are whitened, at least K.
-        shrinkage: of `learned_whitening`.
-        views: augmented copies of each frame; frames are drawn evenly where there are more than `most_views`.
+        shrinkage: of `learned_whitening`. None is 0.03, and more where there are few views.
+        views: augmented copies of each frame. None is 4, and more on a short route: 30 for each component.
+            Frames are drawn evenly where there would be more than `most_views`.
         most_views: copies in all.
         strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
         seed: of the copies.
@@ -134,20 +163,21 @@ class Whitening(nn.Module):
         self,
         numbers: int | None = None,
         components: int = COMPONENTS,
-        shrinkage: float = 0.03,
-        views: int = 4,
+        shrinkage: float | None = None,
+        views: int | None = None,
         most_views: int = 20000,
         strengths: Mapping[str, Any] | None = None,
         seed: int = 0,
         bits: int = 8,
     ) -> None:
         super().__init__()
-        if (numbers is not None and numbers < 1) or components < (numbers or 1) or min(views, most_views) < 1:
+        least = min(1 if count is None else count for count in (numbers, views, most_views))
+        if least < 1 or components < (numbers or 1):
             raise InputError(
                 f"Whitening got numbers={numbers}, components={components}, views={views}, "
                 f"most_views={most_views}; expected at least 1 each, and no more numbers than components"
             )
-        if not 0 < shrinkage <= 1 or bits not in (8, 16):
+        if not (shrinkage is None or 0 < shrinkage <= 1) or bits not in (8, 16):
             raise InputError(
                 f"Whitening got shrinkage={shrinkage}, bits={bits}; expected a shrinkage above 0 and at most "
                 "1, 8 or 16 bits"
@@ -184,6 +214,13 @@ class Whitening(nn.Module):
                 return torch.cat([whitened, self.length.to(whitened).expand(len(whitened), 1)], 1)
             return nn.functional.normalize(whitened, dim=1)
 
+    def copies(self, frames: int, features: int) -> int:
+        """Augmented copies of each of so many frames, with so many features."""
+        if self.views is not None:
+            return self.views
+        components = min(frames, features, self.components)
+        return max(VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames))
+
     @torch.no_grad()
     def learn(self, places: Tensor, views: Iterable[tuple[Tensor, Tensor]] | None = None) -> None:
         """Find the projection for one route.
@@ -192,7 +229,7 @@ class Whitening(nn.Module):
             places: (N,D), the descriptors of the route; they may lie in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
         """
-        kept = self._kept(len(places), views is not None)
+        kept = self._kept(len(places), places.shape[1], views is not None)
         mean, basis, variances = principal_components(
             places, kept if views is None else self.components, self.seed
         )
@@ -223,10 +260,10 @@ class Whitening(nn.Module):
         )
         self._store(mean + basis @ centre, basis @ projection, None)
 
-    def _kept(self, places: int, views: bool) -> int:
+    def _kept(self, places: int, features: int, views: bool) -> int:
         if self.numbers is not None:
             return self.numbers
-        return min(NUMBERS, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS
+        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS
 
     def _store(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
         """Take over a projection in whole numbers, and its mean."""

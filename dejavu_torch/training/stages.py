@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
@@ -60,35 +60,49 @@ class Stage(nn.Module):
 
 
 class DescriptorStage(Stage):
-    """The network of an `Embedding` learns to tell stretches of the route apart.
+    """The descriptor learns to tell stretches of the route apart.
 
-    Place cross-entropy over the cosine distances of its descriptor to one proxy for each stretch, as long as
-    the tolerance.
+    Place cross-entropy over the cosine distances of the descriptor to one proxy for each stretch, as long as
+    the tolerance. Where it is the last stage, the map is made of the descriptor in closed form.
     """
 
     every: Tensor
 
-    def __init__(self, share: float, inputs: int) -> None:
+    def __init__(self, share: float = 0.0) -> None:
         super().__init__(share)
-        self.proxies = nn.Parameter(torch.zeros(0, inputs))
+        self.proxies = nn.Parameter(torch.zeros(0, 0))
         self.log_temperature = nn.Parameter(torch.tensor(math.log(TEMPERATURE)))
         self.register_buffer("every", torch.tensor(1))  # places of a stretch
 
     def begin(self, task: PlaceRecognitionTask) -> None:
+        if not _trainable(network_of(task.dejavu.features)):
+            raise InputError(
+                f"nothing of {type(task.dejavu.features).__name__} can be trained; expected a network with "
+                "parameters that are not frozen, or `dejavu learn`, which trains nothing"
+            )
+        reference = task.data.sets["reference"]
+        every = int(self.every) if len(self.proxies) else max(1, task.data.tolerance)
+        count = -(-len(reference) // every)
         if not len(self.proxies):
-            self.every.fill_(max(1, task.data.tolerance))
-            count = -(-len(task.data.sets["reference"]) // int(self.every))
-            self.proxies = nn.Parameter(torch.randn(count, self.proxies.shape[1], device=task.device))
+            self.every.fill_(every)
+            with torch.no_grad(), in_mode(task.dejavu.features, False):
+                one = described(task, reference.values[:1], descriptor_of(task))
+            self.proxies = nn.Parameter(torch.randn(count, one.shape[1], device=task.device))
+        elif len(self.proxies) != count:
+            raise InputError(
+                f"the descriptor was learned on {len(self.proxies)} stretches of {every} frames, "
+                f"{task.data.reference.name} has {count}; expected the route that it was learned on"
+            )
 
     def end(self, task: PlaceRecognitionTask) -> None:
         self.proxies = nn.Parameter(self.proxies.detach()[:0])  # no later checkpoint needs them
 
     def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
-        return [*_trainable(embedding_of(task).network), *self.parameters()]
+        return [*_trainable(network_of(task.dejavu.features)), *self.parameters()]
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         frames, places = task.data.augmented(batch.frames, task.data.clip), len(task.data.sets["reference"])
-        descriptors = to_length(embedding_of(task).describe(task.dejavu.preprocess(frames)).float())
+        descriptors = to_length(descriptor_of(task)(frames).float())
         noisy = descriptors + NOISE * torch.randn_like(descriptors)
         distances = phase_distances(noisy, self.proxies, "cosine")
         stretch = torch.arange(places, device=distances.device) // self.every
@@ -110,7 +124,7 @@ class WhiteningStage(Stage):
         embedding = embedding_of(task)
         task.views = describe_views(task)
         with in_mode(embedding, False):
-            places = stored_features(task, lambda f: embedding.describe(task.dejavu.preprocess(f)))
+            places = stored_features(task, descriptor_of(task))
         _coder(embedding).whiten(task.views.descriptors, places[task.views.positives[:, 0]])
 
 
@@ -149,21 +163,25 @@ class CodeStage(Stage):
         return task.losses(distances, task.scores(distances), positives, task.route, temperature, tolerance)
 
 
-def stages_of(backbone: nn.Module, descriptor: float) -> list[Stage]:
+def stages_of(backbone: nn.Module, descriptor: float, made: bool = False) -> list[Stage]:
     """The stages that a backbone needs.
 
-    An `Embedding` with a hidden layer learns its descriptor, which is whitened, and then its code. A network
+    Where the map is made of the descriptor, that is all that is learned. For a map that is trained an
+    `Embedding` with a hidden layer learns its descriptor, which is whitened, and then its code. A network
     without parameters to train, such as HOG, is whitened at once; a whitened one, as another map brings, is
     left alone. Other backbones have the last stage only.
 
     Args:
         descriptor: share of the steps in which a descriptor is learned.
+        made: whether the map is made of the descriptor in closed form, and not trained.
     """
+    if made:
+        return [DescriptorStage()]
     if not isinstance(backbone, Embedding) or backbone.coder is None or backbone.coder.whitened:
         return [CodeStage()]
     if not _trainable(backbone.network):
         return [WhiteningStage(), CodeStage()]
-    return [DescriptorStage(descriptor, len(backbone.coder.mean)), WhiteningStage(), CodeStage()]
+    return [DescriptorStage(descriptor), WhiteningStage(), CodeStage()]
 
 
 def has_descriptor(backbone: nn.Module) -> bool:
@@ -176,6 +194,18 @@ def embedding_of(task: PlaceRecognitionTask) -> Embedding:
     return cast(Embedding, task.dejavu.features)
 
 
+def network_of(backbone: nn.Module) -> nn.Module:
+    """What makes the descriptor: the backbone, or its network where a code comes behind it."""
+    return cast(Embedding, backbone).network if has_descriptor(backbone) else backbone
+
+
+def descriptor_of(task: PlaceRecognitionTask) -> Callable[[Tensor], Tensor]:
+    """Describes frames: (B,C,H,W) -> (B,K)."""
+    if not has_descriptor(task.dejavu.features):
+        return task.dejavu.describe
+    return lambda frames: embedding_of(task).describe(task.dejavu.preprocess(frames))
+
+
 def _coder(embedding: Embedding) -> Coder:
     return cast(Coder, embedding.coder)
 
@@ -184,25 +214,47 @@ def _trainable(module: nn.Module) -> list[nn.Parameter]:
     return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 
-@torch.no_grad()
 def describe_views(task: PlaceRecognitionTask) -> Views:
     """Descriptors of all training frames of known places, under several augmentations of each."""
-    data, embedding = task.data, embedding_of(task)
+    room = NUMBERS // len(_coder(embedding_of(task)).mean)
+    descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
+    return Views(torch.cat(descriptors), torch.cat(positives))
+
+
+@torch.no_grad()
+def views_of(task: PlaceRecognitionTask, rounds: int, most: int) -> Iterator[Views]:
+    """Batches of descriptors of augmented training frames of known places.
+
+    Args:
+        rounds: times that each frame is shown. most: views in all, but for one of each frame.
+    """
+    data, describe = task.data, descriptor_of(task)
     loader = data.train_dataloader()
-    frames = len(cast(StoredFrames, loader.dataset))
-    rounds = min(ROUNDS, NUMBERS // (len(_coder(embedding).mean) * frames)) if data.augmentation.acts else 1
-    descriptors, positives = [], []
-    with in_mode(embedding, False):
+    rounds = min(rounds, most // len(cast(StoredFrames, loader.dataset))) if data.augmentation.acts else 1
+    with in_mode(task.dejavu.features, False):
         for _ in range(max(1, rounds)):
             for batch in loader:
                 known = batch.truth.positives[:, 0] >= 0
                 if known.any():
-                    views = task.dejavu.preprocess(
-                        data.augmented(batch.frames.to(task.device), data.clip)[known]
-                    )
-                    descriptors.append(embedding.describe(views).float())
-                    positives.append(batch.truth.positives[known].to(task.device))
-    return Views(torch.cat(descriptors), torch.cat(positives))
+                    frames = data.augmented(batch.frames.to(task.device), data.clip)[known]
+                    views = features_of(frames, describe, "the batch").float()
+                    yield Views(views, batch.truth.positives[known].to(task.device))
+
+
+def make_map(task: PlaceRecognitionTask) -> None:
+    """Learn the whitening and the map of the present descriptors, in closed form.
+
+    Whitening sees the training's own views. None of training's random numbers are taken, and the same
+    descriptors always give the same map.
+    """
+    model, whitening = task.dejavu, task.dejavu.whitening
+    with torch.random.fork_rng(), torch.no_grad(), in_mode(model, False):
+        features = stored_features(task, model.describe)
+        if whitening is not None:
+            torch.manual_seed(whitening.seed)
+            views = views_of(task, whitening.views, whitening.most_views)
+            whitening.learn(features, ((view, places[:, 0]) for view, places in views))
+        model.learn_features(model.whitened(features), task.data.reference)
 
 
 @torch.no_grad()
@@ -221,21 +273,30 @@ def stored_features(
     Raises:
         InputError: a backbone that does not take the frames, or makes NaN.
     """
-    values, maker = task.data.sets["reference"].values, type(task.dejavu.features).__name__
+    values = task.data.sets["reference"].values
     order = torch.randperm(len(values)) if shuffled else torch.arange(len(values))
     count = min(-(-len(order) // task.dejavu.batch_size), len(order) // 2)  # none of a single frame
     features = torch.zeros(0, device=task.device)
     for batch in order.tensor_split(count):
-        try:
-            with torch.autocast(task.device.type, enabled=False):
-                part = features_of(as_frames(values[batch]).to(task.device), describe, "the batch")
-        except RuntimeError as error:
-            problem = " ".join(str(error).split())[:200]
-            raise InputError(f"{maker} does not take frames {tuple(values.shape[1:])}: {problem}") from error
+        part = described(task, values[batch], describe)
         if not len(features):
             features = part.new_empty(len(values), part.shape[1])
         features[batch.to(task.device)] = part
     if not features.isfinite().all():
-        name = task.data.reference.name
+        name, maker = task.data.reference.name, type(task.dejavu.features).__name__
         raise InputError(f"{maker} makes NaN or infinite features of {name}; expected finite numbers")
     return features
+
+
+def described(task: PlaceRecognitionTask, values: Tensor, describe: Callable[[Tensor], Tensor]) -> Tensor:
+    """Features of stored frames, in 32 bits.
+
+    Raises:
+        InputError: a backbone that does not take the frames.
+    """
+    try:
+        with torch.autocast(task.device.type, enabled=False):
+            return features_of(as_frames(values).to(task.device), describe, "the batch")
+    except RuntimeError as error:
+        problem, maker = " ".join(str(error).split())[:200], type(task.dejavu.features).__name__
+        raise InputError(f"{maker} does not take frames {tuple(values.shape[1:])}: {problem}") from error

@@ -1,4 +1,4 @@
-"""Training the whole method end to end: backbone, templates, weights and temperature."""
+"""Training the whole method end to end: the backbone, and with it the map, or what the map is made of."""
 
 from __future__ import annotations
 
@@ -18,25 +18,38 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from dejavu_torch.database.mapfile import read_map
+from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.template_map import TemplateMap, TemplateMapper, log_posterior
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.datamodule import Batch, RouteData
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.training.stages import CodeStage, Stage, Views, stages_of, stored_features
+from dejavu_torch.training.stages import (
+    CodeStage,
+    Stage,
+    Views,
+    has_descriptor,
+    make_map,
+    stages_of,
+    stored_features,
+)
 from dejavu_torch.types import InputError, Plan, Training
 
 log = logging.getLogger("dejavu_torch")
 
 TEMPERATURE = 0.03  # of `log_posterior` at the start
+DESCRIPTOR = 0.4  # of the steps of a training whose descriptor gets a code
 MAP = "dejavu.map."  # ahead of the names of the map's tensors in a checkpoint
 CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
+NETWORK = "network."  # of any Embedding
 
 
 class PlaceRecognitionTask(pl.LightningModule):
@@ -46,10 +59,16 @@ class PlaceRecognitionTask(pl.LightningModule):
     then on. Periods are exact numbers and never get a gradient: they are imposed, or found anew in the
     features every few epochs. A training is a list of stages, see `stages_of`; most backbones have one.
 
+    Any other map, such as a spectral one, is not trained: all steps train the descriptor, and the map is made
+    of it in closed form wherever one is needed. The descriptor is the backbone's output; of an `Embedding`
+    with a hidden layer the code is left out.
+
     Args:
         backbone: nn.Module (B,C,H,W) -> (B,D); None is `SmallCNN` with its defaults.
-        mapper: makes the map; its temperature is where the trained one starts, 0.03 where it is None. None is
-            `TemplateMapper(ImposedPeriods(), temperature=0.03)`.
+        mapper: makes the map; the temperature of a TemplateMapper is where the trained one starts, 0.03 where
+            it is None. None is `TemplateMapper(ImposedPeriods(), temperature=0.03)`.
+        whitening: of the descriptor, ahead of a map that is made of it; it learns from views under the
+            training's augmentation and of the second traverse. None is as in `DejaVu`.
         preprocess: as in `DejaVu`.
         feature_weights: learn what a difference in each feature counts, at least 0.
         descriptor: share of the steps in which the network of an `Embedding` with a hidden layer learns its
@@ -61,7 +80,8 @@ class PlaceRecognitionTask(pl.LightningModule):
             "frozen" keeps its running statistics, as pretrained networks and few frames want.
         refresh: epochs after which the layers are found anew, and templates start over from the phase means;
             0 never.
-        losses: which losses count, and how much.
+        losses: which losses count, and how much. Like feature_weights, descriptor and refresh it is of
+            templates alone.
         lr: highest learning rate of AdamW; it rises over the first tenth of a stage's steps and falls to 0.
         weight_decay: of weights that are multiplied with something, not of biases, templates and the like.
         batch_size: frames in memory at a time where features are made without gradients.
@@ -77,10 +97,11 @@ class PlaceRecognitionTask(pl.LightningModule):
     def __init__(
         self,
         backbone: nn.Module | None = None,
-        mapper: TemplateMapper | None = None,
+        mapper: Mapper | None = None,
+        whitening: Whitening | None = None,
         preprocess: Preprocess | None = None,
         feature_weights: bool = False,
-        descriptor: float = 0.4,
+        descriptor: float = DESCRIPTOR,
         start: str | None = None,
         freeze: list[str] | None = None,
         batch_norm: Literal["train", "frozen"] = "train",
@@ -100,17 +121,30 @@ class PlaceRecognitionTask(pl.LightningModule):
             raise InputError(f"descriptor is {descriptor}; expected a share of the steps, from 0 to below 1")
         backbone = SmallCNN() if backbone is None else backbone
         mapper = TemplateMapper(ImposedPeriods()) if mapper is None else mapper
-        if not isinstance(mapper, TemplateMapper):
-            raise InputError(f"the mapper is {type(mapper).__name__}; expected a TemplateMapper")
-        self.dejavu = DejaVu(backbone, mapper=mapper, batch_size=batch_size, preprocess=preprocess)
+        if not isinstance(mapper, Mapper):
+            raise InputError(f"the mapper is {type(mapper).__name__}; expected a Mapper")
+        self.made = not isinstance(mapper, TemplateMapper)
+        changed = {"feature_weights": feature_weights, "descriptor": descriptor != DESCRIPTOR}
+        changed |= {"refresh": refresh > 0, "losses": losses is not None}
+        lost = [name for name, is_changed in changed.items() if is_changed] if self.made else []
+        lost += ["whitening"] if whitening is not None and not self.made else []
+        if lost:
+            raise InputError(
+                f"{lost[0]} is given, which does nothing for the map of a {type(mapper).__name__}; expected "
+                "another mapper, or none of it"
+            )
+        if self.made and isinstance(backbone, Embedding) and has_descriptor(backbone):
+            backbone = backbone.without_code()
+        self.dejavu = DejaVu(backbone, whitening, mapper, batch_size=batch_size, preprocess=preprocess)
         if start is not None:
             start_from(backbone, start)
         self.frozen = [module.eval() for module in freeze_parts(backbone, freeze or [], batch_norm)]
-        self.log_temperature = nn.Parameter(torch.tensor(math.log(mapper.temperature or TEMPERATURE)))
+        temperature = mapper.temperature if isinstance(mapper, TemplateMapper) else None
+        self.log_temperature = nn.Parameter(torch.tensor(math.log(temperature or TEMPERATURE)))
         self.feature_weights, self.refresh = feature_weights, refresh
         self.losses = Objective() if losses is None else losses
         self.lr, self.weight_decay = lr, weight_decay
-        self.stages = nn.ModuleList(stages_of(backbone, descriptor))
+        self.stages = nn.ModuleList(stages_of(backbone, descriptor, self.made))
         self.index = 0  # of the stage
         self.began = 0  # the step at which it began
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
@@ -122,10 +156,15 @@ class PlaceRecognitionTask(pl.LightningModule):
     @property
     def data(self) -> RouteData:
         """The data module that the trainer runs with."""
-        data = getattr(self.trainer, "datamodule", None)
+        data = getattr(self._trainer, "datamodule", None)
         if not isinstance(data, RouteData):
             raise InputError(f"the trainer's data module is {type(data).__name__}; expected RouteData")
         return data
+
+    @property
+    def map(self) -> PlaceMap:
+        """The map of the present features; empty where it is still to be made."""
+        return self.dejavu.map
 
     @property
     def route(self) -> TemplateMap:
@@ -139,7 +178,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     @property
     def in_last_stage(self) -> bool:
-        """Whether this is the stage that trains the map."""
+        """Whether this is the stage that trains the map, or what it is made of."""
         return self.index == len(self.stages) - 1
 
     @property
@@ -156,6 +195,11 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
         self._check_route(self.dejavu.map.places)
+        if reference.values.ndim == 2 and self.made:
+            raise InputError(
+                f"{self.data.reference.name} holds ready features, and the map of a "
+                f"{type(self.dejavu.mapper).__name__} is not trained; expected frames, or `dejavu learn`"
+            )
         if reference.values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")
             self.dejavu.features = HOG()  # has nothing to store
@@ -169,12 +213,18 @@ class PlaceRecognitionTask(pl.LightningModule):
 
         The first features are made in training mode, so that running statistics are gathered.
         """
+        if self.made:
+            make_map(self)
+        else:
+            self._start_templates()
+        if self.data.resize is not None:
+            self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
+
+    def _start_templates(self) -> None:
         first, weights = not self.route.places, self.route.weights
         with in_mode(self, first):
             features = stored_features(self, self.dejavu.describe, shuffled=first)
         self.dejavu.learn_features(features, self.data.reference)
-        if self.data.resize is not None:
-            self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
         if not self.route.plan:
             raise InputError(
                 f"nothing repeats in the features of {self.data.reference.name}; expected imposed periods"
@@ -183,7 +233,10 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scores of all places, the very ones that the exported map gives. (B,C,H,W) or (B,D) -> (B,N)."""
-        return self.scores(self.route.distances(features_of(frames, self.dejavu.describe, "the batch")))
+        features = features_of(frames, self.dejavu.describe, "the batch")
+        if self.made:
+            return self.map.scores(self.dejavu.whitened(features))
+        return self.scores(self.route.distances(features))
 
     def scores(self, distances: Sequence[Tensor]) -> Tensor:
         """Eq. 4 of the map with the temperature that is trained: L tensors (B,P) -> (B,N)."""
@@ -196,14 +249,17 @@ class PlaceRecognitionTask(pl.LightningModule):
             InputError: a training that has not reached its last stage.
         """
         self.require_map()
+        if self.made and not self.map.places:
+            self.relearn()
         model = copy.deepcopy(self.dejavu).eval()
-        route, mapper = cast(TemplateMap, model.map), cast(TemplateMapper, model.mapper)
-        route.freeze()
-        route.temperature = mapper.temperature = float(self.log_temperature.detach().exp())
-        mapper.trainable = False
-        steps = self.steps if self._trainer is None else self.trainer.global_step
+        if not self.made:
+            route, mapper = cast(TemplateMap, model.map), cast(TemplateMapper, model.mapper)
+            route.freeze()
+            route.temperature = mapper.temperature = float(self.log_temperature.detach().exp())
+            mapper.trainable = False
+        steps = 0 if self._trainer is None else self.trainer.global_step
         seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
-        model.trained = Training(steps, self._elapsed(), int(seed) if seed else None)
+        model.trained = Training(steps or self.steps, self._elapsed(), int(seed) if seed else None)
         return model
 
     def require_map(self) -> None:
@@ -251,7 +307,12 @@ class PlaceRecognitionTask(pl.LightningModule):
             ]
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Where the steps of a stage are over, the next one begins, with its own optimizer."""
+        """Where the steps of a stage are over, the next one begins, with its own optimizer.
+
+        A map that is made of the features does not outlast them.
+        """
+        if self.made and self.map.places:
+            self.dejavu.load_state_dict(self._unmade(), strict=False)
         if not self.in_last_stage and self.global_step >= self._stop():
             self._advance(self.global_step)
             self.trainer.strategy.setup_optimizers(self.trainer)
@@ -305,7 +366,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         """A map of the present features, where there is none yet."""
         if self.trainer.state.fn != "fit":
             self.require_map()
-        if self.in_last_stage and not self.route.places:
+        if self.in_last_stage and not self.map.places:
             with torch.inference_mode(False):  # its parameters may be trained later
                 self.relearn()
 
@@ -316,7 +377,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             frames = batch.frames if self.trainer.testing else self.data.validated(batch)
             with torch.autocast(self.device.type, enabled=False):
                 match = best_match(self(frames))
-            index = self.route.scored(match.index)
+            index = self.map.scored(match.index)
             self.metric.update(match._replace(index=index), batch.truth)
 
     def on_validation_epoch_end(self) -> None:
@@ -335,10 +396,17 @@ class PlaceRecognitionTask(pl.LightningModule):
     # checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the stage, the clock, and what is trained."""
+        """Keep the stage, the clock, and what is trained; a map that is made is made anew."""
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
         checkpoint |= {"seconds": self._elapsed()}
+        if self.made:
+            checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
+
+    def _unmade(self) -> dict[str, Any]:
+        """The state of a model that has learned no map and no whitening."""
+        whitening = None if self.dejavu.whitening is None else Whitening()
+        return DejaVu(nn.Identity(), whitening or "none", self.dejavu.mapper).state_dict()
 
     def _trained(self) -> list[str]:
         trained = {id(parameter) for parameter in self.stage.trained(self)}
@@ -350,11 +418,22 @@ class PlaceRecognitionTask(pl.LightningModule):
         if checkpoint.get("stages") != stages:
             seen = checkpoint.get("stages", "no training")
             raise InputError(f"the checkpoint is of {seen}; expected one of the stages {stages}")
-        state = checkpoint["state_dict"]
-        route = cast(TemplateMapper, self.dejavu.mapper).empty()
+        if not self.made:
+            self._take_templates(checkpoint["state_dict"])
+        self.index, self.began = checkpoint["stage"], checkpoint["began"]
+        self.steps, self.seconds = checkpoint["global_step"], checkpoint["seconds"]
+        other = sorted(set(self._trained()) ^ set(checkpoint["trained"]))
+        if other:
+            raise InputError(
+                f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both; expected a "
+                "checkpoint of the same settings"
+            )
+
+    def _take_templates(self, state: dict[str, Any]) -> None:
+        mapper = cast(TemplateMapper, self.dejavu.mapper)
+        route, periods = mapper.empty(), mapper.periods
         route.load_state_dict({n.removeprefix(MAP): t for n, t in state.items() if n.startswith(MAP)})
         self._check_route(route.places)
-        periods = cast(TemplateMapper, self.dejavu.mapper).periods
         if route.places and isinstance(periods, ImposedPeriods):
             imposed = periods.plan(torch.zeros(1, 1).expand(route.places, route.dimension))
             if imposed != route.plan:
@@ -364,14 +443,6 @@ class PlaceRecognitionTask(pl.LightningModule):
                 )
         route.trainable(True, self.feature_weights)
         self.dejavu.map = route.to(self.device)
-        self.index, self.began = checkpoint["stage"], checkpoint["began"]
-        self.steps, self.seconds = checkpoint["global_step"], checkpoint["seconds"]
-        other = sorted(set(self._trained()) ^ set(checkpoint["trained"]))
-        if other:
-            raise InputError(
-                f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both; expected a "
-                "checkpoint of the same settings"
-            )
 
     def _check_route(self, places: int) -> None:
         """Refuse a map of another route than the data's."""
@@ -392,7 +463,8 @@ def _layers(plan: Plan) -> str:
 def start_from(backbone: nn.Module, path: str | Path) -> None:
     """Give a backbone the weights that a map file holds.
 
-    Of a whitened descriptor its code is left out, which is of the other route, and of any dimension.
+    Of a whitened descriptor its code is left out, which is of the other route, and of any dimension. Where an
+    `Embedding` gives the descriptor itself, here or there, its network is all that is taken.
 
     Raises:
         InputError: no map file, or one of another backbone.
@@ -400,9 +472,13 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
     tensors, header = read_map(Path(path))
     prefix = "features."
     weights = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
-    if bool(weights.get("linear.whitened", False)):
-        own = {name: t for name, t in backbone.state_dict().items() if name.startswith(CODE)}
-        weights = {name: t for name, t in weights.items() if not name.startswith(CODE)} | own
+    own = backbone.state_dict()
+    code = CODE if bool(weights.get("linear.whitened", False)) else ()
+    bare = any(all(name.startswith(NETWORK) for name in one) for one in (weights, own))
+    if bare and isinstance(backbone, Embedding):
+        code = ("linear.", "standardise.")
+    weights = {name: t for name, t in weights.items() if not name.startswith(code)}
+    weights |= {name: t for name, t in own.items() if name.startswith(code)}
     try:
         backbone.load_state_dict(weights)
     except RuntimeError as error:

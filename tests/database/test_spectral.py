@@ -12,6 +12,7 @@ from helpers import refused
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import SpectralCode, SpectralMap, SpectralMapper, quantise
 from dejavu_torch.database.spectrum import from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer
@@ -84,6 +85,50 @@ def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_p
         (tmp_path / "m.safetensors").stat().st_size == model.summary().map_bytes == again.summary().map_bytes
     )
     assert torch.equal(again(descriptors[:5]), model(descriptors[:5]))
+
+
+class Named(ArrayTraverse):
+    """Ready features with a counter that jitters, or a random name, for each frame."""
+
+    def __init__(self, values: Tensor, random: bool) -> None:
+        super().__init__(values)
+        draw = torch.randint(10**9, (len(values), 3), generator=torch.Generator().manual_seed(0)).tolist()
+        self.names = [
+            f"{a}-{b}-{c}.png" if random else f"{40 * i + (a % 8 == 0)}.png" for i, (a, b, c) in enumerate(draw)
+        ]
+
+    def frame_name(self, i: int) -> str:
+        return self.names[i]
+
+
+@pytest.mark.parametrize("places", [111, 1000])
+@pytest.mark.parametrize("budget", [2.5, 5.0])
+def test_names_count_in_the_budget(
+    places: int, budget: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mapper = SpectralMapper(budget)
+    model = DejaVu(mapper=mapper, whitening="none").learn(Named(route(places, 24), random=False))
+    summary = model.summary()
+    assert summary.route["names"] > 0.05 * budget * places
+    assert 0.98 * budget <= summary.route_bytes / places <= budget
+    assert not caplog.text
+    model.save(tmp_path / "m.safetensors")
+    again = DejaVu.load(tmp_path / "m.safetensors")
+    assert again.summary().map_bytes == (tmp_path / "m.safetensors").stat().st_size
+    plain = model.learn(route(places, 24)).summary()  # without names their bytes are the lines'
+    assert plain.route["lines"] > 1.03 * summary.route["lines"]
+    assert 0.98 * budget <= plain.route_bytes / places <= budget
+
+
+def test_names_of_over_half_of_the_budget_come_on_top(caplog: pytest.LogCaptureFixture) -> None:
+    features = route(400, 24)
+    summary = DejaVu(whitening="none").learn(Named(features, random=True)).summary()
+    (line,) = caplog.messages
+    assert "come on top" in line
+    assert f"{summary.route['names'] / 400:.3g} bytes per place" in line
+    assert summary.route["names"] > 5 * 400
+    rest = summary.route_bytes - summary.route["names"]
+    assert rest == DejaVu(whitening="none").learn(features).summary().route_bytes <= 5 * 400
 
 
 def test_more_bytes_hold_more_of_the_route() -> None:

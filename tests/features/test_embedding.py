@@ -90,6 +90,19 @@ def test_vectors_are_projected_as_they_are() -> None:
     torch.testing.assert_close(net.eval()(frames), expected, rtol=0, atol=1e-4)
 
 
+def test_without_a_dimension_the_descriptor_is_what_it_gives(tmp_path: Path) -> None:
+    full = Embedding(SmallCNN(dimension=7, resize=(16, 16), widths=(4,)), 5, resize=(16, 16), hidden=6).eval()
+    own, frames = full.without_code(), torch.rand(20, 3, 24, 24)
+    assert torch.equal(own(frames), full.describe(frames))
+    assert own.network is full.network
+    assert all(name.startswith("network.") for name in own.state_dict())
+    model = DejaVu(own).learn(frames)
+    model.save(tmp_path / "map.safetensors")
+    torch.testing.assert_close(DejaVu.load(tmp_path / "map.safetensors")(frames), model(frames))
+    with refused("hidden=6", "no dimension"):
+        Embedding(full.network, None, hidden=6)
+
+
 def test_grey_is_repeated_and_colour_becomes_luminance() -> None:
     grey = torch.rand(2, 1, 12, 16)
     net = plain().eval()

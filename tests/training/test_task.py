@@ -122,7 +122,7 @@ def test_bf16_trains_and_exports_float32(tmp_path: Path) -> None:
         ({"refresh": -1}, ("refresh -1",)),
         ({"descriptor": -0.1}, ("descriptor is -0.1", "from 0 to below 1")),
         ({"descriptor": 1.0}, ("descriptor is 1.0",)),
-        ({"mapper": nn.Identity()}, ("mapper is Identity", "TemplateMapper")),
+        ({"mapper": nn.Identity()}, ("mapper is Identity", "expected a Mapper")),
     ],
     ids=str,
 )

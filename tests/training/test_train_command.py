@@ -19,7 +19,7 @@ from pytorch_lightning import Trainer
 from small_training import CONFIG, FRAMES, MINE, footage, train, warned
 from torch import nn
 
-from dejavu_torch import DejaVu, RouteData, TemplateMap
+from dejavu_torch import DejaVu, RouteData, SpectralMap, TemplateMap
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.mapfile import read_map
@@ -217,6 +217,42 @@ def test_export_makes_a_map_of_a_checkpoint(
     config = str(folder / "run" / "lightning_logs" / "version_0" / "config.yaml")  # the one of the fit
     train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "again", config=config)
     assert (tmp_path / "again" / "map.safetensors").is_file()
+
+
+def test_a_spectral_map_whatever_mapper_a_preset_has(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "plain.yaml").write_text(CONFIG.partition("  mapper:")[0] + CONFIG[CONFIG.index("data:") :])
+    chosen = ["--model.mapper", "SpectralMapper", "--model.mapper.route_bytes_per_place", 12]
+    for config in ("train.yaml", str(tmp_path / "plain.yaml")):
+        run = tmp_path / Path(config).stem
+        train("fit", *chosen, "--trainer.default_root_dir", run, config=config)
+        assert warned(caplog) == []
+        said = capfd.readouterr()
+        assert said.err == ""
+        assert "lines of their spectra" in said.out
+        assert isinstance(DejaVu.load(run / "map.safetensors").map, SpectralMap)
+    last = run / "checkpoints" / "last.ckpt"
+    for size in (12, 6):  # the map is made anew of the checkpoint's features
+        options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
+        train("export", "--ckpt_path", last, *options)
+    maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("plain", "12", "6")]
+    levels = [model.map.levels for model in maps]
+    assert torch.equal(levels[0], levels[1])
+    assert (levels[2] != 0).sum() < (levels[1] != 0).sum()
+    assert maps[1].trained is not None
+    assert maps[1].trained.steps == 4
+    capfd.readouterr()
+    options = [*chosen, "--trainer.default_root_dir", run, "--ckpt_path", last]
+    train("test", *options, "--data.query", "two.npy")
+    match = maps[0].localize(ArrayTraverse(footage(0.1)))
+    scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
+    rows = dict(
+        line.split() for line in capfd.readouterr().out.splitlines() if line.strip().startswith("test/")
+    )
+    assert {name: float(value) for name, value in rows.items()} == pytest.approx(
+        {f"test/{name}": figure for name, figure in scores._asdict().items()}, abs=1e-6
+    )
 
 
 def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:

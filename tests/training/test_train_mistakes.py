@@ -11,6 +11,7 @@ from dejavu_torch.cli import main
 
 STOP, WATCH = (["--trainer.callbacks+", name] for name in ("EarlyStopping", "ModelCheckpoint"))
 ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
+SPECTRAL = ["--model.mapper", "SpectralMapper"]
 
 
 @pytest.mark.parametrize(
@@ -31,6 +32,14 @@ ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
         ("fit", [*ANOTHER, "--model.backbone", "mine.Plain"], ["convolutions", "not in both"]),
         ("fit", [*ANOTHER, "--model.feature_weights", "true"], ["dejavu.map.weights", "same settings"]),
         ("fit", [*ANOTHER, "--model.mapper.metric", "l2"], ["the map's metric is 'l1'", "expected 'l2'"]),
+        ("fit", [*SPECTRAL, "--model.refresh", "2"], ["refresh", "SpectralMapper"]),
+        ("fit", [*SPECTRAL, "--model.losses.place", "1"], ["losses", "SpectralMapper"]),
+        ("fit", [*SPECTRAL, "--model.backbone", "HOG"], ["nothing of HOG", "dejavu learn"]),
+        ("fit", [*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["'periods' is not accepted"]),
+        ("fit", [*SPECTRAL, "--model.mapper.route_bytes_per_place", "0"], ["route_bytes_per_place is 0"]),
+        ("fit", [*SPECTRAL, *ANOTHER], ["of ['CodeStage']", "['DescriptorStage']"]),
+        ("export", [*SPECTRAL, *ANOTHER], ["of ['CodeStage']", "['DescriptorStage']"]),
+        ("fit", ["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
         ("export", ["--ckpt_path", "gone.ckpt"], ["gone.ckpt"]),
         ("export", ["--ckpt_path", "a_file"], ["checkpoint cannot be read"]),
         ("export", ["--ckpt_path", "foreign.ckpt"], ["the checkpoint is of no training"]),

@@ -1,0 +1,315 @@
+"""Trainings that end in a map which is made of the descriptor, in closed form, and not trained."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from pytorch_lightning.callbacks import ModelCheckpoint
+from small_training import (
+    FRAMES,
+    Stop,
+    assert_same_scores,
+    backbone,
+    data_of,
+    fit,
+    footage,
+    mapper,
+    new_task,
+    recall,
+    trainer,
+    warned,
+)
+from test_stages import STILL, Watch, coded
+from test_task import assert_figures
+from torch import nn
+
+from dejavu_torch import HOG, DejaVu, SpectralMap, SpectralMapper, TemplateMap, Whitening
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.baselines import baselines_of
+from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.training.export import LastCheckpoint, load_weights
+from dejavu_torch.training.losses import Objective
+from dejavu_torch.training.stages import CodeStage, DescriptorStage, WhiteningStage
+from dejavu_torch.training.task import PlaceRecognitionTask, start_from
+
+EVERY = {"val_check_interval": 2, "check_val_every_n_epoch": None}
+
+
+def spectral(**settings: Any) -> PlaceRecognitionTask:
+    return new_task(**{"backbone": coded(), "mapper": SpectralMapper(20.0)} | settings)
+
+
+class Plain(SpectralMapper):
+    """A mapper that takes descriptors as they are."""
+
+    whitens = False
+
+
+def levels(model: DejaVu) -> torch.Tensor:
+    assert isinstance(model.map, SpectralMap)
+    return model.map.levels
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"backbone": backbone()},
+        {"backbone": coded(hidden=0)},
+        {"backbone": nn.Sequential(nn.Flatten(), nn.Linear(256, 8))},
+        {"mapper": Plain(20.0)},
+        {"mapper": SpectralMapper(10.0, transform="dct", metric="l2"), "whitening": Whitening(numbers=4)},
+        {"batch_norm": "frozen", "freeze": ["network.convolutions"]},
+    ],
+    ids=["code", "CNN", "linear", "foreign", "no whitening", "l2", "frozen"],
+)
+def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path: Path, settings: dict[str, Any]) -> None:
+    task = spectral(**settings)
+    trainer(tmp_path).fit(task, data_of())
+    given = DejaVu.load if type(task.dejavu.mapper) is SpectralMapper else None
+    features = task.dejavu.features if isinstance(task.dejavu.features, nn.Sequential) else None
+    model = task.deployed() if given is None else given(tmp_path / "map.safetensors", features)
+    assert isinstance(model.map, SpectralMap)
+    assert_same_scores(task, model)
+    assert recall(model, footage()) > 0.9
+    assert model.trained is not None
+    assert model.trained.steps == 4
+
+
+def test_the_file_holds_the_network_alone(tmp_path: Path) -> None:
+    task = spectral()
+    model = fit(tmp_path, task, data_of())
+    assert isinstance(model.features, Embedding)
+    network = model.features.network.state_dict()
+    assert model.summary().fixed["backbone"] == sum(tensor.nbytes for tensor in network.values())
+    assert all(name.startswith("network.") for name in model.features.state_dict())
+    assert model.map.dimension == 8  # of the network, not the 12 of the code
+    assert model.whitening is not None
+    assert model.whitening.learned
+
+
+def test_the_descriptor_is_that_of_a_training_with_a_code(tmp_path: Path) -> None:
+    """The same steps, rates and random numbers, whatever is validated on the way."""
+    states = []
+    for task, steps in ((new_task(backbone=coded(), descriptor=0.5), 10), (spectral(), 5)):
+        torch.manual_seed(3)
+        again = coded()
+        task.dejavu.features.network.load_state_dict(again.network.state_dict())  # type: ignore[union-attr]
+        watch = Watch()
+        running = trainer(tmp_path / str(steps), watch, max_steps=steps, enable_checkpointing=True, **EVERY)
+        running.fit(task, data_of())
+        states.append([{n: t for n, t in s.items() if n.startswith("network.")} for s in watch.states])
+    for code, own in zip(*states, strict=False):
+        assert all(torch.equal(code[name], value) for name, value in own.items())
+    assert not torch.equal(states[1][0]["network.linear.weight"], states[1][-1]["network.linear.weight"])
+
+
+def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path: Path) -> None:
+    model = fit(tmp_path, spectral(), data_of(), max_steps=3, **EVERY)
+    features = model.extract_all(ArrayTraverse(footage()))
+    assert torch.equal(levels(model), SpectralMapper(20.0)(features).levels)
+
+
+def test_making_a_map_changes_nothing_and_gives_the_same_again(tmp_path: Path) -> None:
+    task = spectral()
+    trainer(tmp_path).fit(task, data_of())
+    task.train()
+    first, state = levels(task.deployed()), torch.get_rng_state()
+    weights = {name: value.clone() for name, value in task.dejavu.features.state_dict().items()}
+    task.relearn()
+    assert torch.equal(levels(task.deployed()), first)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert task.dejavu.features.training
+    assert all(torch.equal(weights[n], value) for n, value in task.dejavu.features.state_dict().items())
+
+
+def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path) -> None:
+    running, task = trainer(tmp_path, precision="bf16-mixed"), spectral()
+    running.fit(task, data_of())
+    assert_figures(running, task, footage(0.2))
+
+
+def test_its_null_is_beside_it(tmp_path: Path) -> None:
+    """Of the same descriptors, coded in shuffled order: nothing of it has to be trained."""
+    model = fit(tmp_path, spectral(), data_of())
+    features, queries = (model.extract_all(ArrayTraverse(footage(noise))) for noise in (0.0, 0.05))
+    null = baselines_of(model, features, queries, tolerance=2)["null"]
+    assert null.name == "null: shuffled frames, as many bytes"
+    assert len(null.match.index) == FRAMES
+
+
+# checkpoints ---------------------------------------------------------------------------------------------
+
+
+def part(folder: Path, steps: int = 4, of: int = 8) -> Path:
+    """A checkpoint after some steps, behind a validation."""
+    keep = Stop(steps, folder / "part.ckpt")
+    trainer(folder, keep, max_steps=of, **EVERY).fit(spectral(), data_of())
+    return folder / "part.ckpt"
+
+
+def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    on, task = trainer(tmp_path / "again", watch := Watch(), max_steps=8), spectral()
+    on.fit(task, data_of(), ckpt_path=part(tmp_path), weights_only=True)
+    assert on.global_step == 8
+    assert len(watch.rates) == 4
+    assert task.in_last_stage
+    assert recall(DejaVu.load(tmp_path / "again" / "map.safetensors"), footage()) > 0.9
+
+
+def test_a_checkpoint_holds_no_map_and_validating_it_makes_one(tmp_path: Path) -> None:
+    path = part(tmp_path)
+    state = torch.load(path, weights_only=True)["state_dict"]
+    assert not [
+        n for n, t in state.items() if "dejavu.map" in n and isinstance(t, torch.Tensor) and t.numel()
+    ]
+    task, running = spectral(mapper=SpectralMapper(12.0)), trainer(tmp_path)
+    noisy = data_of(validation=ArrayTraverse(footage(0.05)))
+    (figures,) = running.validate(task, noisy, ckpt_path=path, verbose=False, weights_only=True)
+    assert figures["val/recall_at_1"] > 0.5
+    route = task.deployed()
+    assert route.trained is not None
+    assert route.trained.steps == 4
+    summary = route.summary()
+    assert 11 < summary.route_bytes / FRAMES <= 12 or levels(route).abs().max() > 64  # this run's budget
+
+
+def test_without_frames_there_is_no_map_to_deploy(tmp_path: Path) -> None:
+    given = {"backbone": coded(), "mapper": SpectralMapper(20.0)}
+    task = PlaceRecognitionTask.load_from_checkpoint(part(tmp_path), weights_only=True, **given)
+    with refused("data module is NoneType", "RouteData"):
+        task.deployed()
+
+
+def test_the_map_is_of_the_best_checkpoint(tmp_path: Path) -> None:
+    best = ModelCheckpoint(tmp_path, monitor="val/recall_at_1_augmented", mode="min", filename="best")
+    running = trainer(tmp_path, best, max_steps=6, **EVERY)
+    running.fit(task := spectral(), data_of())
+    state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
+    model = DejaVu.load(tmp_path / "map.safetensors")
+    name = "network.linear.weight"
+    assert torch.equal(model.features.state_dict()[name], state[f"dejavu.features.{name}"])
+    assert_same_scores(task, model)
+
+
+def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_path: Path) -> None:
+    stop, handler = Stop(3, exception=KeyboardInterrupt()), signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit):
+            trainer(tmp_path, stop, LastCheckpoint(every=2), max_steps=9).fit(spectral(), data_of())
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    model, task = DejaVu.load(tmp_path / "map.safetensors"), spectral()
+    assert model.trained is not None
+    assert model.trained.steps == 3
+    load_weights(task, tmp_path / "checkpoints" / "last.ckpt")
+    own, kept = task.dejavu.features.state_dict(), model.features.state_dict()
+    assert all(torch.equal(own[name], value) for name, value in kept.items())
+
+
+@pytest.mark.parametrize(
+    ("settings", "frames", "words"),
+    [
+        ({"mapper": mapper()}, FRAMES, ("of ['DescriptorStage']", "'CodeStage'")),
+        ({}, 30, ("20 stretches of 2 frames", "the array has 15", "the route that it was learned on")),
+        ({"freeze": ["network.linear"]}, FRAMES, ("network.linear.bias", "not in both")),
+    ],
+    ids=str,
+)
+def test_a_checkpoint_of_another_training_is_refused(
+    tmp_path: Path, settings: dict[str, Any], frames: int, words: tuple[str, ...]
+) -> None:
+    path, data = part(tmp_path), data_of(footage(frames=frames))
+    with refused(*words):
+        trainer(tmp_path / "on", max_steps=8).fit(
+            spectral(**settings), data, ckpt_path=path, weights_only=True
+        )
+
+
+# views, and where to start -------------------------------------------------------------------------------
+
+
+def test_a_second_traverse_tells_what_a_visit_changes(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    still = Augmentation(**STILL)  # type: ignore[arg-type]
+    winter = (footage().float() * torch.linspace(0.2, 1, 16)).byte()
+    second = {"second": ArrayTraverse(winter), "second_truth": "0"}
+    trainer(tmp_path / "both").fit(spectral(), data_of(augmentation=still, **second))
+    assert (tmp_path / "both" / "map.safetensors").exists()
+    assert warned(caplog) == []
+    trainer(tmp_path / "one", limit_val_batches=0).fit(spectral(), data_of(augmentation=still))
+    (line,) = warned(caplog)
+    assert "no map is written" in line
+    assert "differ from those of their places by 0 in" in line
+
+
+def test_a_map_of_either_kind_gives_its_network_to_start_from(tmp_path: Path) -> None:
+    maps = {"code": new_task(backbone=coded(), descriptor=0.5), "own": spectral()}
+    for name, task in maps.items():
+        fit(tmp_path / name, task, data_of(), max_steps=4)
+        kept = task.dejavu.features.network.state_dict()  # type: ignore[union-attr,operator]
+        for start in (coded(), coded().without_code()):
+            fresh = {n: t.clone() for n, t in start.state_dict().items()}
+            start_from(start, tmp_path / name / "map.safetensors")
+            assert all(torch.equal(kept[n], t) for n, t in start.network.state_dict().items())
+            if name == "own":  # no code comes with it
+                assert all(
+                    torch.equal(fresh[n], t) for n, t in start.state_dict().items() if "network." not in n
+                )
+    path = str(tmp_path / "own" / "map.safetensors")
+    again = new_task(backbone=coded(), start=path)
+    assert [type(stage) for stage in again.stages] == [DescriptorStage, WhiteningStage, CodeStage]
+    assert isinstance(fit(tmp_path / "again", again, data_of()).map, TemplateMap)
+    with refused("holds weights of", "expected those of the same Embedding"):
+        spectral(backbone=coded(network=backbone(9)), start=path)
+    fit(tmp_path / "small", spectral(backbone=backbone()), data_of())
+    with refused("holds weights of", "expected those of the same Embedding"):
+        spectral(start=str(tmp_path / "small" / "map.safetensors"))
+
+
+# refusals ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"feature_weights": True}, ("feature_weights", "SpectralMapper")),
+        ({"descriptor": 0.5}, ("descriptor", "SpectralMapper")),
+        ({"refresh": 2}, ("refresh", "SpectralMapper")),
+        ({"losses": Objective()}, ("losses", "SpectralMapper")),
+        ({"mapper": mapper(), "whitening": Whitening()}, ("whitening", "TemplateMapper")),
+        ({"freeze": ["linear"]}, ("'linear'", "expected one of network")),  # the code is gone
+    ],
+    ids=str,
+)
+def test_settings_that_do_nothing_are_refused(settings: dict[str, Any], words: tuple[str, ...]) -> None:
+    with refused(*words):
+        spectral(**settings)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"backbone": HOG()}, {"backbone": coded(network=HOG())}, {"freeze": [""]}], ids=str
+)
+def test_what_cannot_be_trained_is_refused(tmp_path: Path, settings: dict[str, Any]) -> None:
+    with refused("can be trained", "dejavu learn"):
+        trainer(tmp_path).fit(spectral(**settings), data_of())
+
+
+def test_ready_features_are_refused(tmp_path: Path) -> None:
+    with refused("ready features", "SpectralMapper is not trained", "dejavu learn"):
+        trainer(tmp_path).fit(spectral(), data_of(torch.rand(FRAMES, 6)))
+
+
+def test_a_budget_that_cannot_be_met_stops_at_the_first_validation(tmp_path: Path) -> None:
+    running = trainer(tmp_path, max_steps=9, **EVERY, num_sanity_val_steps=0)
+    with refused("route_bytes_per_place is 0.1"):
+        running.fit(spectral(mapper=SpectralMapper(0.1)), data_of())
+    assert running.global_step == 2
