@@ -36,9 +36,31 @@ TRANSFORM_COST = 200  # of a place in a query's inverse transform
 REBUILD_COST = 120  # of a number that is rebuilt for all queries at once
 
 
-def quantise(lines: Tensor, step: Tensor | float) -> Tensor:
-    """Whole numbers of steps, those below 1 - `ROUNDING` of a step 0. Same shape, float; no gradient."""
-    return lines.sign() * (lines.abs() / step + ROUNDING).floor()
+def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -> Tensor:
+    """Whole numbers of steps, those below 1 - `ROUNDING` of a step 0. Same shape, float; no gradient.
+
+    Args:
+        width: by how much that dead zone is wider for each line, at least 1; see `dead_zone`.
+    """
+    levels = lines.sign() * (lines.abs() / step + ROUNDING).floor()
+    return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
+
+
+def dead_zone(lengths: list[int], resolution: float, transform: Transform) -> Tensor | None:
+    """By how much the dead zone of each line is wider than that of line 0, for chunks of these lengths.
+
+    That of a line of period P is 1 + (resolution / P)^2 times as wide: it costs as many bits as a slow one,
+    and tells nothing of where one is but within P places.
+
+    Returns:
+        (N,1), or None where all lines count alike.
+    """
+    if not resolution:
+        return None
+    # line r has r half cycles (DCT), or of pairs of a cosine and a sine as many cycles (DFT)
+    halves = [torch.arange(n) if transform == "dct" else (torch.arange(n) + 1) // 2 * 2 for n in lengths]
+    inverse = torch.cat([r / (2 * n) for r, n in zip(halves, lengths, strict=True)])
+    return (1 + (resolution * inverse).square())[:, None]
 
 
 class SpectralMap(PlaceMap):
@@ -65,6 +87,7 @@ class SpectralMap(PlaceMap):
             of their distance.
         transform: of the lines, see `spectrum`.
         chunk: places of a chunk; "route" is one chunk, which cannot be extended.
+        resolution: of the coding of further places, see `SpectralMapper`.
 
     Shape: scores: descriptors (Q,K) -> (Q,N), lower is better.
 
@@ -100,10 +123,11 @@ class SpectralMap(PlaceMap):
         metric: SpectralMetric = "cosine",
         transform: Transform = "dft",
         chunk: int | Literal["route"] = "route",
+        resolution: float = 0.0,
     ) -> None:
         super().__init__(*((0, 0) if levels is None else levels.shape))
-        check_settings(metric, transform, chunk)
-        self.metric, self.transform, self.chunk = metric, transform, chunk
+        check_settings(metric, transform, chunk, resolution)
+        self.metric, self.transform, self.chunk, self.resolution = metric, transform, chunk, resolution
         empty = {
             "levels": torch.zeros(0, 0, dtype=torch.int8),
             "escapes": torch.zeros(0, dtype=torch.int32),
@@ -120,7 +144,8 @@ class SpectralMap(PlaceMap):
         self.check()
 
     def settings(self) -> dict[str, Any]:
-        return {"metric": self.metric, "transform": self.transform, "chunk": self.chunk}
+        names = ("metric", "transform", "chunk", "resolution")
+        return {name: getattr(self, name) for name in names}
 
     def loaded(self) -> None:
         """The lines that are not 0, one by one, and the norms of the rebuilt descriptors."""
@@ -216,7 +241,8 @@ class SpectralMap(PlaceMap):
         check_descriptors(features, self.dimension)
         lengths = _lengths(len(features), self.chunk)
         lines = _lines(features - self.mean.float(), lengths, self.transform)
-        small, escapes = to_int8(quantise(lines, self.steps[-1]))
+        width = dead_zone(lengths, self.resolution, self.transform)
+        small, escapes = to_int8(quantise(lines, self.steps[-1], width))
         self.levels = torch.cat([self.levels, small])
         self.escapes = torch.cat([self.escapes, escapes])
         self.lengths = torch.cat([self.lengths, self.lengths.new_tensor(lengths)])
@@ -294,7 +320,10 @@ class SpectralMap(PlaceMap):
         return MapSummary(self.kind, self.places, heard, 0, 0, tuple(chunks), route, {}, lines)
 
     def mapper_of_equal_size(self) -> SpectralMapper:
-        """Makes maps of other routes with these settings, that take as many bytes a place."""
+        """Makes maps of other routes with these settings, that take as many bytes a place.
+
+        All lines count alike: what is fast is noise in a smooth route, but not in one that is not.
+        """
         size = (self.summary().route_bytes - self.positions.nbytes) / self.places
         return SpectralMapper(size, None, self.chunk, self.transform, self.metric)
 
@@ -326,6 +355,10 @@ class SpectralMapper(Mapper):
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
         transform, metric: of the maps, see `SpectralMap`.
+        resolution: places; 0 codes all lines alike. The dead zone of a line of period P is
+            1 + (resolution / P)^2 times as wide, so that what changes from frame to frame takes no bytes from
+            what lasts. Of video of many frames for each place a user tells apart, where such changes are
+            mostly noise, 8 makes a better map; where every frame is another place it makes a worse one.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
@@ -352,6 +385,7 @@ class SpectralMapper(Mapper):
         chunk: int | Literal["route"] = "route",
         transform: Transform = "dft",
         metric: SpectralMetric = "cosine",
+        resolution: float = 0.0,
     ) -> None:
         super().__init__()
         if (route_bytes_per_place is None) == (step is None):
@@ -362,9 +396,9 @@ class SpectralMapper(Mapper):
         for name, value in (("route_bytes_per_place", route_bytes_per_place), ("step", step)):
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name} is {value}; expected a number above 0")
-        check_settings(metric, transform, chunk)
+        check_settings(metric, transform, chunk, resolution)
         self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
-        self.transform, self.metric = transform, metric
+        self.transform, self.metric, self.resolution = transform, metric, resolution
         self.taken = 0  # bytes of the budget, see `beside`
         self.exact = True  # otherwise the entropy alone tells the step: within a fifth or so, and sooner
 
@@ -379,8 +413,10 @@ class SpectralMapper(Mapper):
         if not scale > 1e-6 * float(features.square().mean().sqrt()):
             raise InputError(f"the {len(features)} descriptors are all alike; expected a route that changes")
         overhead = self.taken + mean.nbytes + CHUNK_BYTES * len(lengths)
-        step = self._step(lines, lengths, overhead) if self.step is None else self.step
-        small, escapes = to_int8(quantise(lines, step))
+        width = dead_zone(lengths, self.resolution, self.transform)
+        width = None if width is None else width.to(lines)
+        step = self._step(lines, width, lengths, overhead) if self.step is None else self.step
+        small, escapes = to_int8(quantise(lines, step, width))
         steps = features.new_full((len(lengths),), step)
         route = SpectralMap(
             small,
@@ -391,18 +427,20 @@ class SpectralMapper(Mapper):
             self.metric,
             self.transform,
             self.chunk,
+            self.resolution,
         )
-        if _held(lines, step) < LITTLE:
-            half = _smallest_step(lambda step: _held(lines, step) < 0.5, *_steps(lines))
-            route.needed = (overhead + _coded_bytes(lines, lengths, half)) / len(features)
+        if _held(lines, width, step) < LITTLE:
+            half = _smallest_step(lambda step: _held(lines, None, step) < 0.5, *_steps(lines))
+            route.needed = (overhead + _coded_bytes(lines, None, lengths, half)) / len(features)
         return route
 
     def extra_repr(self) -> str:
-        names = ("route_bytes_per_place", "step", "chunk", "transform", "metric")
+        names = ("route_bytes_per_place", "step", "chunk", "transform", "metric", "resolution")
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
     def empty(self) -> SpectralMap:
-        return SpectralMap(metric=self.metric, transform=self.transform, chunk=self.chunk)
+        settings = self.metric, self.transform, self.chunk, self.resolution
+        return SpectralMap(None, None, None, None, None, *settings)
 
     def beside(self, taken: int, places: int) -> SpectralMapper:
         """See `Mapper`; what takes over half of the budget comes on top of it, and a line says so."""
@@ -421,7 +459,7 @@ class SpectralMapper(Mapper):
         other.taken = taken
         return other
 
-    def _step(self, lines: Tensor, lengths: list[int], overhead: int) -> float:
+    def _step(self, lines: Tensor, width: Tensor | None, lengths: list[int], overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %."""
         assert self.route_bytes_per_place is not None
         places, numbers = lines.shape
@@ -434,11 +472,11 @@ class SpectralMapper(Mapper):
             )
         finest, coarsest = _steps(lines)
         if not self.exact:
-            return _smallest_step(partial(_fits, lines, room / CODED), finest, coarsest)
+            return _smallest_step(partial(_fits, lines, width, room / CODED), finest, coarsest)
         aim, fitting = room, coarsest
         for _ in range(8):
-            step = _smallest_step(partial(_fits, lines, aim), finest, coarsest)
-            size = _coded_bytes(lines, lengths, step)
+            step = _smallest_step(partial(_fits, lines, width, aim), finest, coarsest)
+            size = _coded_bytes(lines, width, lengths, step)
             if size <= room:
                 fitting = min(fitting, step)
                 if size >= WITHIN * room or step == finest:
@@ -484,7 +522,7 @@ class SpectralCode(nn.Module):
         return from_spectrum(((wanted + noise) * self.step).T, self.transform).T
 
 
-def check_settings(metric: str, transform: str, chunk: int | str) -> None:
+def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:
     """Refuse settings that no spectral map has."""
     if metric not in get_args(SpectralMetric):
         raise InputError(f"metric {metric!r} is none of a spectral map; expected 'cosine' or 'l2'")
@@ -493,6 +531,8 @@ def check_settings(metric: str, transform: str, chunk: int | str) -> None:
     whole = isinstance(chunk, int) and not isinstance(chunk, bool) and chunk >= 2
     if chunk != "route" and not whole:
         raise InputError(f"chunk is {chunk!r}; expected 'route' or a number of places, at least 2")
+    if not 0 <= resolution < math.inf:
+        raise InputError(f"resolution is {resolution}; expected a number of places, 0 or more")
 
 
 def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
@@ -520,8 +560,8 @@ def _lines(series: Tensor, lengths: list[int], transform: Transform) -> Tensor:
     return torch.cat([spectrum(part.T, transform).T for part in series.split(lengths)])
 
 
-def _coded_bytes(lines: Tensor, lengths: list[int], step: float) -> int:
-    small, escapes = to_int8(quantise(lines, step))
+def _coded_bytes(lines: Tensor, width: Tensor | None, lengths: list[int], step: float) -> int:
+    small, escapes = to_int8(quantise(lines, step, width))
     return escapes.nbytes + sum(len(encode(part).bytes) for part in small.split(lengths))
 
 
@@ -530,14 +570,14 @@ def _steps(lines: Tensor) -> tuple[float, float]:
     return float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
 
 
-def _fits(lines: Tensor, size: float, step: float) -> bool:
+def _fits(lines: Tensor, width: Tensor | None, size: float, step: float) -> bool:
     """Whether the levels' entropy is at most so many bytes."""
-    return entropy_bytes(quantise(lines, step)) <= size
+    return entropy_bytes(quantise(lines, step, width)) <= size
 
 
-def _held(lines: Tensor, step: float) -> float:
+def _held(lines: Tensor, width: Tensor | None, step: float) -> float:
     """The share of the variance that lines in such steps hold."""
-    error = lines - step * quantise(lines, step)
+    error = lines - step * quantise(lines, step, width)
     return 1 - float(error.square().sum() / lines.square().sum())
 
 

@@ -50,7 +50,7 @@ def storage_curve(
     features = run.reference_features
     order, mixed = shuffled(features, seed)
     kinds = {
-        "map": partial(_coded, run, route, features),
+        "map": partial(_coded, run, route, features, resolution=route.resolution),
         "null": partial(_coded, run, route, mixed, order=order),
         "interpolated": partial(_keyframes, run, route),
     }
@@ -80,16 +80,22 @@ def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float
     energy = (sums / band.bincount().clamp(min=1))[:, band]
     normal = torch.randn(lines.shape, generator=torch.Generator().manual_seed(seed))
     noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.mean.float()
-    mapper = SpectralMapper(None, float(route.steps.mean()), route.chunk, route.transform, route.metric)
+    settings = route.chunk, route.transform, route.metric, route.resolution
+    mapper = SpectralMapper(None, float(route.steps.mean()), *settings)
     streams = [one.packed()["streams"].nbytes for one in (mapper(noise), route)]
     return streams[0] / streams[1]
 
 
 def _coded(
-    run: Localization, route: SpectralMap, features: Tensor, budget: float, order: Tensor | None = None
+    run: Localization,
+    route: SpectralMap,
+    features: Tensor,
+    budget: float,
+    order: Tensor | None = None,
+    resolution: float = 0.0,
 ) -> Iterator[tuple[Match, int]]:
     """Matches on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
-    mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric)
+    mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric, resolution)
     mapper.exact = features.numel() < SMALL
     model = with_mapper(run.model, mapper)
     try:

@@ -252,7 +252,7 @@ def make_map(task: PlaceRecognitionTask) -> None:
         features = stored_features(task, model.describe)
         if whitening is not None:
             torch.manual_seed(whitening.seed)
-            views = views_of(task, whitening.views, whitening.most_views)
+            views = views_of(task, whitening.copies(*features.shape), whitening.most_views)
             whitening.learn(features, ((view, places[:, 0]) for view, places in views))
         model.learn_features(model.whitened(features), task.data.reference)
 

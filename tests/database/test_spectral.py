@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.spectral import SpectralCode, SpectralMap, SpectralMapper, quantise
-from dejavu_torch.database.spectrum import from_spectrum, spectrum
+from dejavu_torch.database.spectral import SpectralCode, SpectralMap, SpectralMapper, dead_zone, quantise
+from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer
 
 
@@ -39,7 +39,7 @@ SETTINGS: list[dict[str, Any]] = [
     {"metric": "l2"},
     {"transform": "dct"},
     {"chunk": 64},
-    {"chunk": 150, "transform": "dct", "metric": "l2"},
+    {"chunk": 150, "transform": "dct", "metric": "l2", "resolution": 4.0},
 ]
 
 
@@ -94,7 +94,8 @@ class Named(ArrayTraverse):
         super().__init__(values)
         draw = torch.randint(10**9, (len(values), 3), generator=torch.Generator().manual_seed(0)).tolist()
         self.names = [
-            f"{a}-{b}-{c}.png" if random else f"{40 * i + (a % 8 == 0)}.png" for i, (a, b, c) in enumerate(draw)
+            f"{a}-{b}-{c}.png" if random else f"{40 * i + (a % 8 == 0)}.png"
+            for i, (a, b, c) in enumerate(draw)
         ]
 
     def frame_name(self, i: int) -> str:
@@ -179,6 +180,48 @@ def test_at_equal_error_the_file_grows_by_the_logarithm_of_the_cycles() -> None:
         sizes[cycles], counts[cycles] = learned.summary().route_bytes, learned.summary().lines
     assert counts[10] == counts[1000] == 24
     assert sizes[1000] <= sizes[10] + 64 + 24 * math.log2(1000 * 20) / 8 * 2
+
+
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_resolution_takes_bytes_from_what_changes_from_frame_to_frame(transform: Transform) -> None:
+    slow = torch.randn(600, 4).cumsum(0)
+    series = slow / slow.std() + 0.5 * torch.randn(600, 4)
+    even, wide = (SpectralMapper(1.0, transform=transform, resolution=r)(series) for r in (0.0, 8.0))
+    assert wide.summary().route_bytes <= 600
+    fast = [int((one.line >= 300).sum()) for one in (even, wide)]
+    assert fast[1] < fast[0] / 2
+    below = 600 // 4  # lines of periods of 8 places and more
+    error = [spectrum((held(one) - series).T, transform)[:, :below].square().sum() for one in (even, wide)]
+    assert error[1] < error[0]
+
+
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_at_the_resolution_the_dead_zone_is_twice_as_wide(transform: Transform) -> None:
+    """Waves of one period each, whose lines are 1.2 dead zones high."""
+    time = torch.arange(96, dtype=torch.float64)
+    phase = 0.5 if transform == "dct" else 0.0
+    kept = []
+    for period in (48, 24, 12, 8, 4):
+        wave = (2 * math.pi * (time + phase) / period).cos()[:, None]
+        height = float(spectrum(wave.T, transform).abs().max())
+        route = SpectralMapper(None, step=height / 0.65 / 1.2, resolution=8.0, transform=transform)(wave)
+        kept.append(len(route.value))
+    assert kept == [1, 1, 0, 0, 0]  # dead zones 1.03, 1.11, 1.44, 2 and 5 times as wide
+
+
+def test_resolution_is_kept_and_extends_alike() -> None:
+    descriptors = route(300)
+    mapper = SpectralMapper(None, step=0.3, chunk=100, resolution=6.0)
+    grown = mapper(descriptors[:200])
+    again = mapper.empty()
+    again.load_state_dict({**again.unpacked(grown.packed()), "_extra_state": grown.get_extra_state()})
+    again.extend(descriptors[200:])
+    assert again.resolution == 6.0
+    assert torch.equal(again.levels[:200], grown.levels)
+    lines = spectrum((descriptors[200:] - grown.mean.float()).T).T
+    levels = [quantise(lines, 0.3, dead_zone([100], r, "dft")).to(torch.int8) for r in (6.0, 0.0)]
+    assert torch.equal(again.levels[200:], levels[0])
+    assert not torch.equal(levels[0], levels[1])
 
 
 def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period() -> None:
@@ -312,6 +355,8 @@ def test_the_map_is_exported(transform: Any) -> None:
         ({"chunk": "all"}, ("'all'", "'route'")),
         ({"transform": "fft"}, ("'fft'", "'dct'")),
         ({"metric": "l1"}, ("'l1'", "'cosine' or 'l2'")),
+        ({"resolution": -1.0}, ("resolution is -1.0", "0 or more")),
+        ({"resolution": math.nan}, ("resolution is nan", "0 or more")),
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, Any], words: tuple[str, ...]) -> None:
