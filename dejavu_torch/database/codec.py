@@ -27,14 +27,22 @@ class Stream(NamedTuple):
 
 
 def encode(levels: Tensor) -> Stream:
-    """Compress integer levels, row by row, with LZMA.
+    """Compress integer levels: which of them are not 0, their signs, and their magnitudes, with LZMA.
 
     Shape: (W,K) int8 -> (n,) uint8.
+
+    Convention: which are not 0 is a bit each, in bytes of eight columns; those of the first eight columns
+        come first, row by row. Most bytes are then one of few, and neighbours are alike.
     """
-    plain = levels.detach().cpu().contiguous().numpy().tobytes()
+    whole = levels.detach().cpu().contiguous().numpy()
+    kept = whole != 0
+    values = whole[kept]
+    marks = np.packbits(kept, axis=1).T.tobytes()
+    sizes = (np.abs(values.astype(np.int16)) - 1).astype(np.uint8)
+    plain = marks + np.packbits(values > 0).tobytes() + sizes.tobytes()
     filters = [{**FILTERS[0], "dict_size": max(4096, len(plain))}]  # the same bytes, sooner
     packed = lzma.compress(plain, format=lzma.FORMAT_RAW, filters=filters)
-    return Stream(torch.from_numpy(np.frombuffer(packed, np.uint8).copy()), zlib.crc32(plain))
+    return Stream(torch.from_numpy(np.frombuffer(packed, np.uint8).copy()), zlib.crc32(whole.tobytes()))
 
 
 def decode(stream: Stream, rows: int, columns: int) -> Tensor:
@@ -43,20 +51,37 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
     Raises:
         InputError: a truncated or altered stream, one of another size, or more than the memory holds.
     """
-    count, problem = rows * columns, ""
+    count, problem, whole = rows * columns, "", b""
     if count * NUMBER > memory():
         raise InputError(f"the map claims {rows} x {columns} levels; expected what fits into the memory")
     try:
         decompressor = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=FILTERS)
-        plain = decompressor.decompress(stream.bytes.numpy().tobytes(), count + 1)
-    except (lzma.LZMAError, MemoryError) as error:
-        plain, problem = b"", str(error)
-    if len(plain) != count or zlib.crc32(plain) != stream.checksum:
-        seen = problem or f"{len(plain)} levels of checksum {zlib.crc32(plain)}"
+        longest = -(-columns // 8) * rows + -(-count // 8) + count
+        plain = decompressor.decompress(stream.bytes.numpy().tobytes(), longest + 1)
+        whole = _levels(np.frombuffer(plain, np.uint8), rows, columns)
+    except (lzma.LZMAError, MemoryError, ValueError) as error:
+        problem = str(error)
+    if problem or zlib.crc32(whole) != stream.checksum:
+        seen = problem or f"levels of checksum {zlib.crc32(whole)}"
         raise InputError(
-            f"the coded lines are truncated or altered: {seen}; expected {count} of {stream.checksum}"
+            f"the coded lines are truncated or altered: {seen}; expected {count} levels of {stream.checksum}"
         )
-    return torch.from_numpy(np.frombuffer(plain, np.int8).reshape(rows, columns).copy())
+    return torch.from_numpy(np.frombuffer(whole, np.int8).reshape(rows, columns).copy())
+
+
+def _levels(plain: np.ndarray, rows: int, columns: int) -> bytes:
+    """What `encode` packed, as int8 row by row; ValueError where there are more or fewer bytes."""
+    marks, rest = np.split(plain, [-(-columns // 8) * rows])
+    kept = np.unpackbits(marks.reshape(-1, rows).T, axis=1, count=columns).astype(bool)
+    number = int(kept.sum())
+    signs, sizes = np.split(rest, [-(-number // 8)])
+    if len(sizes) != number:
+        raise ValueError(f"{len(sizes)} magnitudes of {number} levels")
+    positive = np.unpackbits(signs, count=number).astype(bool)
+    magnitudes = sizes.astype(np.int16) + 1
+    levels = np.zeros((rows, columns), np.int8)
+    levels[kept] = np.where(positive, magnitudes, -magnitudes)
+    return levels.tobytes()
 
 
 def to_int8(levels: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,7 @@ FINEST = 64  # steps in an RMS line at most: a finer step changes no score
 STRONGEST = 10  # periods that a summary names
 CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and checksum in the file
 WITHIN = 0.98  # of the budget is near enough
-CODED = 1.13  # bytes that the codec needs for one of entropy, measured
+CODED = 1.04  # bytes that the codec needs for one of entropy, measured
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
 LINE_COST = 60  # of a coded line in a query's sum
