@@ -94,7 +94,8 @@ class Named(ArrayTraverse):
         super().__init__(values)
         draw = torch.randint(10**9, (len(values), 3), generator=torch.Generator().manual_seed(0)).tolist()
         self.names = [
-            f"{a}-{b}-{c}.png" if random else f"{40 * i + (a % 8 == 0)}.png" for i, (a, b, c) in enumerate(draw)
+            f"{a}-{b}-{c}.png" if random else f"{40 * i + (a % 8 == 0)}.png"
+            for i, (a, b, c) in enumerate(draw)
         ]
 
     def frame_name(self, i: int) -> str:
