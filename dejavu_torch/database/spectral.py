@@ -467,7 +467,7 @@ class SpectralMapper(Mapper):
         if room <= 0 or self.route_bytes_per_place > 4 * numbers:
             raise InputError(
                 f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
-                f"{overhead / places:.3g}, which names, the mean and the table of chunks take, and at most "
+                f"{overhead / places:.3g}, which the mean, the table of chunks and names take, and at most "
                 f"{4 * numbers}, {numbers} numbers as floats"
             )
         finest, coarsest = _steps(lines)

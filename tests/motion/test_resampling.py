@@ -13,6 +13,8 @@ from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.positions import place_of
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 
@@ -91,6 +93,18 @@ def test_a_map_learned_from_features_takes_queries_as_they_are() -> None:
     assert model.step is None
     assert len(model.map.positions) == 0
     assert len(model.localize(footage(QUERY)).index) == len(QUERY)
+
+
+def test_positions_count_in_the_budget_of_a_map() -> None:
+    mapper = SpectralMapper(12.0)
+    model = DejaVu(whitening=Whitening(views=2), mapper=mapper, velocity=camera()).learn(footage(REFERENCE))
+    summary = model.summary()
+    taken = summary.route["positions"]
+    assert taken == 4 * len(REFERENCE)
+    assert 0.98 * 12 <= summary.route_bytes / 101 <= 12
+    # a null has no positions, nor their bytes
+    null = model.map.mapper_of_equal_size()(torch.randn(101, model.map.dimension)).summary()
+    assert null.route_bytes == pytest.approx(summary.route_bytes - taken, rel=0.03)
 
 
 def test_ready_features_cannot_be_resampled() -> None:
