@@ -12,7 +12,7 @@ import torch
 
 from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
 from dejavu_torch.cli import commands, train
-from dejavu_torch.cli.parser import UsageError, command_parser
+from dejavu_torch.cli.parser import UsageError, command_parser, without_whitening_map
 from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features.cnn import SmallCNN
 
@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 TRAINING = (ROOT / "docs" / "training.md").read_text()
 ROUTES = (ROOT / "docs" / "real_routes.md").read_text()
+SPECTRAL = (ROOT / "docs" / "spectral_maps.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 OPTIONS = [
     option
@@ -74,6 +75,7 @@ def understand(line: str) -> None:
         patch.chdir(ROOT)  # where the configs lie
         words = with_configs(words)
         if name != "train":
+            words, _ = without_whitening_map(words)
             command_parser(name, getattr(commands, f"run_{name}")).parse_args(words)
             return
         patch.setattr(train, "TrainCLI", ParseOnly)
@@ -81,13 +83,28 @@ def understand(line: str) -> None:
             train.run_train(words)
 
 
-@pytest.mark.parametrize("text", [README, TRAINING, ROUTES], ids=["README", "training", "real_routes"])
+@pytest.mark.parametrize(
+    "text", [README, TRAINING, ROUTES, SPECTRAL], ids=["README", "training", "real_routes", "spectral_maps"]
+)
 def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
     shown += [line for line in re.findall(r"`(dejavu [^`]+)`", text) if " -" in line and "--help" not in line]
-    assert len(shown) >= 4
+    assert len(shown) >= 3
     for line in shown:
         understand(line)
+
+
+def test_lines_over_cycles_are_those_of_the_code_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    (shown,) = re.findall(r"```python\n(.*?)```", SPECTRAL, re.DOTALL)
+    exec(shown, {})
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    rows = [
+        line.strip("| ").split(" | ") for line in SPECTRAL.splitlines() if line.startswith(("| dft", "| dct"))
+    ]
+    assert len(rows) == len(printed) == 12
+    for row, line in zip(rows, printed, strict=True):
+        assert row[:3] == line[:3]
+        assert [float(cell) for cell in row[3:]] == pytest.approx([float(cell) for cell in line[3:]], rel=0.1)
 
 
 def test_the_text_on_training_names_options() -> None:

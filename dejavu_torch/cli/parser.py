@@ -147,7 +147,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         InputError: what the constructor of a part refuses.
     """
     parser = command_parser(name, function)
-    words, whitening = _without_whitening_map(words) if MODEL in function.__annotations__ else (words, None)
+    words, whitening = without_whitening_map(words) if MODEL in function.__annotations__ else (words, None)
     try:
         parsed = parser.parse_args(list(words))
     except UsageError as error:
@@ -200,7 +200,7 @@ def _of_another_mapper(parser: Parser, words: Sequence[str]) -> str | None:
     return None
 
 
-def _without_whitening_map(words: Sequence[str]) -> tuple[list[str], Path | None]:
+def without_whitening_map(words: Sequence[str]) -> tuple[list[str], Path | None]:
     """The words without `--whitening MAP`, and the map."""
     kept: list[str] = []
     whitening = None
