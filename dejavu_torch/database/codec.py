@@ -15,8 +15,18 @@ from torch import Tensor
 from dejavu_torch.types import InputError
 
 ESCAPE = -128  # stands for a level that int8 does not hold
-FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0}]
-NUMBER = 6  # bytes that a level takes while a map is loaded: itself, and a float32 with its norm
+WINDOW = 2**26  # bytes that LZMA looks back, both when it packs and when it unpacks
+FILTERS = [
+    {
+        "id": lzma.FILTER_LZMA2,
+        "preset": 9 | lzma.PRESET_EXTREME,
+        "lc": 0,
+        "lp": 0,
+        "pb": 0,
+        "dict_size": WINDOW,
+    }
+]
+LEVEL = 16  # bytes that a level takes while it is decoded
 
 
 class Stream(NamedTuple):
@@ -40,7 +50,7 @@ def encode(levels: Tensor) -> Stream:
     marks = np.packbits(kept, axis=1).T.tobytes()
     sizes = (np.abs(values.astype(np.int16)) - 1).astype(np.uint8)
     plain = marks + np.packbits(values > 0).tobytes() + sizes.tobytes()
-    filters = [{**FILTERS[0], "dict_size": max(4096, len(plain))}]  # the same bytes, sooner
+    filters = [{**FILTERS[0], "dict_size": min(max(4096, len(plain)), WINDOW)}]  # the same bytes, sooner
     packed = lzma.compress(plain, format=lzma.FORMAT_RAW, filters=filters)
     return Stream(torch.from_numpy(np.frombuffer(packed, np.uint8).copy()), zlib.crc32(whole.tobytes()))
 
@@ -52,14 +62,13 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
         InputError: a truncated or altered stream, one of another size, or more than the memory holds.
     """
     count, problem, whole = rows * columns, "", b""
-    if count * NUMBER > memory():
-        raise InputError(f"the map claims {rows} x {columns} levels; expected what fits into the memory")
+    check_claim(rows, columns)
     try:
         decompressor = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=FILTERS)
         longest = -(-columns // 8) * rows + -(-count // 8) + count
         plain = decompressor.decompress(stream.bytes.numpy().tobytes(), longest + 1)
         whole = _levels(np.frombuffer(plain, np.uint8), rows, columns)
-    except (lzma.LZMAError, MemoryError, ValueError) as error:
+    except (lzma.LZMAError, MemoryError, OverflowError, ValueError) as error:
         problem = str(error)
     if problem or zlib.crc32(whole) != stream.checksum:
         seen = problem or f"levels of checksum {zlib.crc32(whole)}"
@@ -69,9 +78,24 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
     return torch.from_numpy(np.frombuffer(whole, np.int8).reshape(rows, columns).copy())
 
 
+def check_claim(rows: int, columns: int) -> None:
+    """Refuse, before anything is made, more levels than the memory holds, or none.
+
+    Raises:
+        InputError: naming both.
+    """
+    if min(rows, columns) < 1 or rows * columns * LEVEL > memory():
+        raise InputError(
+            f"the map claims {rows} x {columns} levels; expected at least one, and what fits into the memory"
+        )
+
+
 def _levels(plain: np.ndarray, rows: int, columns: int) -> bytes:
     """What `encode` packed, as int8 row by row; ValueError where there are more or fewer bytes."""
-    marks, rest = np.split(plain, [-(-columns // 8) * rows])
+    marked = -(-columns // 8) * rows
+    marks, rest = np.split(plain, [marked])
+    if len(marks) != marked:
+        raise ValueError(f"{len(marks)} bytes of marks, expected {marked}")
     kept = np.unpackbits(marks.reshape(-1, rows).T, axis=1, count=columns).astype(bool)
     number = int(kept.sum())
     signs, sizes = np.split(rest, [-(-number // 8)])

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.database.codec import Stream, decode, encode, entropy_bytes, from_int8, to_int8
+from dejavu_torch.database.codec import Stream, check_claim, decode, encode, entropy_bytes, from_int8, to_int8
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.spectrum import Transform, from_spectrum, period_of, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
@@ -46,8 +46,8 @@ def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -
     return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
 
 
-def dead_zone(lengths: list[int], resolution: float, transform: Transform) -> Tensor | None:
-    """By how much the dead zone of each line is wider than that of line 0, for chunks of these lengths.
+def dead_zone(lines: Tensor, lengths: list[int], resolution: float, transform: Transform) -> Tensor | None:
+    """By how much the dead zone of each of (N,K) lines, of chunks of these lengths, is wider than line 0's.
 
     That of a line of period P is 1 + (resolution / P)^2 times as wide: it costs as many bits as a slow one,
     and tells nothing of where one is but within P places.
@@ -59,7 +59,7 @@ def dead_zone(lengths: list[int], resolution: float, transform: Transform) -> Te
         return None
     # line r has r half cycles (DCT), or of pairs of a cosine and a sine as many cycles (DFT)
     halves = [torch.arange(n) if transform == "dct" else (torch.arange(n) + 1) // 2 * 2 for n in lengths]
-    inverse = torch.cat([r / (2 * n) for r, n in zip(halves, lengths, strict=True)])
+    inverse = torch.cat([r / (2 * n) for r, n in zip(halves, lengths, strict=True)]).to(lines)
     return (1 + (resolution * inverse).square())[:, None]
 
 
@@ -241,7 +241,7 @@ class SpectralMap(PlaceMap):
         check_descriptors(features, self.dimension)
         lengths = _lengths(len(features), self.chunk)
         lines = _lines(features - self.mean.float(), lengths, self.transform)
-        width = dead_zone(lengths, self.resolution, self.transform)
+        width = dead_zone(lines, lengths, self.resolution, self.transform)
         small, escapes = to_int8(quantise(lines, self.steps[-1], width))
         self.levels = torch.cat([self.levels, small])
         self.escapes = torch.cat([self.escapes, escapes])
@@ -276,6 +276,7 @@ class SpectralMap(PlaceMap):
         sizes = table[:, 0].tolist()
         if min(sizes) < 0 or sum(sizes) != len(streams) or int(lengths.min()) < 1:
             raise InputError(f"the coded lines are {len(streams)} bytes; the table claims {sum(sizes)}")
+        check_claim(sum(lengths.tolist()), columns)
         parts = zip(streams.split(sizes), lengths.tolist(), table[:, 1].tolist(), strict=True)
         state["levels"] = torch.cat([decode(Stream(part, sum_), rows, columns) for part, rows, sum_ in parts])
         return state
@@ -350,7 +351,7 @@ class SpectralMapper(Mapper):
     Args:
         route_bytes_per_place: what the map may take for each place, without what does not grow with the
             route; the step is chosen so that its coded lines fit. Names and positions of frames count, but
-            come on top where they alone take over half of it.
+            come on top, and a line says so, where they would leave the lines less than half.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -412,9 +413,9 @@ class SpectralMapper(Mapper):
         scale = float(lines.square().mean().sqrt())
         if not scale > 1e-6 * float(features.square().mean().sqrt()):
             raise InputError(f"the {len(features)} descriptors are all alike; expected a route that changes")
-        overhead = self.taken + mean.nbytes + CHUNK_BYTES * len(lengths)
-        width = dead_zone(lengths, self.resolution, self.transform)
-        width = None if width is None else width.to(lines)
+        overhead = mean.nbytes + CHUNK_BYTES * len(lengths)
+        overhead += self._within(len(features), overhead)
+        width = dead_zone(lines, lengths, self.resolution, self.transform)
         step = self._step(lines, width, lengths, overhead) if self.step is None else self.step
         small, escapes = to_int8(quantise(lines, step, width))
         steps = features.new_full((len(lengths),), step)
@@ -443,34 +444,37 @@ class SpectralMapper(Mapper):
         return SpectralMap(None, None, None, None, None, *settings)
 
     def beside(self, taken: int, places: int) -> SpectralMapper:
-        """See `Mapper`; what takes over half of the budget comes on top of it, and a line says so."""
-        budget = self.route_bytes_per_place
-        if budget is None or not taken:
-            return self
-        if taken > budget * places / 2:
-            log.warning(
-                "names and positions of frames take %.3g bytes per place, over half of "
-                "route_bytes_per_place=%g: they come on top of it",
-                taken / places,
-                budget,
-            )
-            return self
         other = copy.copy(self)
         other.taken = taken
         return other
+
+    def _within(self, places: int, overhead: int) -> int:
+        """What is taken beside the map, where it counts: over half of the lines' room comes on top of it."""
+        if self.route_bytes_per_place is None or not self.taken:
+            return 0
+        if self.taken <= (self.route_bytes_per_place * places - overhead) / 2:
+            return self.taken
+        log.warning(
+            "names and positions of frames take %.3g bytes per place, over half of what "
+            "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
+            self.taken / places,
+            self.route_bytes_per_place,
+        )
+        return 0
 
     def _step(self, lines: Tensor, width: Tensor | None, lengths: list[int], overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %."""
         assert self.route_bytes_per_place is not None
         places, numbers = lines.shape
+        finest, coarsest = _steps(lines)
         room = self.route_bytes_per_place * places - overhead
-        if room <= 0 or self.route_bytes_per_place > 4 * numbers:
+        least = _coded_bytes(lines, width, lengths, coarsest)  # none of them
+        if room <= least or self.route_bytes_per_place > 4 * numbers:
             raise InputError(
                 f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
-                f"{overhead / places:.3g}, which the mean, the table of chunks and names take, and at most "
-                f"{4 * numbers}, {numbers} numbers as floats"
+                f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
+                f"and at most {4 * numbers}, {numbers} numbers as floats"
             )
-        finest, coarsest = _steps(lines)
         if not self.exact:
             return _smallest_step(partial(_fits, lines, width, room / CODED), finest, coarsest)
         aim, fitting = room, coarsest

@@ -89,7 +89,8 @@ def compare(
         interpolate: see `find_ground_truth`.
         second: see `DejaVu.describe_reference`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
-            in tables; none of them resamples.
+            in tables. They are scored by their matches, so only where there is a truth; none of them
+            resamples.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -135,11 +136,13 @@ def compare(
     run = Localization(model, reference, query, places, queries, match, known, tolerance)
     contenders = _contenders(run, seed, leave_out, progress)
     for key, (name, other) in (others or {}).items():
-        contenders[key] = _learned_beside(run, name, other)
+        if known is not None:
+            contenders[key] = _learned_beside(run, name, other)
     storage, noise = None, {}
     if isinstance(model.map, SpectralMap) and contenders["map"].scores is not None:
         storage = storage_curve(run, seed=seed, progress=progress)
-        noise = {"noise_over_map": noise_over_map(model.map, places, seed)}
+        if model.map.chunk == "route":
+            noise = {"noise_over_map": noise_over_map(model.map, places, seed)}
     pictures = draw_pictures(run, contenders, storage)
     carried = all(source_of(one).place is not None for one in (reference, query))
     facts = {

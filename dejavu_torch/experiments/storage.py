@@ -68,11 +68,11 @@ def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float
     """Bytes of noise that is as smooth as the route, coded in the map's steps, over those of the map.
 
     The noise is Gaussian with the spectrum of each number of the descriptor, its energy averaged over half
-    octaves: nothing in it repeats. What a map takes less than this it owes to repetition, all else to
-    smoothness.
+    octaves: nothing in it repeats. What the map takes less than this is the most that it can owe to
+    repetition, and all else it owes to smoothness; a trend, or a stretch quieter than others, saves too.
 
     Args:
-        route: the map. features: (N,K) the descriptors that it holds. seed: of the noise.
+        route: the map, of one chunk. features: (N,K) the descriptors that it holds. seed: of the noise.
     """
     lines = spectrum((features.float() - route.mean.float()).T, route.transform)
     band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).log2()).long()

@@ -19,6 +19,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.mapfile import FORMAT
 from dejavu_torch.database.recipe import Recipe
 from dejavu_torch.database.recipe import recipe_of as recipe_in
 from dejavu_torch.database.template_map import TemplateMapper
@@ -231,7 +232,7 @@ def test_the_claimed_size_holds_with_any_features(path: Path, features: nn.Modul
 
 def test_metadata_names_format_version_and_config(saved: Path) -> None:
     tensors, metadata = contents(saved)
-    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", 4)
+    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", FORMAT)
     assert tensors["map.layers"].tolist() == [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
     config = json.loads(metadata["config"])
     assert config["features"]["class_path"] == "HOG"
@@ -324,14 +325,14 @@ def test_a_missing_file_and_a_folder_are_refused(path: Path) -> None:
 
 
 def test_a_newer_format_is_refused(saved: Path) -> None:
-    craft(saved, metadata={"version": "5"})
-    with refused(str(saved), "format 5", "reads 4", "newer"):
+    craft(saved, metadata={"version": str(FORMAT + 1)})
+    with refused(str(saved), f"format {FORMAT + 1}", f"reads {FORMAT}", "newer"):
         DejaVu.load(saved)
 
 
 def test_a_map_of_an_unreleased_format_is_refused(saved: Path) -> None:
     craft(saved, metadata={"version": "3"})
-    with refused(str(saved), "format 3", "reads 4", "learn"):
+    with refused(str(saved), "format 3", f"reads {FORMAT}", "learn"):
         DejaVu.load(saved)
 
 

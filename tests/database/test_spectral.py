@@ -103,7 +103,7 @@ class Named(ArrayTraverse):
 
 
 @pytest.mark.parametrize("places", [111, 1000])
-@pytest.mark.parametrize("budget", [2.5, 5.0])
+@pytest.mark.parametrize("budget", [4.0, 6.0])
 def test_names_count_in_the_budget(
     places: int, budget: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -130,6 +130,26 @@ def test_names_of_over_half_of_the_budget_come_on_top(caplog: pytest.LogCaptureF
     assert summary.route["names"] > 5 * 400
     rest = summary.route_bytes - summary.route["names"]
     assert rest == DejaVu(whitening="none").learn(features).summary().route_bytes <= 5 * 400
+
+
+def test_names_leave_the_lines_half_of_what_mean_and_chunks_leave(caplog: pytest.LogCaptureFixture) -> None:
+    """Of 5 bytes per place the chunks take over 2: with names of 2 more next to nothing would fit."""
+    mapper, features = SpectralMapper(5.0, chunk=12), route(400, 24)
+    alone = mapper(features).summary()
+    beside = mapper.beside(800, 400)(features).summary()
+    assert "come on top" in caplog.messages[-1]
+    assert beside.lines == alone.lines > 0
+
+
+def test_a_budget_that_no_line_fits_in_is_refused() -> None:
+    descriptors = route(60, 15)
+    nothing = SpectralMapper(None, step=1e9)(descriptors).summary()
+    assert nothing.lines == 0
+    with refused(f"expected more than {nothing.route_bytes / 60:.3g}"):
+        SpectralMapper(nothing.route_bytes / 60)(descriptors)
+    learned = SpectralMapper(nothing.route_bytes / 60 + 0.2)(descriptors).summary()
+    assert learned.lines > 0
+    assert learned.route_bytes <= nothing.route_bytes + 0.2 * 60
 
 
 def test_more_bytes_hold_more_of_the_route() -> None:
@@ -219,7 +239,7 @@ def test_resolution_is_kept_and_extends_alike() -> None:
     assert again.resolution == 6.0
     assert torch.equal(again.levels[:200], grown.levels)
     lines = spectrum((descriptors[200:] - grown.mean.float()).T).T
-    levels = [quantise(lines, 0.3, dead_zone([100], r, "dft")).to(torch.int8) for r in (6.0, 0.0)]
+    levels = [quantise(lines, 0.3, dead_zone(lines, [100], r, "dft")).to(torch.int8) for r in (6.0, 0.0)]
     assert torch.equal(again.levels[200:], levels[0])
     assert not torch.equal(levels[0], levels[1])
 
