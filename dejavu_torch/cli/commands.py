@@ -88,7 +88,7 @@ def run_learn(
     traverse, views = _with_second(model, traverse, second, second_truth)
     model.learn(traverse, progress=True, second=views)
     model.save(map)
-    _print_map(model)
+    print_map(model)
     if model.map.summary().covered:
         _print_next("localize", map, "QUERY", "--out", "matches.csv")
     else:
@@ -304,7 +304,7 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
     from dejavu_torch.periods.stft import BACKEND
 
     model = DejaVu.load(map, features)
-    _print_map(model)
+    print_map(model)
     if model.frame_shape is not None:
         kind = "frames of " if len(model.frame_shape) == 3 else "ready features, "
         print(f"learned from {kind}{' x '.join(str(n) for n in model.frame_shape)}")
@@ -356,7 +356,8 @@ def _print_steps(traverse: Traverse) -> None:
         print(f"{len(traverse.positions)} frames make {traverse.length} {steps}")
 
 
-def _print_map(model: DejaVu) -> None:
+def print_map(model: DejaVu) -> None:
+    """What a map holds, and what it would need where that is next to nothing."""
     summary = model.summary()
     if not summary.covered:
         print("this route does not repeat")
@@ -382,7 +383,7 @@ def _publish(result: Comparison, out: Path, title: str, command: str, given: Pat
     from dejavu_torch.evaluation.report import write_report
 
     run, kept = result.run, out / "map.safetensors"
-    _print_map(run.model)
+    print_map(run.model)
     if run.truth is None:
         print("nothing tells which places are right, see --truth: matches and pictures, no scores")
     make_output_folder(out)

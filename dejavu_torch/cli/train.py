@@ -15,9 +15,9 @@ from pytorch_lightning import Trainer
 from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
+from dejavu_torch.cli.commands import print_map
 from dejavu_torch.cli.parser import Parser, refusal
 from dejavu_torch.data.files import check_output_folder, make_output_folder, remove_empty_folders
-from dejavu_torch.database.summary import describe
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport, load_weights
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask
@@ -82,8 +82,8 @@ class MapTrainer(Trainer):
         if model.made:  # of the frames of the reference
             self.strategy.connect(model)
             model.trainer, self.datamodule, datamodule.trainer = self, datamodule, self
-            datamodule.setup("fit")
-            model.setup("fit")
+            datamodule.setup("export")
+            model.setup("export")
             model.relearn()
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
@@ -228,8 +228,9 @@ class TrainCLI(LightningCLI):
 def print_written(export: MapExport, data: RouteData) -> None:
     """What was written, and what to do next."""
     if export.written is not None:
-        path, summary = export.written
-        print(f"{describe(summary)}\nwritten to {path}; only a second traverse shows what it is worth:")
+        path, model = export.written
+        print_map(model)
+        print(f"written to {path}; only a second traverse shows what it is worth:")
         print_next(path, data)
 
 

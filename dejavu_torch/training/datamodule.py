@@ -175,7 +175,8 @@ class RouteData(LightningDataModule):
                 [values], as_ground_truth(torch.arange(len(values))[:, None])
             )
         needed = {"fit": ("second", "validation"), "validate": ("validation",), "test": ("query",)}
-        for name in needed.get(stage, ()):
+        also = ("second",) if getattr(task, "made", False) else ()  # its map is made anew, whatever the stage
+        for name in (*also, *needed.get(stage, ())):
             if self.sources[name] is not None and name not in self.sets:
                 self.sets[name] = self._read(name)
         if stage == "test" and "query" not in self.sets:

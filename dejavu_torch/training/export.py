@@ -10,7 +10,7 @@ import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
-from dejavu_torch.database.summary import MapSummary
+from dejavu_torch.model import DejaVu
 from dejavu_torch.training.task import PlaceRecognitionTask
 from dejavu_torch.types import InputError
 
@@ -39,7 +39,7 @@ class MapExport(Callback):
     def __init__(self, name: str = "map.safetensors") -> None:
         self.name = name
         self.began: int | None = None
-        self.written: tuple[Path, MapSummary] | None = None
+        self.written: tuple[Path, DejaVu] | None = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Note the step that a checkpoint brought."""
@@ -81,7 +81,7 @@ class MapExport(Callback):
             return
         folder.mkdir(parents=True, exist_ok=True)
         model.save(folder / self.name)
-        self.written = (folder / self.name, model.summary())
+        self.written = (folder / self.name, model)
 
 
 class LastCheckpoint(Checkpoint):

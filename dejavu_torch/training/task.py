@@ -25,7 +25,7 @@ from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.features.whitening import STRENGTHS, Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
@@ -68,7 +68,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         mapper: makes the map; the temperature of a TemplateMapper is where the trained one starts, 0.03 where
             it is None. None is `TemplateMapper(ImposedPeriods(), temperature=0.03)`.
         whitening: of the descriptor, ahead of a map that is made of it; it learns from views under the
-            training's augmentation and of the second traverse. None is as in `DejaVu`.
+            training's augmentation and of the second traverse, its `strengths` count for nothing. None and
+            "none" are as in `DejaVu`.
         preprocess: as in `DejaVu`.
         feature_weights: learn what a difference in each feature counts, at least 0.
         descriptor: share of the steps in which the network of an `Embedding` with a hidden layer learns its
@@ -98,7 +99,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self,
         backbone: nn.Module | None = None,
         mapper: Mapper | None = None,
-        whitening: Whitening | None = None,
+        whitening: Whitening | Literal["none"] | None = None,
         preprocess: Preprocess | None = None,
         feature_weights: bool = False,
         descriptor: float = DESCRIPTOR,
@@ -127,11 +128,16 @@ class PlaceRecognitionTask(pl.LightningModule):
         changed = {"feature_weights": feature_weights, "descriptor": descriptor != DESCRIPTOR}
         changed |= {"refresh": refresh > 0, "losses": losses is not None}
         lost = [name for name, is_changed in changed.items() if is_changed] if self.made else []
-        lost += ["whitening"] if whitening is not None and not self.made else []
+        lost += ["whitening"] if isinstance(whitening, Whitening) and not self.made else []
         if lost:
             raise InputError(
                 f"{lost[0]} is given, which does nothing for the map of a {type(mapper).__name__}; expected "
                 "another mapper, or none of it"
+            )
+        if isinstance(whitening, Whitening) and whitening.strengths != STRENGTHS:
+            raise InputError(
+                "whitening.strengths is given, which does nothing in a training; expected the strengths of "
+                "data.augmentation"
             )
         if self.made and isinstance(backbone, Embedding) and has_descriptor(backbone):
             backbone = backbone.without_code()
@@ -199,6 +205,12 @@ class PlaceRecognitionTask(pl.LightningModule):
             raise InputError(
                 f"{self.data.reference.name} holds ready features, and the map of a "
                 f"{type(self.dejavu.mapper).__name__} is not trained; expected frames, or `dejavu learn`"
+            )
+        still = not self.data.augmentation.acts and self.data.sources["second"] is None
+        if self.made and self.dejavu.whitening is not None and still:
+            raise InputError(
+                "data.augmentation changes nothing and there is no data.second: nothing shows the whitening "
+                "what two visits differ in; expected one of them, or model.whitening none"
             )
         if reference.values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")

@@ -87,9 +87,9 @@ def test_a_best_checkpoint_that_is_gone_warns(tmp_path: Path, caplog: pytest.Log
 def test_the_callback_knows_what_it_wrote(tmp_path: Path) -> None:
     running = trainer(tmp_path)
     running.fit(new_task(), data_of())
-    path, summary = running.callbacks[0].written  # type: ignore[attr-defined]
+    path, model = running.callbacks[0].written  # type: ignore[attr-defined]
     assert path == tmp_path / "map.safetensors"
-    assert summary == DejaVu.load(path).summary()
+    assert model.summary() == DejaVu.load(path).summary()
 
 
 def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_path: Path) -> None:

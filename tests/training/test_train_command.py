@@ -233,16 +233,17 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
         assert "lines of their spectra" in said.out
         assert isinstance(DejaVu.load(run / "map.safetensors").map, SpectralMap)
     last = run / "checkpoints" / "last.ckpt"
-    for size in (12, 6):  # the map is made anew of the checkpoint's features
+    for size in (12, 6, 1.5):  # the map is made anew of the checkpoint's features
         options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
+        options += ["--data.validation", "gone.npy"]  # which is not read
         train("export", "--ckpt_path", last, *options)
+        assert ("this route needs about" in capfd.readouterr().out) == (size == 1.5)
     maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("plain", "12", "6")]
     levels = [model.map.levels for model in maps]
     assert torch.equal(levels[0], levels[1])
     assert (levels[2] != 0).sum() < (levels[1] != 0).sum()
     assert maps[1].trained is not None
     assert maps[1].trained.steps == 4
-    capfd.readouterr()
     options = [*chosen, "--trainer.default_root_dir", run, "--ckpt_path", last]
     train("test", *options, "--data.query", "two.npy")
     match = maps[0].localize(ArrayTraverse(footage(0.1)))
@@ -253,6 +254,12 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
     assert {name: float(value) for name, value in rows.items()} == pytest.approx(
         {f"test/{name}": figure for name, figure in scores._asdict().items()}, abs=1e-6
     )
+
+
+def test_a_spectral_map_without_whitening(folder: Path, tmp_path: Path) -> None:
+    chosen = ["--model.mapper", "SpectralMapper", "--model.whitening", "none"]
+    train("fit", *chosen, "--trainer.default_root_dir", tmp_path)
+    assert DejaVu.load(tmp_path / "map.safetensors").whitening is None
 
 
 def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:

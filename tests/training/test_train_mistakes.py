@@ -37,6 +37,7 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
         ("fit", [*SPECTRAL, "--model.backbone", "HOG"], ["nothing of HOG", "dejavu learn"]),
         ("fit", [*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["'periods' is not accepted"]),
         ("fit", [*SPECTRAL, "--model.mapper.route_bytes_per_place", "0"], ["route_bytes_per_place is 0"]),
+        ("fit", [*SPECTRAL, "--model.whitening.strengths.noise", "0.1"], ["strengths", "data.augmentation"]),
         ("fit", [*SPECTRAL, *ANOTHER], ["of ['CodeStage']", "['DescriptorStage']"]),
         ("export", [*SPECTRAL, *ANOTHER], ["of ['CodeStage']", "['DescriptorStage']"]),
         ("fit", ["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
