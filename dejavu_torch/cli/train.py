@@ -174,10 +174,11 @@ class TrainCLI(LightningCLI):
     def fit(self, **arguments: Any) -> None:
         """Train, and print what was written, also where the user interrupts."""
         root = Path(self.trainer.default_root_dir)
-        new = not root.exists()
+        new, refused = not root.exists(), False
         try:
             self.trainer.fit(**arguments)
         except InputError:
+            refused = True
             if new:
                 remove_empty_folders(root)
             raise
@@ -186,7 +187,7 @@ class TrainCLI(LightningCLI):
                 if isinstance(callback, MapExport):
                     print_written(callback, self.datamodule)
             last = self._last_checkpoint()
-            if self.trainer.interrupted and last is not None:
+            if self.trainer.interrupted and last is not None and not refused:
                 print(f"to go on: {shlex.join(['dejavu', 'train', *self.words, '--ckpt_path', str(last)])}")
 
     def before_validate(self) -> None:

@@ -116,7 +116,7 @@ def describe(summary: MapSummary) -> str:
     """
     lines = [_chunk_line(chunk) for chunk in summary.chunks]
     stored = f"{summary.templates} templates, {summary.template_numbers} numbers"
-    if summary.lines:
+    if summary.kind == "spectral":
         stored = f"{summary.lines} lines of their spectra"
     lines.append(f"{summary.covered} of {summary.places} places covered; {stored}")
     growing = summary.route_bytes / max(summary.places, 1)
