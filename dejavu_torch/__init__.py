@@ -21,6 +21,7 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
            (ours) few numbers, that tell places  Whitening           features.whitening
     IV-C   precision, recall, area               pr_curve, evaluate  evaluation.curves
     V      (ours) beside baselines and nulls     compare             experiments.compare
+    VI     (ours) several queries one by one     SequenceMatcher     recognition.sequence
     VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
            frames to train on                    RouteData           training.datamodule
            any backbone                          Embedding           features.embedding
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from dejavu_torch.data.strip import SlidingWindow
     from dejavu_torch.database.distance import phase_distances
     from dejavu_torch.database.place_map import PlaceMap
-    from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
+    from dejavu_torch.database.spectral import SpectralMapper
     from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
     from dejavu_torch.database.templates import PhaseTemplates, phase_mask
     from dejavu_torch.evaluation.curves import evaluate, pr_curve
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from dejavu_torch.periods.imposed import ImposedPeriods
     from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
     from dejavu_torch.recognition.select import best_match
+    from dejavu_torch.recognition.sequence import SequenceMatcher
     from dejavu_torch.training.datamodule import RouteData
     from dejavu_torch.training.task import PlaceRecognitionTask
     from dejavu_torch.types import FrequencyLayer, InputError, Match, PRCurve, Traverse
@@ -72,8 +74,8 @@ __all__ = [
     "PlaceRecognitionTask",
     "Preprocess",
     "RouteData",
+    "SequenceMatcher",
     "SlidingWindow",
-    "SpectralMap",
     "SpectralMapper",
     "SpectrogramAnalysis",
     "TemplateMap",
@@ -106,8 +108,8 @@ _HOMES = {
     "PlaceRecognitionTask": "training.task",
     "Preprocess": "features.preprocess",
     "RouteData": "training.datamodule",
+    "SequenceMatcher": "recognition.sequence",
     "SlidingWindow": "data.strip",
-    "SpectralMap": "database.spectral",
     "SpectralMapper": "database.spectral",
     "SpectrogramAnalysis": "periods.spectrogram",
     "TemplateMap": "database.template_map",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -37,6 +37,7 @@ from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -308,12 +309,18 @@ class DejaVu(nn.Module):
         self.check_queries(tuple(queries.shape[1:]), features.shape[1], "the query")
         return self.map.scores(self.whitened(features))
 
-    def localize(self, queries: Traverse | Tensor, progress: str | None = None) -> Match:
+    def localize(
+        self,
+        queries: Traverse | Tensor,
+        progress: str | None = None,
+        sequence: SequenceMatcher | None = None,
+    ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
         Args:
             queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D).
             progress: text of a progress bar on a terminal; None is no bar.
+            sequence: adds the scores of consecutive queries up; None takes each by itself.
 
         Shape: -> Match of (Q,) on the CPU.
 
@@ -322,32 +329,46 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        return _joined(self.matches(queries, progress))
+        return _joined(self.matches(queries, progress, sequence))
 
-    def localize_descriptors(self, descriptors: Tensor) -> Match:
+    def localize_descriptors(self, descriptors: Tensor, sequence: SequenceMatcher | None = None) -> Match:
         """As `localize`, of descriptors (Q,K) as the map's own are: whitened where the model whitens."""
         self._require_map()
-        return _joined(self._found(descriptors))
+        return _joined(self._found([descriptors], sequence))
 
-    def matches(self, queries: Traverse | Tensor, progress: str | None = None) -> Iterator[Match]:
+    def matches(
+        self,
+        queries: Traverse | Tensor,
+        progress: str | None = None,
+        sequence: SequenceMatcher | None = None,
+    ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
         queries = as_traverse(queries)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress is not None)
-        shape = queries.frame_shape
+        yield from self._found(self._checked(queries, progress), sequence)
+
+    def _checked(self, queries: Traverse, progress: str | None) -> Iterator[Tensor]:
+        """Descriptors of queries that fit the map, in batches."""
         for i, features in enumerate(self._features(queries, progress)):
             if i == 0:
-                self.check_queries(shape, features.shape[1], queries.name)
-            yield from self._found(self.whitened(features))
+                self.check_queries(queries.frame_shape, features.shape[1], queries.name)
+            yield self.whitened(features)
 
-    def _found(self, descriptors: Tensor) -> Iterator[Match]:
-        """Matches of descriptors, as many at a time as memory allows."""
+    def _found(self, batches: Iterable[Tensor], sequence: SequenceMatcher | None) -> Iterator[Match]:
+        """Matches of batches of descriptors."""
+        scores = self._scored(batches)
+        for part in scores if sequence is None else sequence.stream(scores):
+            yield Match(*(column.cpu() for column in best_match(part, self.threshold)))
+
+    def _scored(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+        """Scores of batches of descriptors, of as many at a time as memory allows."""
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
-        for part in descriptors.split(at_once):
-            with torch.no_grad():
-                match = best_match(self.map.scores(part), self.threshold)
-            yield Match(*(column.cpu() for column in match))
+        for descriptors in batches:
+            for part in descriptors.split(at_once):
+                with torch.no_grad():
+                    yield self.map.scores(part)
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""

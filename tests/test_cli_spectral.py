@@ -12,11 +12,12 @@ from command_line import TEMPLATES, fails, frames, report_of, run
 from footage import QUERY, REFERENCE, SIDE, STEP, footage
 from helpers import refused
 
-from dejavu_torch import DejaVu, SpectralMap, SpectralMapper
+from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.database.mapfile import read_map
+from dejavu_torch.database.spectral import SpectralMap
 
 ROUTE = "sim:aerial?frames=96"
 SECOND = "sim:aerial?frames=96&traverse=1"

@@ -28,8 +28,9 @@ from test_stages import STILL, Watch, coded
 from test_task import assert_figures
 from torch import nn
 
-from dejavu_torch import HOG, DejaVu, SpectralMap, SpectralMapper, TemplateMap, Whitening
+from dejavu_torch import HOG, DejaVu, SpectralMapper, TemplateMap, Whitening
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.evaluation.baselines import baselines_of
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.augmentation import Augmentation

@@ -19,10 +19,11 @@ from pytorch_lightning import Trainer
 from small_training import CONFIG, FRAMES, MINE, footage, train, warned
 from torch import nn
 
-from dejavu_torch import DejaVu, RouteData, SpectralMap, TemplateMap
+from dejavu_torch import DejaVu, RouteData, TemplateMap
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.mapfile import read_map
+from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.database.summary import describe
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN

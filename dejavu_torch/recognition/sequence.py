@@ -1,0 +1,97 @@
+"""The place of the latest of several queries, driven past one after another."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.types import InputError
+
+log = logging.getLogger("dejavu_torch")
+
+
+class SequenceMatcher(nn.Module):
+    """Scores of places from the latest T queries instead of one, for any map.
+
+    The score of place i is the mean over trajectories that end there: of the query k steps before the latest,
+    the score of place i - v k, rounded; of several speeds v the best counts. Only earlier queries are used.
+
+    Args:
+        length: T, queries of a sequence; where steps are resampled, steps.
+        speeds: each v in places a query: 1 where both traverses went equally fast, negative for the way back.
+
+    Shape: scores (Q,N), the R rows ahead of them or None -> (Q,N), lower is better.
+
+    Convention: the first queries have fewer before them, and use these. The part of a trajectory that lies
+        off the map, or on places that nothing covers, is left out of the mean; less than half of it on the
+        map scores +inf. Half a place is rounded up. Gradients reach the scores.
+
+    Source: constant-speed search of SeqSLAM (Milford and Wyeth, ICRA 2012), causal and without its
+        normalisation.
+
+    Raises:
+        InputError: a length below 1, no speeds, or speeds that are not finite; forward: scores that are no
+            (Q,N), or rows ahead of another number of places.
+
+    Example:
+        >>> scores = torch.tensor([[0.0, 5, 5, 0], [5, 0.0, 0, 5], [0, 5, 0.0, 5]])
+        >>> scores.argmin(1), SequenceMatcher(length=3)(scores).argmin(1)
+        (tensor([0, 1, 0]), tensor([0, 1, 2]))
+    """
+
+    def __init__(self, length: int = 11, speeds: Sequence[float] = (1.0,)) -> None:
+        super().__init__()
+        if length < 1:
+            raise InputError(f"a sequence of {length} queries; expected at least 1")
+        if not len(speeds) or not all(math.isfinite(speed) for speed in speeds):
+            raise InputError(f"the speeds are {list(speeds)}; expected finite numbers of places a query")
+        self.length, self.speeds = length, tuple(float(speed) for speed in speeds)
+
+    def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
+        if scores.ndim != 2 or (before is not None and before.shape[1:] != scores.shape[1:]):
+            seen = f"{tuple(scores.shape)}" + (f" behind {tuple(before.shape)}" if before is not None else "")
+            raise InputError(f"scores are {seen}; expected (Q,N), and (R,N) ahead of them")
+        if self.length == 1:
+            return scores
+        rows = scores if before is None else torch.cat([before[1 - self.length :], scores])
+        ahead = len(rows) - len(scores)
+        on_map = rows.isfinite()
+        known, count = torch.where(on_map, rows, 0), on_map.to(rows.dtype)
+        used = torch.arange(ahead + 1, len(rows) + 1, device=rows.device).clamp(max=self.length)[:, None]
+        best = torch.full_like(scores, math.inf)
+        for speed in self.speeds:
+            total, inside = torch.zeros_like(scores), torch.zeros_like(scores)
+            for k in range(min(self.length, len(rows))):
+                shift = math.floor(speed * k + 0.5)
+                first = max(0, k - ahead)  # the first query that has one k steps before it
+                to = slice(max(0, shift), scores.shape[1] + min(0, shift))
+                of = slice(max(0, -shift), scores.shape[1] - max(0, shift))
+                if to.start >= to.stop:
+                    break  # so far back no trajectory is on the map
+                part = slice(ahead + first - k, len(rows) - k)
+                total[first:, to] += known[part, of]
+                inside[first:, to] += count[part, of]
+            mean = total / inside.clamp(min=1)
+            best = torch.minimum(best, torch.where(2 * inside >= used, mean, math.inf))
+        return best
+
+    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+        """As `forward`, of scores (B,N) that come in batches one behind the other.
+
+        Between two batches T - 1 rows are kept, however many queries there are. A line says where there are
+        fewer queries than T.
+        """
+        before, count = None, 0
+        for scores in batches:
+            yield self(scores, before)
+            rows = scores if before is None else torch.cat([before, scores])
+            before, count = rows[max(0, len(rows) - self.length + 1) :], count + len(scores)
+        if count < self.length:
+            log.warning("a sequence of %d queries, but there are %d: all of them count", self.length, count)
+
+    def extra_repr(self) -> str:
+        return f"length={self.length}, speeds={list(self.speeds)}"

@@ -1,0 +1,133 @@
+"""Scores of several queries added up along trajectories."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from helpers import Fixed, refused, template_model
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import DejaVu, SequenceMatcher
+from dejavu_torch.types import FrequencyLayer, Match
+
+
+def literal(scores: list[list[float]], length: int, speeds: list[float]) -> list[list[float]]:
+    """Each query, place, speed and step in a loop of its own."""
+    places, found = len(scores[0]), []
+    for t in range(len(scores)):
+        row = []
+        for i in range(places):
+            best, used = math.inf, min(length, t + 1)
+            for speed in speeds:
+                passed = [i - math.floor(speed * k + 0.5) for k in range(used)]
+                on_map = [
+                    scores[t - k][place]
+                    for k, place in enumerate(passed)
+                    if 0 <= place < places and math.isfinite(scores[t - k][place])
+                ]
+                if on_map and 2 * len(on_map) >= used:
+                    best = min(best, sum(on_map) / len(on_map))
+            row.append(best)
+        found.append(row)
+    return found
+
+
+SCORE = st.one_of(st.integers(0, 3).map(float), st.just(math.inf))
+TABLE = st.integers(1, 7).flatmap(
+    lambda n: st.lists(st.lists(SCORE, min_size=n, max_size=n), min_size=1, max_size=9)
+)
+SPEEDS = st.lists(st.sampled_from([1.0, 0.0, 0.5, 2.0, -1.0, 1.3]), min_size=1, max_size=3)
+
+
+@given(TABLE, st.integers(1, 12), SPEEDS)
+def test_equals_a_literal_loop(rows: list[list[float]], length: int, speeds: list[float]) -> None:
+    found = SequenceMatcher(length, speeds)(torch.tensor(rows, dtype=torch.float64))
+    expected = torch.tensor(literal(rows, length, speeds), dtype=torch.float64)
+    assert torch.allclose(found, expected, atol=1e-12)
+    assert torch.equal(found.isfinite(), expected.isfinite())
+
+
+@given(TABLE, st.integers(1, 12), SPEEDS, st.integers(1, 4))
+def test_batches_do_not_matter(rows: list[list[float]], length: int, speeds: list[float], size: int) -> None:
+    matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows)
+    assert torch.equal(torch.cat(list(matcher.stream(scores.split(size)))), matcher(scores))
+
+
+def test_later_queries_change_nothing() -> None:
+    scores = torch.rand(20, 30)
+    matcher = SequenceMatcher(7, [1.0, 0.8])
+    assert torch.equal(matcher(scores)[:12], matcher(scores[:12]))
+
+
+def test_gradients_reach_every_score_of_a_trajectory() -> None:
+    scores = torch.rand(4, 6, dtype=torch.float64, requires_grad=True)
+    matcher = SequenceMatcher(3, [1.0, 2.0])
+    finite = matcher(scores).isfinite()
+    assert torch.autograd.gradcheck(lambda scores: matcher(scores)[finite], (scores,))
+    (gradient,) = torch.autograd.grad(SequenceMatcher(3)(scores)[3, 4], scores)
+    assert gradient.nonzero().tolist() == [[1, 2], [2, 3], [3, 4]]
+
+
+def test_no_more_rows_than_a_sequence_are_kept(largest_tensor: type) -> None:
+    matcher, batches = SequenceMatcher(5), (torch.rand(2, 50) for _ in range(100))
+    with largest_tensor() as seen:
+        for _ in matcher.stream(batches):
+            pass
+    assert seen.numel <= (5 - 1 + 2) * 50
+
+
+def route(noise: int) -> Tensor:
+    fresh = torch.Generator().manual_seed(noise)
+    places = torch.rand(200, 4, generator=torch.Generator().manual_seed(9))
+    return places + 0.2 * torch.randn(200, 4, generator=fresh)
+
+
+@pytest.mark.parametrize("kind", ["templates", "spectral"])
+def test_a_sequence_finds_what_single_frames_do_not(kind: str) -> None:
+    if kind == "templates":
+        layer = FrequencyLayer(200, 200, 0, 200, (0, 1, 2, 3))
+        model = template_model(periods=Fixed(layer))
+    else:
+        model = DejaVu(whitening="none")
+    model.learn(route(0))
+    single, many = model.localize(route(1)), model.localize(route(1), sequence=SequenceMatcher(15))
+
+    def right(match: Match) -> float:
+        return float((match.index == torch.arange(200)).float().mean())
+
+    assert right(single) < 0.5
+    assert right(many) > 0.9
+    model.batch_size = 7
+    assert torch.equal(model.localize(route(1), sequence=SequenceMatcher(15)).index, many.index)
+
+
+def test_a_sequence_longer_than_the_queries_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    model = DejaVu(whitening="none").learn(route(0))
+    model.localize(route(1)[:6], sequence=SequenceMatcher(11))
+    assert "a sequence of 11 queries, but there are 6" in caplog.text
+    caplog.clear()
+    model.localize(route(1)[:11], sequence=SequenceMatcher(11))
+    assert not caplog.text
+
+
+def test_settings_that_make_no_sequence_are_refused() -> None:
+    with refused("a sequence of 0 queries", "at least 1"):
+        SequenceMatcher(0)
+    with refused("speeds are []", "finite"):
+        SequenceMatcher(3, [])
+    with refused("speeds are [1.0, nan]", "finite"):
+        SequenceMatcher(3, [1.0, math.nan])
+    with refused("scores are (4,)", "(Q,N)"):
+        SequenceMatcher(3)(torch.rand(4))
+    with refused("(2, 4) behind (3, 5)"):
+        SequenceMatcher(3)(torch.rand(2, 4), torch.rand(3, 5))
+
+
+def test_speeds_that_leave_the_map_at_once_find_nothing() -> None:
+    """But for the first query, which has none before it, and the second, half of whose way is on the map."""
+    found = SequenceMatcher(9, [100.0])(torch.rand(5, 10))
+    assert found.isfinite().all(1).tolist() == [True, True, False, False, False]
