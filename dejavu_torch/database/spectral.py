@@ -484,9 +484,12 @@ class SpectralMapper(Mapper):
             if size <= room:
                 fitting = min(fitting, step)
                 if size >= WITHIN * room or step == finest:
-                    break
-            aim *= (1 + WITHIN) / 2 * room / size
-        return fitting
+                    return step
+            aim = entropy_bytes(quantise(lines, step, width)) * (1 + WITHIN) / 2 * room / size
+        step = fitting if fitting < coarsest else step
+        while _coded_bytes(lines, width, lengths, step) > room:
+            step *= 1.02
+        return step
 
 
 class SpectralCode(nn.Module):

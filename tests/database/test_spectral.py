@@ -141,6 +141,16 @@ def test_names_leave_the_lines_half_of_what_mean_and_chunks_leave(caplog: pytest
     assert beside.lines == alone.lines > 0
 
 
+@pytest.mark.parametrize("numbers", [1, 3, 4, 9])
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.2])
+def test_the_budget_is_met_where_levels_are_nearly_all_different(numbers: int, share: float) -> None:
+    """Of few large levels the counts say little of what they take."""
+    noise = torch.randn(200, numbers)
+    learned = SpectralMapper(numbers * share + 0.4)(noise).summary()
+    assert learned.route_bytes <= (numbers * share + 0.4) * 200
+    assert learned.lines > 50 * numbers
+
+
 def test_a_budget_that_no_line_fits_in_is_refused() -> None:
     descriptors = route(60, 15)
     nothing = SpectralMapper(None, step=1e9)(descriptors).summary()
