@@ -331,10 +331,16 @@ class DejaVu(nn.Module):
         """
         return _joined(self.matches(queries, progress, sequence))
 
-    def localize_descriptors(self, descriptors: Tensor, sequence: SequenceMatcher | None = None) -> Match:
-        """As `localize`, of descriptors (Q,K) as the map's own are: whitened where the model whitens."""
+    def localize_descriptors(
+        self, descriptors: Tensor, sequence: SequenceMatcher | None = None, order: Tensor | None = None
+    ) -> Match:
+        """As `localize`, of descriptors (Q,K) as the map's own are: whitened where the model whitens.
+
+        Args:
+            order: (N,) which frame each place of a shuffled map is; the match then counts frames.
+        """
         self._require_map()
-        return _joined(self._found([descriptors], sequence))
+        return _joined(self._found([descriptors], sequence, order))
 
     def matches(
         self,
@@ -356,9 +362,14 @@ class DejaVu(nn.Module):
                 self.check_queries(queries.frame_shape, features.shape[1], queries.name)
             yield self.whitened(features)
 
-    def _found(self, batches: Iterable[Tensor], sequence: SequenceMatcher | None) -> Iterator[Match]:
+    def _found(
+        self, batches: Iterable[Tensor], sequence: SequenceMatcher | None, order: Tensor | None = None
+    ) -> Iterator[Match]:
         """Matches of batches of descriptors."""
         scores = self._scored(batches)
+        if order is not None:
+            place = order.argsort()
+            scores = (part[:, place.to(part.device)] for part in scores)
         for part in scores if sequence is None else sequence.stream(scores):
             yield Match(*(column.cpu() for column in best_match(part, self.threshold)))
 

@@ -320,3 +320,30 @@ def test_a_damaged_map_is_refused(
     with refused(str(path)):
         DejaVu.load(path)
     assert not (tmp_path / "m.csv").exists()
+
+
+def test_a_sequence_is_of_the_map_and_of_all_beside_it(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0)
+    walk = noise.normal(size=(200, 8)).cumsum(0)
+    for name in ("one", "two"):
+        np.save(tmp_path / f"{name}.npy", (walk + 3 * noise.normal(size=(200, 8))).astype(np.float32))
+    one, two = tmp_path / "one.npy", tmp_path / "two.npy"
+    reports = {}
+    for length in (1, 9):
+        run("compare", one, two, "--tolerance", 1, "--sequence", length, "--out", tmp_path / f"{length}")
+        reports[length] = report_of(tmp_path / f"{length}")
+        assert reports[length]["sequence"] == length
+    for key in ("uncompressed", "interpolated", "stride"):
+        assert reports[9][key]["auc"] > reports[1][key]["auc"]
+    assert reports[9]["null"]["auc"] != reports[1]["null"]["auc"]
+    assert reports[9]["auc"] > reports[1]["auc"]
+
+    matches = tmp_path / "matches.csv"
+    run("localize", tmp_path / "9" / "map.safetensors", two, "--sequence", 9, "--out", matches)
+    assert matches.read_text() == (tmp_path / "9" / "matches.csv").read_text()
+
+
+def test_a_sequence_of_no_queries_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = fails(capsys, "compare", ROUTE, SECOND, "--sequence", "0", "--out", tmp_path / "out")
+    assert "a sequence of 0 queries" in error
+    assert not (tmp_path / "out").exists()

@@ -20,6 +20,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ def run_localize(
     threshold: float | None = None,
     corners: list[list[float]] | None = None,
     as_is: bool = False,
+    sequence: int = 1,
     features: nn.Module | None = None,
 ) -> None:
     """Find the frames of a source on a map.
@@ -114,6 +116,7 @@ def run_localize(
         threshold: accept a match whose score is below
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         as_is: take the frames as they are, though the map's are resampled
+        sequence: queries that are matched together, one place after another
         features: class of the map's features, if not ours
     """
     check_output_file(out)
@@ -131,7 +134,8 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, progress=True)
         _print_steps(query)
-    total, accepted = _write_matches(out, model.matches(query, "localizing"), query, model)
+    matches = model.matches(query, "localizing", _sequence_of(sequence))
+    total, accepted = _write_matches(out, matches, query, model)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
     elif model.threshold is None:
@@ -154,6 +158,7 @@ def run_compare(
     second: str | None = None,
     second_truth: str | None = None,
     map: Path | None = None,
+    sequence: int = 1,
     model: DejaVu,
     command: str,
 ) -> None:
@@ -172,10 +177,12 @@ def run_compare(
         second: a third traverse, as of `dejavu learn`
         second_truth: which places it shows, as --truth
         map: evaluate this map of the reference as it is, and learn none
+        sequence: queries that are matched together, one place after another
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
 
+    matcher = _sequence_of(sequence)
     if map is not None:
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
@@ -194,6 +201,7 @@ def run_compare(
         seed=seed,
         interpolate=interpolate,
         second=views,
+        sequence=matcher,
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map)
@@ -327,6 +335,12 @@ def _check_report_folder(out: Path, *sources: str | None) -> None:
     if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
         raise InputError(f"{out} holds the images; expected another folder for the report")
     check_output_folder(out)
+
+
+def _sequence_of(length: int) -> SequenceMatcher | None:
+    """Adds up so many queries; none for one."""
+    matcher = SequenceMatcher(length)
+    return None if length == 1 else matcher
 
 
 def _set_seed(model: DejaVu, seed: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,6 +19,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -46,28 +47,35 @@ def nearest_frames(
     strides: Sequence[int] = (1,),
     metric: Metric = "l1",
     progress: str | None = None,
+    sequence: SequenceMatcher | None = None,
 ) -> list[Match]:
     """Nearest stored frame of each query, where every k-th reference frame is stored.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
-        strides: each k; 1 stores all frames. All are found in one pass over the distances.
+        strides: each k; 1 stores all frames.
         progress: text of a progress bar on a terminal; None is no bar.
+        sequence: as of `DejaVu.localize`; a frame that is not stored has the distance of the one before it.
 
     Returns:
-        For each k a Match of (Q,), index in reference frames.
+        For each k a Match of (Q,), index in reference frames, which is one that is stored.
     """
-    rows = max(1, DISTANCES_AT_ONCE // len(reference))
-    parts: list[list[Match]] = [[] for _ in strides]
-    with torch.no_grad():
-        batches = query.split(rows)
-        for batch in tqdm(batches, progress, disable=None if progress else True, leave=False):
-            distances = phase_distances(batch.to(reference.device), reference, metric)
-            for found, k in zip(parts, strides, strict=True):
-                match = best_match(distances[:, ::k])
-                match = match._replace(index=torch.where(match.index >= 0, match.index * k, -1))
-                found.append(Match(*(column.cpu() for column in match)))
-    return [Match(*(torch.cat(column) for column in zip(*found, strict=True))) for found in parts]
+    rows, matches = max(1, DISTANCES_AT_ONCE // len(reference)), []
+    for k in strides:
+        batches = tqdm(query.split(rows), progress, disable=None if progress else True, leave=False)
+        stored = reference[::k]
+        with torch.no_grad():
+            scores: Iterable[Tensor] = (
+                phase_distances(batch.to(stored.device), stored, metric) for batch in batches
+            )
+            if sequence is not None:
+                before = torch.arange(len(reference), device=stored.device) // k
+                scores = sequence.stream(part[:, before] for part in scores)
+            found = [best_match(part) for part in scores]
+        match = Match(*(torch.cat(column).cpu() for column in zip(*found, strict=True)))
+        frame = match.index // k * k if sequence is not None else match.index * k
+        matches.append(match._replace(index=torch.where(match.index >= 0, frame, -1)))
+    return matches
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
@@ -95,6 +103,7 @@ def baselines_of(
     seed: int = 0,
     leave_out: int | None = None,
     progress: bool = False,
+    sequence: SequenceMatcher | None = None,
 ) -> dict[str, Baseline]:
     """The baselines and null controls that every report sets beside the map, by their keys in report.json.
 
@@ -102,24 +111,23 @@ def baselines_of(
         model: with the map. reference: (N,D) its features. query: (Q,D) those of the queries.
         tolerance: the coarsest stride is twice as much. seed: of the shuffle of the null controls.
         leave_out: also query the reference with itself, see `leave_out_match`.
-        progress: show progress bars on a terminal.
+        progress: show progress bars on a terminal. sequence: as of `DejaVu.localize`, of all but `leave_out`.
     """
     store = _compact_stores if isinstance(model.map, SpectralMap) else _plain_stores
     text = "baselines: what is stored as it is" if progress else None
-    found = store(model, reference, query, tolerance, text)
+    found = store(model, reference, query, tolerance, text, sequence)
     one = "place" if len(model.map.positions) else "frame"
-    text = "null control: shuffled frames" if progress else None
     foreign = isinstance(getattr(model.mapper, "periods", None), ForeignPeriods)
     if foreign:
         log.warning("no null control learned anew: what found the map's periods is not of this package")
     if (model.trained is None or isinstance(model.map, SpectralMap)) and not foreign:
-        anew = null_control(model, reference, query, seed, progress=text)
+        anew = null_control(model, reference, query, seed, sequence=sequence)
         name = f"null: everything learned from shuffled {one}s"
         if isinstance(model.map, SpectralMap):
             name = f"null: shuffled {one}s, as many bytes"
         found["null"] = Baseline(name, anew)
     if isinstance(model.map, TemplateMap):
-        same = null_control(model, reference, query, seed, same_plan=True, progress=text)
+        same = null_control(model, reference, query, seed, same_plan=True, sequence=sequence)
         if model.trained is None:
             found["null_same_plan"] = Baseline(f"null: this map's layers, shuffled {one}s", same)
         else:  # training anew is a run of its own
@@ -131,7 +139,12 @@ def baselines_of(
 
 
 def _plain_stores(
-    model: DejaVu, reference: Tensor, query: Tensor, tolerance: int, progress: str | None
+    model: DejaVu,
+    reference: Tensor,
+    query: Tensor,
+    tolerance: int,
+    progress: str | None,
+    sequence: SequenceMatcher | None,
 ) -> dict[str, Baseline]:
     """The features that a template map is made of, of all frames and of every k-th."""
     frames, dimension = reference.shape
@@ -148,7 +161,7 @@ def _plain_stores(
         "stride_coarsest": f"{of}{every(strides['stride_coarsest'], one)} (2 x tolerance)",
     }
     metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
-    nearest = nearest_frames(reference, query, tuple(strides.values()), metric, progress)
+    nearest = nearest_frames(reference, query, tuple(strides.values()), metric, progress, sequence)
     return {
         key: Baseline(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k, backbone)
         for (key, k), match in zip(strides.items(), nearest, strict=True)
@@ -156,7 +169,12 @@ def _plain_stores(
 
 
 def _compact_stores(
-    model: DejaVu, reference: Tensor, query: Tensor, tolerance: int, progress: str | None
+    model: DejaVu,
+    reference: Tensor,
+    query: Tensor,
+    tolerance: int,
+    progress: str | None,
+    sequence: SequenceMatcher | None,
 ) -> dict[str, Baseline]:
     """The descriptors that a spectral map codes: all in float, every k-th and interpolated ones in int8."""
     frames, dimension = reference.shape
@@ -167,20 +185,15 @@ def _compact_stores(
     between, spaced, keys = interpolated(short, model.map.summary().route_bytes)
     contenders = {
         "uncompressed": (f"its descriptors of all {frames} {one}s, float", reference, 1, frames * 4),
-        "stride": (
-            f"its descriptors of {every(apart, one)}, int8",
-            short[::apart],
-            apart,
-            -(-frames // apart),
-        ),
+        "stride": (f"its descriptors of {every(apart, one)}, int8", short, apart, -(-frames // apart)),
         "interpolated": (f"interpolated between {every(spaced, one)}, int8", between, spaced, keys),
     }
     metric = model.map.metric
     found = {}
     for key, (name, stored, k, numbers) in contenders.items():
-        match = nearest_frames(stored, query, (1,), "l2" if metric == "l2" else "cosine", progress)[0]
-        if key == "stride":
-            match = match._replace(index=torch.where(match.index >= 0, match.index * k, -1))
+        apart = k if key == "stride" else 1
+        near = "l2" if metric == "l2" else "cosine"
+        (match,) = nearest_frames(stored, query, (apart,), near, progress, sequence)
         found[key] = Baseline(name, match, numbers * dimension + fixed, k, fixed)
     return found
 
@@ -212,7 +225,12 @@ def interpolated(descriptors: Tensor, route_bytes: float) -> tuple[Tensor, int, 
 
 
 def hog_baselines(
-    reference: Traverse, query: Traverse, batch_size: int, tolerance: int, progress: bool = False
+    reference: Traverse,
+    query: Traverse,
+    batch_size: int,
+    tolerance: int,
+    progress: bool = False,
+    sequence: SequenceMatcher | None = None,
 ) -> dict[str, Baseline]:
     """What a map of other features is set beside: HOG of all frames, and of every k-th, k = 2 x tolerance.
 
@@ -230,7 +248,7 @@ def hog_baselines(
     one = "place" if isinstance(reference, ResampledTraverse) else "frame"
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     text = "baselines: HOG of all frames" if progress else None
-    nearest = nearest_frames(stored, queries, tuple(strides.values()), progress=text)
+    nearest = nearest_frames(stored, queries, tuple(strides.values()), "l1", text, sequence)
     frames, dimension = stored.shape
     return {
         key: Baseline(

@@ -18,6 +18,7 @@ from dejavu_torch.database.templates import PhaseTemplates
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 
@@ -46,7 +47,7 @@ def null_control(
     query: Tensor,
     seed: int = 0,
     same_plan: bool = False,
-    progress: str | None = None,
+    sequence: SequenceMatcher | None = None,
 ) -> Match:
     """Matches of a map learned from the reference in shuffled order.
 
@@ -58,7 +59,7 @@ def null_control(
         same_plan: keep the layers of the model's template map and learn only the templates anew. Otherwise
             the periods are sought anew too; the default preset then finds none, since shuffled frames are
             noise in time, and reports nothing.
-        progress: text of a progress bar on a terminal; None is no bar.
+        sequence: as of `DejaVu.localize`.
 
     Returns:
         Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
@@ -74,8 +75,7 @@ def null_control(
     else:
         with without_warnings():
             null.learn_features(mixed)
-    match = null.localize(query, progress)
-    return match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
+    return null.localize_descriptors(query, sequence, order)
 
 
 def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:

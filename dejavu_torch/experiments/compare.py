@@ -40,6 +40,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
+from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -72,6 +73,7 @@ def compare(
     interpolate: bool = False,
     second: Views | None = None,
     others: Mapping[str, tuple[str, DejaVu]] | None = None,
+    sequence: SequenceMatcher | None = None,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -91,6 +93,8 @@ def compare(
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They are scored by their matches, so only where there is a truth; none of them
             resamples.
+        sequence: adds the scores of consecutive queries up, those of the map and of all that it is set
+            beside.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -128,12 +132,12 @@ def compare(
     with timed(seconds, "localize"):
         model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)
-        match = model.localize_descriptors(queries)
+        match = model.localize_descriptors(queries, sequence)
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
-    run = Localization(model, reference, query, places, queries, match, known, tolerance)
+    run = Localization(model, reference, query, places, queries, match, known, tolerance, sequence)
     contenders = _contenders(run, seed, leave_out, progress)
     for key, (name, other) in (others or {}).items():
         if known is not None:
@@ -231,9 +235,10 @@ def _contenders(run: Localization, seed: int, leave_out: int | None, progress: b
     if run.truth is None and leave_out is None:  # nothing that the others find could be scored
         return contenders
     features = run.reference_features, run.query_features
-    baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress)
+    baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress, run.sequence)
     if not _is_plain_hog(model):
-        baselines |= hog_baselines(run.reference, run.query, model.batch_size, tolerance, progress)
+        size = model.batch_size
+        baselines |= hog_baselines(run.reference, run.query, size, tolerance, progress, run.sequence)
     for key, (name, match, bytes, k, fixed) in baselines.items():
         truth, match = run.truth, of_shown_frames(match, model.map)
         if key == "leave_out":  # its queries are the places themselves
@@ -245,7 +250,10 @@ def _contenders(run: Localization, seed: int, leave_out: int | None, progress: b
 
 def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
     """Another model that learns the run's reference."""
-    match, summary = other.learn(run.reference).localize(run.query), other.summary()
+    match, summary = (
+        other.learn(run.reference).localize(run.query, sequence=run.sequence),
+        other.summary(),
+    )
     match = of_shown_frames(match, run.model.map)
     return contend(name, match, run.truth, run.tolerance, bytes=summary.map_bytes, fixed=summary.fixed_bytes)
 
@@ -294,6 +302,7 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
         "threshold": model.threshold,
+        "sequence": 1 if run.sequence is None else run.sequence.length,
         "trained": model.trained and model.trained._asdict(),
         "reference": reference.name,
         "query": query.name,

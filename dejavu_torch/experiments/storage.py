@@ -102,9 +102,7 @@ def _coded(
         model.learn_features(features)
     except InputError:  # more than floats, or less than the mean
         return
-    match = model.localize_descriptors(run.query_features)
-    if order is not None:
-        match = match._replace(index=torch.where(match.index >= 0, order[match.index], -1))
+    match = model.localize_descriptors(run.query_features, run.sequence, order)
     yield match, sum(tensor.nbytes for tensor in model.map.packed().values())
 
 
@@ -113,4 +111,5 @@ def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator
     between, _, keys = interpolated(as_int8(run.reference_features), budget * route.places)
     size = keys * route.dimension
     if size <= budget * route.places:
-        yield nearest_frames(between, run.query_features, (1,), route.metric)[0], size
+        matches = nearest_frames(between, run.query_features, (1,), route.metric, sequence=run.sequence)
+        yield matches[0], size

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames, stride_bytes
+from dejavu_torch.recognition.sequence import SequenceMatcher
 
 DISTANCES = {
     "l1": lambda a, b: (a - b).abs().sum(),
@@ -51,13 +52,27 @@ def test_the_uncompressed_reference_finds_its_own_frames() -> None:
     assert match.score.tolist() == [0.0] * 50
 
 
+@pytest.mark.parametrize("k", [1, 4])
+def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> None:
+    """Its distances are those of the stored frame before it, and the frame reported is a stored one."""
+    reference, query, matcher = torch.rand(30, 3), torch.rand(25, 3), SequenceMatcher(6)
+    (match,) = nearest_frames(reference, query, (k,), sequence=matcher)
+    stored = reference[torch.arange(30) // k * k]
+    score, index = matcher(torch.cdist(query, stored, p=1)).min(1)
+    assert match.index.tolist() == (index // k * k).tolist()
+    assert torch.allclose(match.score, score)
+
+
 def test_distances_in_parts_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     reference, query = torch.rand(20, 4), torch.rand(11, 4)
-    whole = nearest_frames(reference, query, (1, 3))
-    for numbers in (1, 20, 45):
-        monkeypatch.setattr("dejavu_torch.evaluation.baselines.DISTANCES_AT_ONCE", numbers)
-        for a, b in zip(nearest_frames(reference, query, (1, 3)), whole, strict=True):
-            assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+    for sequence in (None, SequenceMatcher(4)):
+        whole = nearest_frames(reference, query, (1, 3), sequence=sequence)
+        for numbers in (1, 20, 45):
+            with monkeypatch.context() as patch:
+                patch.setattr("dejavu_torch.evaluation.baselines.DISTANCES_AT_ONCE", numbers)
+                parts = nearest_frames(reference, query, (1, 3), sequence=sequence)
+            for a, b in zip(parts, whole, strict=True):
+                assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 @pytest.mark.parametrize(

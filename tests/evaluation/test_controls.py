@@ -11,6 +11,7 @@ import torch
 from helpers import Fixed, refused, template_model
 from torch import Tensor
 
+from dejavu_torch import DejaVu, SequenceMatcher, SpectralMapper
 from dejavu_torch.evaluation.controls import leave_out_match, null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -69,6 +70,21 @@ def test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored() -> No
     match = null_control(model, reference, reference)
     assert match.index.tolist() == list(range(50))
     assert match.score.tolist() == [0.0] * 50
+
+
+@pytest.mark.parametrize("kind", ["templates", "spectral"])
+def test_a_sequence_of_the_null_runs_along_the_route(kind: str) -> None:
+    """Its map is of shuffled frames, and its scores are added up along the frames as they were."""
+    reference = torch.rand(60, 5)
+    query = reference + 0.3 * torch.rand(60, 5)
+    if kind == "templates":
+        model = template_model(periods=Fixed(layer(60, 0, 60, 0, 1, 2, 3, 4)))
+    else:
+        model = DejaVu(whitening="none", mapper=SpectralMapper(None, step=0.05))
+    model.learn_features(reference)
+    single, many = (null_control(model, reference, query, sequence=one) for one in (None, SequenceMatcher(9)))
+    assert recall(single) < 0.9
+    assert recall(many) > 0.95
 
 
 def test_the_null_shuffles_by_its_seed_and_leaves_the_model_alone() -> None:
