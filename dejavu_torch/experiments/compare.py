@@ -31,7 +31,7 @@ from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
-from dejavu_torch.experiments.evaluate import evaluation_facts
+from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
 from dejavu_torch.experiments.storage import noise_over_map, storage_curve
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
@@ -40,6 +40,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
+from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -52,12 +53,14 @@ class Comparison(NamedTuple):
     """A comparison's figures and pictures, and the run they are of.
 
     The run's traverses are as they were learned and localized, resampled where the model asks for it; its
-    match and truth count places.
+    match and truth count places. candidates: of each query the best places, no two within the tolerance, as
+    many as were wanted or as a score takes.
     """
 
     report: Report
     pictures: Mapping[str, Picture]
     run: Localization
+    candidates: Candidates
 
 
 def compare(
@@ -72,6 +75,7 @@ def compare(
     interpolate: bool = False,
     second: Views | None = None,
     others: Mapping[str, tuple[str, DejaVu]] | None = None,
+    top: int = 1,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -91,6 +95,7 @@ def compare(
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They are scored by their matches, so only where there is a truth; none of them
             resamples.
+        top: how many candidates of each query are wanted.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -108,6 +113,7 @@ def compare(
         reference = model.resample(reference, model.step if has_map else None, progress)
     with timed(seconds, "localize"):
         query = model.resample(query, getattr(reference, "step", None), progress)
+    check_candidates(top, tolerance, reference.length)  # before the long work
     find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
     lengths_known = reference.length is not None and query.length is not None
     known = find_truth() if lengths_known else None  # one that does not fit is refused before the long work
@@ -129,6 +135,8 @@ def compare(
         model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)
         match = model.localize_descriptors(queries)
+    ranks = max(top, min(max(RANKS), model.map.places))
+    candidates = model.candidates_of_descriptors(queries, ranks, tolerance)
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
@@ -156,9 +164,10 @@ def compare(
             model.map.positions,
             describe_ground_truth(truth, interpolate, carried),
         ),
+        **candidate_facts(model.map.scored(candidates.index), known, tolerance),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
-    return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run)
+    return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run, candidates)
 
 
 @contextmanager
