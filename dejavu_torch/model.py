@@ -36,6 +36,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, r
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.candidates import Candidates, best_candidates, check_candidates
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, Training, Traverse
@@ -350,36 +351,97 @@ class DejaVu(nn.Module):
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
+        yield from self._found(self._checked(queries, progress), sequence)
+
+    def candidates(
+        self,
+        queries: Traverse | Tensor,
+        k: int,
+        apart: int = 5,
+        sequence: SequenceMatcher | None = None,
+    ) -> Candidates:
+        """The k best places of each query, no two of them near each other; the first is `localize`'s.
+
+        Args:
+            queries, sequence: as of `localize`.
+            k: how many, from 1 to the number of places.
+            apart: places, at least 0: any two candidates of a query differ by more.
+
+        Shape: -> Candidates of (Q,k) on the CPU.
+
+        Raises:
+            InputError: as `localize`, or k or apart out of range.
+
+        Example:
+            >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])
+            >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
+            tensor([20, 21])
+        """
+        return _ranked(self.candidate_batches(queries, k, apart, sequence=sequence))
+
+    def candidates_of_descriptors(
+        self, descriptors: Tensor, k: int, apart: int = 5, sequence: SequenceMatcher | None = None
+    ) -> Candidates:
+        """As `candidates`, of descriptors (Q,K) as the map's own are."""
+        self._require_map()
+        return _ranked(self._candidates([descriptors], k, apart, sequence))
+
+    def candidate_batches(
+        self,
+        queries: Traverse | Tensor,
+        k: int,
+        apart: int = 5,
+        progress: str | None = None,
+        sequence: SequenceMatcher | None = None,
+    ) -> Iterator[Candidates]:
+        """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
+        self._require_map()
+        check_candidates(k, apart, self.map.places)
+        yield from self._candidates(self._checked(queries, progress), k, apart, sequence)
+
+    def _checked(self, queries: Traverse | Tensor, progress: str | None) -> Iterator[Tensor]:
+        """Descriptors of queries that fit the map, in batches; resampled as the map's places are."""
         queries = as_traverse(queries)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress is not None)
-        yield from self._found(self._checked(queries, progress), sequence)
-
-    def _checked(self, queries: Traverse, progress: str | None) -> Iterator[Tensor]:
-        """Descriptors of queries that fit the map, in batches."""
+        shape = queries.frame_shape
         for i, features in enumerate(self._features(queries, progress)):
             if i == 0:
-                self.check_queries(queries.frame_shape, features.shape[1], queries.name)
+                self.check_queries(shape, features.shape[1], queries.name)
             yield self.whitened(features)
 
     def _found(
         self, batches: Iterable[Tensor], sequence: SequenceMatcher | None, order: Tensor | None = None
     ) -> Iterator[Match]:
         """Matches of batches of descriptors."""
-        scores = self._scored(batches)
+        for part in self._scored(batches, sequence, order):
+            yield Match(*(column.cpu() for column in best_match(part, self.threshold)))
+
+    def _candidates(
+        self, batches: Iterable[Tensor], k: int, apart: int, sequence: SequenceMatcher | None
+    ) -> Iterator[Candidates]:
+        """Candidates of batches of descriptors."""
+        for part in self._scored(batches, sequence):
+            yield Candidates(*(column.cpu() for column in best_candidates(part, k, apart)))
+
+    def _scored(
+        self, batches: Iterable[Tensor], sequence: SequenceMatcher | None, order: Tensor | None = None
+    ) -> Iterator[Tensor]:
+        """Scores of batches of descriptors, of single queries or of sequences of them."""
+        scores = self._single(batches)
         if order is not None:
             place = order.argsort()
             scores = (part[:, place.to(part.device)] for part in scores)
-        for part in scores if sequence is None else sequence.stream(scores):
-            yield Match(*(column.cpu() for column in best_match(part, self.threshold)))
+        return scores if sequence is None else sequence.stream(scores)
 
-    def _scored(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Scores of batches of descriptors, of as many at a time as memory allows."""
+    def _single(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+        """Scores of single queries, of as many at a time as memory allows."""
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         for descriptors in batches:
             for part in descriptors.split(at_once):
                 with torch.no_grad():
-                    yield self.map.scores(part)
+                    scores = self.map.scores(part)
+                yield scores
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""
@@ -513,6 +575,10 @@ class DejaVu(nn.Module):
 
 def _joined(matches: Iterator[Match]) -> Match:
     return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
+
+
+def _ranked(candidates: Iterator[Candidates]) -> Candidates:
+    return Candidates(*(torch.cat(column) for column in zip(*candidates, strict=True)))
 
 
 def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

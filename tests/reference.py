@@ -85,6 +85,18 @@ def accepted(row: Row, threshold: float) -> bool:
     return best(row) >= 0 and row[best(row)] < threshold
 
 
+def candidates(row: Row, k: int, apart: int) -> list[int]:
+    """The best place, then the best further than `apart` from all before; -1 where none is left."""
+    found: list[int] = []
+    for _ in range(k):
+        far = [
+            value if all(abs(i - other) > apart for other in found if other >= 0) else math.inf
+            for i, value in enumerate(row)
+        ]
+        found.append(best(far))
+    return found
+
+
 class Point(NamedTuple):
     """Precision and recall when every query with score <= threshold reports its place."""
 

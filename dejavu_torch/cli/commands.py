@@ -20,12 +20,15 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report
     from dejavu_torch.experiments.compare import Comparison
+
+APART = 5  # places: any two candidates of a query are further apart
 
 
 def run_demo(
@@ -102,6 +105,7 @@ def run_localize(
     *,
     out: Path,
     threshold: float | None = None,
+    top: int | None = None,
     corners: list[list[float]] | None = None,
     as_is: bool = False,
     sequence: int = 1,
@@ -112,8 +116,9 @@ def run_localize(
     Args:
         map: map file
         source: as of `dejavu learn`
-        out: csv of query,place,score,accepted,query_name,place_name
+        out: csv of query,place,score,accepted[,rank],query_name,place_name
         threshold: accept a match whose score is below
+        top: write so many places of each query, no two within 5 of each other, a row each with its rank
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         as_is: take the frames as they are, though the map's are resampled
         sequence: queries that are matched together, one place after another
@@ -130,12 +135,18 @@ def run_localize(
     if as_is:
         model.velocity = None
     model.threshold = model.threshold if threshold is None else threshold
+    if top is not None:
+        check_candidates(top, APART, model.map.places)
     query = open_source(source)
     if model.step is not None:
         query = model.resample(query, model.step, progress=True)
         _print_steps(query)
-    matches = model.matches(query, "localizing", _sequence_of(sequence))
-    total, accepted = _write_matches(out, matches, query, model)
+    matcher = _sequence_of(sequence)
+    matches = model.matches(query, "localizing", matcher)
+    if top is not None:
+        candidates = model.candidate_batches(query, top, APART, "localizing", matcher)
+        matches = (batch.as_match(model.threshold) for batch in candidates)
+    total, accepted = _write_matches(out, matches, query, model, top)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
     elif model.threshold is None:
@@ -159,6 +170,7 @@ def run_compare(
     second_truth: str | None = None,
     map: Path | None = None,
     sequence: int = 1,
+    top: int | None = None,
     model: DejaVu,
     command: str,
 ) -> None:
@@ -178,6 +190,7 @@ def run_compare(
         second_truth: which places it shows, as --truth
         map: evaluate this map of the reference as it is, and learn none
         sequence: queries that are matched together, one place after another
+        top: write so many places of each query, no two within the tolerance, a row each with its rank
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
@@ -202,9 +215,10 @@ def run_compare(
         interpolate=interpolate,
         second=views,
         sequence=matcher,
+        top=1 if top is None else top,
         progress=True,
     )
-    _publish(result, out, f"{query} found on {reference}", command, map)
+    _publish(result, out, f"{query} found on {reference}", command, map, top)
 
 
 def run_evaluate(
@@ -222,7 +236,7 @@ def run_evaluate(
     """Evaluate the matches in a csv, whatever found them: scores, curve, coverage.
 
     Args:
-        matches: csv of query,place,score[,accepted]
+        matches: csv of query,place,score[,accepted][,rank]
         truth: as of `dejavu compare`
         out: folder for report and pictures
         tolerance: right within this many places, inclusive
@@ -388,11 +402,19 @@ def _print_next(*words: str | Path) -> None:
     print(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
 
-def _publish(result: Comparison, out: Path, title: str, command: str, given: Path | None = None) -> None:
+def _publish(
+    result: Comparison,
+    out: Path,
+    title: str,
+    command: str,
+    given: Path | None = None,
+    top: int | None = None,
+) -> None:
     """Write map, matches and report of a comparison, and print its scores.
 
     Args:
         given: file of the map, where it was not learned.
+        top: how many candidates of each query to write; None writes the matches.
     """
     from dejavu_torch.evaluation.report import write_report
 
@@ -403,19 +425,26 @@ def _publish(result: Comparison, out: Path, title: str, command: str, given: Pat
     make_output_folder(out)
     if given is None or given.resolve() != kept.resolve():
         run.model.save(kept)
-    _write_matches(out / "matches.csv", [run.match], run.query, run.model)
+    match = run.match
+    if top is not None:
+        first = Candidates(*(column[:, :top] for column in result.candidates))
+        match = first.as_match(run.model.threshold)
+    _write_matches(out / "matches.csv", [match], run.query, run.model, top)
     write_report(out, result.report, result.pictures, title, command, str(run.model.summary()))
     _print_scores(result.report, out)
 
 
-def _write_matches(path: Path, matches: Iterable[Match], query: Traverse, model: DejaVu) -> tuple[int, int]:
+def _write_matches(
+    path: Path, matches: Iterable[Match], query: Traverse, model: DejaVu, ranks: int | None = None
+) -> tuple[int, int]:
     """Write the matches of a query that the map was asked for; returns how many (queries, accepted)."""
     from dejavu_torch.evaluation.matches import write_matches
 
     frames, source = None, query
     if isinstance(query, ResampledTraverse):
         frames, source = query.frame, query.traverse
-    return write_matches(path, matches, frames, model.map.frame_of, source.frame_name, model.frame_name)
+    names = source.frame_name, model.frame_name
+    return write_matches(path, matches, frames, model.map.frame_of, *names, ranks)
 
 
 def _print_scores(report: Report, out: Path) -> None:

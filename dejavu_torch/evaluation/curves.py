@@ -149,6 +149,33 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
     )
 
 
+def recall_at(candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, first: int) -> float | None:
+    """Share of the queries with a right answer that have one among their first candidates.
+
+    Args:
+        candidates: places of each query, the reported one first, -1 for none.
+        truth, tolerance: as of `evaluate`; the queries that count are the same.
+        first: how many of the candidates.
+
+    Shape: (Q,K).
+
+    Returns:
+        None where there are fewer candidates than `first`, or no query counts.
+
+    Example:
+        >>> places, right = torch.tensor([[7, 0], [9, 4]]), torch.tensor([[0], [1]])
+        >>> [recall_at(places, right, 0, first) for first in (1, 2, 3)]
+        [0.0, 0.5, None]
+    """
+    truth = as_ground_truth(truth)
+    kept = counted(candidates[:, 0], truth, tolerance)
+    if candidates.shape[1] < first or not kept.any():
+        return None
+    positives = truth.positives[kept]
+    right = torch.stack([is_right(place, positives, tolerance) for place in candidates[kept, :first].T])
+    return int(right.any(0).sum()) / max(1, int((positives >= 0).any(1).sum()))
+
+
 def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> dict[str, int]:
     """How many queries there are, and how many of them the scores count; the keys are keys of report.json.
 

@@ -1,4 +1,4 @@
-"""Matches as a csv of query,place,score,accepted,query_name,place_name."""
+"""Matches as a csv of query,place,score,accepted[,rank],query_name,place_name."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torch import Tensor
 from dejavu_torch.data.files import as_number, read_text, whole_file
 from dejavu_torch.types import InputError, Match
 
-COLUMNS = ("query", "place", "score", "accepted", "query_name", "place_name")
-EXPECTED = "columns query,place,score and, if wanted, accepted"
+NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
+EXPECTED = "columns query,place,score and, if wanted, accepted and rank"
 _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 
 
@@ -23,10 +23,12 @@ class Matches(NamedTuple):
     """Matches read from a file, in its order.
 
     query: (Q,) int64, the frame number of each query. match: Match of (Q,), its index a frame number as well.
+    candidates: (Q,K) int64, the frames of the K ranks of each query, -1 for none; K is 1 without ranks.
     """
 
     query: Tensor
     match: Match
+    candidates: Tensor
 
 
 def write_matches(
@@ -36,10 +38,12 @@ def write_matches(
     frame_of: Callable[[Tensor], Tensor] | None = None,
     query_name: Callable[[int], str] | None = None,
     place_name: Callable[[int], str] | None = None,
+    ranks: int | None = None,
 ) -> tuple[int, int]:
-    """Write matches that come in parts as a csv; returns how many (queries, accepted).
+    """Write matches that come in parts as a csv; returns how many (queries, accepted at their first rank).
 
     Args:
+        matches: one a query, in order; with `ranks`, that many a query, as `Candidates.as_match` gives.
         query_frames: (Q,) int64, the frame of its source that each query shows; None where query i is
             frame i.
         frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None where place i is
@@ -47,23 +51,27 @@ def write_matches(
         query_name, place_name: the name of a frame of the query's and of the reference's source, as
             `Traverse.frame_name`; None leaves the column empty. A character that is not printable, such as a
             line break, is escaped.
+        ranks: how many matches each query has; None is one, and no column for the rank.
 
     Convention 11: query and place count frames of the sources, -1 where no place is reported.
     """
     total = accepted = 0
+    each = 1 if ranks is None else ranks
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(COLUMNS)
+        writer.writerow([*NUMBERS, *([] if ranks is None else ["rank"]), *NAMES])
         for match in matches:
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
-            first, total = total, total + len(match.index)
+            first, total = total, total + len(match.index) // each
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places = match.index if frame_of is None else frame_of(match.index)
-            columns = (queries, places, match.score, match.accepted)
-            for query, place, score, good in zip(*(column.tolist() for column in columns), strict=True):
+            rank = torch.arange(each).repeat(len(queries)) + 1
+            columns = (queries.repeat_interleave(each), places, match.score, match.accepted, rank)
+            for query, place, score, good, at in zip(*(column.tolist() for column in columns), strict=True):
                 names = _name(query_name, query), _name(place_name, place)
-                writer.writerow([query, place, f"{score:.{digits}g}", int(good), *names])
-                accepted += good
+                ranked = [] if ranks is None else [at]
+                writer.writerow([query, place, f"{score:.{digits}g}", int(good), *ranked, *names])
+                accepted += good and at == 1
     return total, accepted
 
 
@@ -79,8 +87,9 @@ def read_matches(path: Path) -> Matches:
         path: a csv with a header. query: number of the query frame, in any order, each once or in lines that
             follow one another, as where resampled footage shows a frame several times. place: number of the
             reported frame of the reference, -1 for none. score: lower is better, inf for none. accepted: 1 or
-            0; where the column is missing, every match with a finite score is accepted. Other columns are
-            ignored.
+            0; where the column is missing, every match with a finite score is accepted. rank: where there is
+            such a column, the lines of a query are its candidates, ranks 1 to K in this order with one K for
+            all queries, and the first is its match. Other columns are ignored.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
         accepted.
@@ -91,25 +100,38 @@ def read_matches(path: Path) -> Matches:
     queries: list[int] = []
     seen: set[int] = set()
     reports: list[tuple[int, float, bool]] = []
+    ranked: list[list[int]] = []
     for where, cells in _rows(path):
         query, place = (
             _whole(cells[name], name, least, where) for name, least in (("query", 0), ("place", -1))
         )
-        if query in seen and query != queries[-1]:
+        rank = _whole(cells.get("rank", "1"), "rank", 1, where)
+        if rank > 1 and not (ranked and query == queries[-1] and rank == len(ranked[-1]) + 1):
+            follows = f" or rank {len(ranked[-1]) + 1} of query {queries[-1]}" if ranked else ""
+            raise InputError(f"{where}: rank {rank} of query {query}; expected rank 1{follows}")
+        if rank == 1 and query in seen and query != queries[-1]:
             raise InputError(f"{where}: query {query} is there twice; expected each once")
         score = _score(cells["score"], where)
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:
             raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
         nothing = place < 0 or math.isinf(score)
+        if rank > 1:
+            ranked[-1].append(-1 if nothing else place)
+            continue
+        ranked.append([-1 if nothing else place])
         queries.append(query)
         seen.add(query)
         reports.append((-1, math.inf, False) if nothing else (place, score, accepted))
     if not queries:
         raise InputError(f"{path} holds no matches; expected a line for each query")
+    for query, places in zip(queries, ranked, strict=True):
+        if len(places) != len(ranked[0]):
+            seen_ = f"query {query} has {len(places)} ranks"
+            raise InputError(f"{path}: {seen_}; expected {len(ranked[0])}, as query {queries[0]} has")
     index, scores, accepted_ = zip(*reports, strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
-    return Matches(torch.tensor(queries), match)
+    return Matches(torch.tensor(queries), match, torch.tensor(ranked))
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

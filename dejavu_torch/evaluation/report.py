@@ -171,6 +171,10 @@ def summary(report: Report) -> str:
         lines.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")
     if "with_answer" in facts:
         lines.append(f"{facts['with_answer']} of the queries have a right answer")
+    if facts.get("recall_at_5") is not None:
+        text = f"{percent(facts['recall_at_5'])} of them have a right place among their first 5 candidates"
+        ten = facts.get("recall_at_10")
+        lines.append(text if ten is None else f"{text}, {percent(ten)} among the first 10")
     if facts.get("ignored"):
         lines.append(f"{facts['ignored']} report a place that counts neither as right nor as wrong")
     if "accepted_right" in facts:

@@ -31,7 +31,7 @@ from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
-from dejavu_torch.experiments.evaluate import evaluation_facts
+from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
 from dejavu_torch.experiments.storage import noise_over_map, storage_curve
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
@@ -40,6 +40,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
+from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, Traverse
 
@@ -53,12 +54,14 @@ class Comparison(NamedTuple):
     """A comparison's figures and pictures, and the run they are of.
 
     The run's traverses are as they were learned and localized, resampled where the model asks for it; its
-    match and truth count places.
+    match and truth count places. candidates: of each query the best places, no two within the tolerance, as
+    many as were wanted or as a score takes.
     """
 
     report: Report
     pictures: Mapping[str, Picture]
     run: Localization
+    candidates: Candidates
 
 
 def compare(
@@ -74,6 +77,7 @@ def compare(
     second: Views | None = None,
     others: Mapping[str, tuple[str, DejaVu]] | None = None,
     sequence: SequenceMatcher | None = None,
+    top: int = 1,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -95,6 +99,7 @@ def compare(
             resamples.
         sequence: adds the scores of consecutive queries up, those of the map and of all that it is set
             beside.
+        top: how many candidates of each query are wanted.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -112,6 +117,7 @@ def compare(
         reference = model.resample(reference, model.step if has_map else None, progress)
     with timed(seconds, "localize"):
         query = model.resample(query, getattr(reference, "step", None), progress)
+    check_candidates(top, tolerance, reference.length)  # before the long work
     find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
     lengths_known = reference.length is not None and query.length is not None
     known = find_truth() if lengths_known else None  # one that does not fit is refused before the long work
@@ -133,6 +139,8 @@ def compare(
         model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)
         match = model.localize_descriptors(queries, sequence)
+    ranks = max(top, min(max(RANKS), model.map.places))
+    candidates = model.candidates_of_descriptors(queries, ranks, tolerance, sequence)
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
@@ -160,9 +168,10 @@ def compare(
             model.map.positions,
             describe_ground_truth(truth, interpolate, carried),
         ),
+        **candidate_facts(model.map.scored(candidates.index), known, tolerance),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
-    return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run)
+    return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run, candidates)
 
 
 @contextmanager

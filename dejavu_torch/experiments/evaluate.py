@@ -22,6 +22,7 @@ from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
     count_queries,
     curve_of,
+    recall_at,
     threshold_of_full_precision,
 )
 from dejavu_torch.evaluation.matches import read_matches
@@ -30,6 +31,8 @@ from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.model import read_place_map
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+
+RANKS = (5, 10)  # among so many candidates a right place is looked for
 
 
 class Evaluation(NamedTuple):
@@ -78,19 +81,21 @@ def evaluate_file(
     if place_map is not None:
         places = place_map.places
         frames = len(positions) if resampled else places
-    queries, match = read_matches(matches)
-    if frames is not None and int(match.index.max()) >= frames:
-        raise InputError(f"{matches} reports place {int(match.index.max())}; expected one below {frames}")
+    queries, match, candidates = read_matches(matches)
+    if frames is not None and int(candidates.max()) >= frames:
+        raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
         raise InputError("there is no ground truth; expected one, or traverses that carry their positions")
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         match = match._replace(index=place_map.place_of(match.index))
+        candidates = place_map.place_of(candidates)
     facts = evaluation_facts(
         match, known, tolerance, positions, describe_ground_truth(truth, interpolate, positions=True)
     )
     accepted = facts["accepted"]
+    facts |= candidate_facts(candidates, known, tolerance)
     facts |= {
         "accepted_precision": facts["accepted_right"] / accepted if accepted else None,
         "matches": str(matches),
@@ -128,3 +133,11 @@ def evaluation_facts(
         facts["truth"] = described
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, truth, tolerance))
     return facts
+
+
+def candidate_facts(candidates: Tensor, truth: GroundTruth | None, tolerance: int) -> dict[str, float | None]:
+    """What every report.json holds of candidates (Q,K), best first, places as a ground truth counts them."""
+    return {
+        f"recall_at_{first}": None if truth is None else recall_at(candidates, truth, tolerance, first)
+        for first in RANKS
+    }

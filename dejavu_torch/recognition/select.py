@@ -33,6 +33,10 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
     if scores.ndim != 2 or scores.shape[1] < 1:
         raise InputError(f"scores are {tuple(scores.shape)}; expected (Q,N) with N >= 1")
     score, index = scores.min(1)
+    return Match(torch.where(score.isfinite(), index, -1), score, accept(score, threshold))
+
+
+def accept(score: Tensor, threshold: float | None) -> Tensor:
+    """Eq. 6: which finite scores are below the threshold; None accepts all of them."""
     found = score.isfinite()
-    accepted = found if threshold is None else found & (score < threshold)
-    return Match(torch.where(found, index, -1), score, accepted)
+    return found if threshold is None else found & (score < threshold)

@@ -21,6 +21,7 @@ from dejavu_torch.evaluation.curves import (
     curve_of,
     evaluate,
     pr_curve,
+    recall_at,
     recall_at_full_precision,
     threshold_of_full_precision,
 )
@@ -359,3 +360,23 @@ def test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more() -> 
         assert threshold is not None
         assert int((score < threshold).sum()) == count
     assert threshold_of_full_precision(pr_curve(score, ~every, every)) is None
+
+
+# candidates
+
+
+def test_a_right_place_among_the_first_candidates() -> None:
+    """By hand: right at rank 1, 2, 3, never; no answer; not known."""
+    candidates = torch.tensor(
+        [[10, 50, 90], [50, 12, 90], [50, 90, 8], [50, 90, -1], [10, 20, 30], [1, 2, 3]]
+    )
+    positives = torch.tensor([[10, -1], [10, -1], [70, 10], [10, -1], [-1, -1], [-1, -1]])
+    judged = torch.tensor([True] * 5 + [False])
+    truth = GroundTruth(positives, judged, torch.zeros(6, 0, dtype=torch.int64))
+    assert [recall_at(candidates, truth, 2, first) for first in (1, 2, 3, 4)] == [1 / 4, 2 / 4, 3 / 4, None]
+    assert recall_at(candidates, truth, 1, 3) == 1 / 4
+    # an ignored place at rank 1 takes the query out of every score; behind it, it does not
+    ignored = truth._replace(ignored=torch.tensor([[-1], [50], [90], [-1], [-1], [-1]]))
+    assert [recall_at(candidates, ignored, 2, first) for first in (1, 2, 3)] == [1 / 3, 1 / 3, 2 / 3]
+    nothing = truth._replace(judged=torch.zeros(6, dtype=torch.bool))
+    assert recall_at(candidates, nothing, 2, 1) is None

@@ -38,7 +38,7 @@ def written(folder: Path, text: str | bytes) -> Path:
 
 def told(path: Path) -> list[tuple[int, int, float, bool]]:
     """The rows that were read, by query."""
-    queries, match = read_matches(path)
+    queries, match, _ = read_matches(path)
     assert [queries.dtype, match.index.dtype, match.score.dtype] == [torch.int64, torch.int64, torch.float64]
     assert match.accepted.dtype == torch.bool
     columns = (queries, *match)
@@ -56,7 +56,7 @@ def test_what_is_written_in_parts_is_read(
     parts = zip(*(column.split(size) for column in match), strict=True)
     path = scratch / "m.csv"
     assert write_matches(path, (Match(*part) for part in parts)) == (len(rows), int(match.accepted.sum()))
-    queries, read = read_matches(path)
+    queries, read, _ = read_matches(path)
     assert queries.tolist() == list(range(len(rows)))
     assert torch.equal(read.index, match.index)
     assert torch.equal(read.accepted, match.accepted)
@@ -131,6 +131,60 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
         read_matches(tmp_path)
 
 
+# ranks
+
+RANKED = "query,place,score,accepted,rank\n4,7,0.5,1,1\n4,20,0.6,0,2\n9,3,0.1,1,1\n9,-1,inf,0,2\n"
+
+
+def test_of_ranked_rows_the_first_is_the_match(tmp_path: Path) -> None:
+    path = written(tmp_path, RANKED)
+    assert told(path) == [(4, 7, 0.5, True), (9, 3, 0.1, True)]
+    assert read_matches(path).candidates.tolist() == [[7, 20], [3, -1]]
+    assert read_matches(written(tmp_path, PLAIN)).candidates.tolist() == [[7], [-1], [3]]
+
+
+@given(st.integers(1, 5), st.integers(1, 5), st.integers(1, 5))
+def test_ranked_matches_are_written_in_parts_and_read(
+    scratch: Path, count: int, ranks: int, size: int
+) -> None:
+    rows = count * ranks
+    index, score, accepted = torch.randint(-1, 50, (rows,)), torch.rand(rows), torch.rand(rows) < 0.5
+    match = Match(index, torch.where(index < 0, torch.inf, score), accepted & (index >= 0))
+    parts = zip(*(column.split(size * ranks) for column in match), strict=True)
+    path, frames = scratch / "ranked.csv", torch.arange(count) // 2  # a frame may be two queries
+    first = Match(*(column[::ranks] for column in match))
+    assert write_matches(path, (Match(*part) for part in parts), frames, ranks=ranks) == (
+        count,
+        int(first.accepted.sum()),
+    )
+    queries, read, candidates = read_matches(path)
+    assert queries.tolist() == frames.tolist()
+    assert torch.equal(read.index, first.index)
+    assert torch.equal(read.score.float(), first.score)
+    assert torch.equal(read.accepted, first.accepted)
+    assert torch.equal(candidates, index.view(count, ranks))
+    assert lines(path)[0] == "query,place,score,accepted,rank,query_name,place_name"
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("4,7,1,1,0\n", ("line 2", "rank is '0'", "at least 1")),
+        ("4,7,1,1,x\n", ("line 2", "rank is 'x'")),
+        ("4,7,1,1,\n", ("line 2", "rank is ''")),
+        ("4,7,1,1,2\n", ("line 2", "rank 2 of query 4", "expected rank 1")),
+        ("4,7,1,1,1\n4,8,1,1,3\n", ("line 3", "rank 3 of query 4", "rank 2 of query 4")),
+        ("4,7,1,1,1\n5,8,1,1,2\n", ("line 3", "rank 2 of query 5", "rank 2 of query 4")),
+        ("4,7,1,1,1\n5,8,1,1,1\n4,9,1,1,2\n", ("line 4", "rank 2 of query 4", "rank 2 of query 5")),
+        ("4,7,1,1,1\n4,8,1,1,2\n5,8,1,1,1\n", ("query 5 has 1 ranks", "expected 2, as query 4 has")),
+        ("4,7,1,1,1\n5,8,1,1,1\n5,9,1,1,2\n", ("query 5 has 2 ranks", "expected 1, as query 4 has")),
+    ],
+)
+def test_broken_ranks_are_refused(tmp_path: Path, rows: str, words: tuple[str, ...]) -> None:
+    with refused("matches.csv", *words):
+        read_matches(written(tmp_path, "query,place,score,accepted,rank\n" + rows))
+
+
 # frames of the sources, and their names
 
 MATCH = Match(torch.tensor([2, -1, 0]), torch.tensor([0.5, INF, 0.25]), torch.tensor([True, False, True]))
@@ -162,7 +216,7 @@ def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> 
         "4,-1,inf,0,q4.png,",
         "7,10,0.25,1,q7.png,0:00:10.000",
     ]
-    queries, match = read_matches(path)
+    queries, match, _ = read_matches(path)
     assert (queries.tolist(), match.index.tolist()) == ([4, 4, 7], [19, -1, 10])
 
 
@@ -170,7 +224,7 @@ def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> 
 def test_any_name_leaves_the_file_readable(scratch: Path, names: list[str]) -> None:
     path = scratch / "names.csv"
     write_matches(path, [MATCH], query_name=names.__getitem__, place_name=names.__getitem__)
-    queries, match = read_matches(path)
+    queries, match, _ = read_matches(path)
     assert queries.tolist() == [0, 1, 2]
     for one, other in zip(match, MATCH, strict=True):
         assert torch.equal(one, other.to(one.dtype))

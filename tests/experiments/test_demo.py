@@ -45,7 +45,8 @@ def report(demo: Path) -> dict[str, Any]:
 def test_report_has_every_key(report: dict[str, Any]) -> None:
     facts = (
         "frames queries tolerance recall_definition map_bytes route_bytes backbone_bytes bytes_per_place "
-        "route_bytes_per_place full_bytes lines periods chunks seconds_learn seconds_localize storage"
+        "route_bytes_per_place full_bytes lines periods chunks seconds_learn seconds_localize storage "
+        "recall_at_5 recall_at_10"
     )
     assert set(report) >= SCORES | set(facts.split()) | set(OTHERS)
     for name in OTHERS:
@@ -54,6 +55,7 @@ def test_report_has_every_key(report: dict[str, Any]) -> None:
     assert report["kind"] == "spectral"
     assert report["frames"] == report["queries"] == 3072
     assert report["tolerance"] == 5
+    assert report["recall_at_1"] <= report["recall_at_5"] <= report["recall_at_10"] <= 1
 
 
 def test_the_imposed_periods_are_among_the_strongest(report: dict[str, Any]) -> None:

@@ -1,0 +1,214 @@
+"""Several places for each query: in Python, in matches.csv and in the reports."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, frames, report_of, run
+from footage import QUERY, REFERENCE, camera, everything, footage
+from helpers import Fixed, refused, template_model
+
+from dejavu_torch import DejaVu, FrequencyLayer
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.matches import read_matches, write_matches
+from dejavu_torch.experiments.compare import compare
+from dejavu_torch.experiments.evaluate import evaluate_file
+from dejavu_torch.motion.resampling import ResampledTraverse
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("pair")
+    for name, seed in (("first", 1), ("second", 2)):
+        np.save(folder / f"{name}.npy", frames(96, seed))
+    return folder / "first.npy", folder / "second.npy"
+
+
+@pytest.fixture(scope="module")
+def route(pair: tuple[Path, Path]) -> Path:
+    path = pair[0].parent / "map.safetensors"
+    run("learn", pair[0], "--map", path)
+    return path
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.open(newline="")))
+
+
+# in Python
+
+
+def waves() -> torch.Tensor:
+    return torch.rand(90, 6, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture
+def model() -> DejaVu:
+    """A map whose last 10 places nothing covers, and of places that are alike."""
+    model = template_model(periods=Fixed(FrequencyLayer(20, 20, 0, 80, (0, 1, 2, 3))))
+    return model.learn(waves())
+
+
+@pytest.mark.parametrize("at_once", [1, 200, 10**6])
+def test_the_first_candidate_is_what_localize_finds(
+    monkeypatch: pytest.MonkeyPatch, model: DejaVu, at_once: int
+) -> None:
+    queries = torch.rand(40, 6, generator=torch.Generator().manual_seed(1))
+    index, score = model.candidates(queries, 5, apart=3)
+    monkeypatch.setattr("dejavu_torch.model.SCORES_AT_ONCE", at_once)
+    match = model.localize(queries)
+    found = model.candidates(ArrayTraverse(queries), 5, apart=3)
+    assert torch.equal(found.index, index)
+    assert torch.equal(found.score, score)
+    assert torch.equal(index[:, 0], match.index)
+    assert torch.equal(score[:, 0], match.score)
+    scores = model(queries)
+    assert torch.equal(scores.gather(1, index), score)
+    assert (score.diff(dim=1) >= 0).all()
+    apart = (index[:, :, None] - index[:, None]).abs() + 99 * torch.eye(5, dtype=torch.int64)
+    assert apart.min() > 3
+
+
+def test_behind_the_last_covered_place_there_is_none(model: DejaVu) -> None:
+    index, score = model.candidates(waves()[:7], 4, apart=30)
+    assert (index[:, -1] == -1).all()
+    assert score[:, -1].isinf().all()
+    assert index.max() < 80
+
+
+def test_numbers_that_cannot_be_are_refused_in_python(model: DejaVu) -> None:
+    with refused("91 candidates", "90 places"):
+        model.candidates(waves(), 91)
+    with refused("0 candidates"):
+        model.candidates(waves(), 0)
+    with refused("no map yet"):
+        DejaVu().candidates(waves(), 3)
+
+
+# in matches.csv
+
+
+def test_localize_writes_a_row_for_each_candidate(
+    route: Path, pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    run("localize", route, pair[1], "--out", tmp_path / "best.csv")
+    run("localize", route, pair[1], "--out", tmp_path / "top.csv", "--top", "10")
+    best, rows = rows_of(tmp_path / "best.csv"), rows_of(tmp_path / "top.csv")
+    assert list(rows[0]) == ["query", "place", "score", "accepted", "rank", "query_name", "place_name"]
+    assert [int(row["rank"]) for row in rows] == [*range(1, 11)] * 96
+    assert [{k: v for k, v in row.items() if k != "rank"} for row in rows[::10]] == best
+    expected = DejaVu.load(route).candidates(torch.from_numpy(frames(96, 2))[:, None] / 255, 10)
+    assert [int(row["place"]) for row in rows] == expected.index.flatten().tolist()
+
+
+def test_threshold_and_count_of_accepted(
+    route: Path, pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("localize", route, pair[1], "--out", tmp_path / "m.csv", "--top", "3")
+    scores = sorted(float(row["score"]) for row in rows_of(tmp_path / "m.csv"))
+    capsys.readouterr()
+    options = "--top", "3", "--threshold", str(scores[150])
+    run("localize", route, pair[1], "--out", tmp_path / "m.csv", *options)
+    rows = rows_of(tmp_path / "m.csv")
+    assert all((row["accepted"] == "1") == (float(row["score"]) < scores[150]) for row in rows)
+    first = sum(row["accepted"] == "1" for row in rows[::3])
+    assert f"96 queries, {first} accepted" in capsys.readouterr().out
+
+
+def test_compare_and_evaluate_agree(route: Path, pair: tuple[Path, Path], tmp_path: Path) -> None:
+    run("compare", *pair, "--map", route, "--tolerance", "1", "--top", "12", "--out", tmp_path / "c")
+    rows = rows_of(tmp_path / "c" / "matches.csv")
+    assert len(rows) == 96 * 12
+    places = torch.tensor([int(row["place"]) for row in rows]).view(96, 12)
+    near = (places[:, :, None] - places[:, None]).abs() <= 1
+    assert not (near & (places >= 0)[:, None]).sum(2).gt(1).any()
+    options = "--truth", "0", "--tolerance", "1", "--map", route
+    run("evaluate", tmp_path / "c" / "matches.csv", *options, "--out", tmp_path / "e")
+    right = (places - torch.arange(96)[:, None]).abs() <= 1
+    for first in (1, 5, 10):
+        expected = right[:, :first].any(1).double().mean().item()
+        for folder in ("c", "e"):
+            assert report_of(tmp_path / folder)[f"recall_at_{first}"] == pytest.approx(expected)
+    assert report_of(tmp_path / "c")["recall_at_1"] < report_of(tmp_path / "c")["recall_at_10"]
+
+
+def test_without_top_compare_counts_and_writes_matches_only(
+    route: Path, pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("compare", *pair, "--map", route, "--tolerance", "1", "--out", tmp_path / "c")
+    assert "among their first 5 candidates" in capsys.readouterr().out
+    assert report_of(tmp_path / "c")["recall_at_10"] > 0
+    assert len(rows_of(tmp_path / "c" / "matches.csv")) == 96
+    assert "rank" not in rows_of(tmp_path / "c" / "matches.csv")[0]
+    run("evaluate", tmp_path / "c" / "matches.csv", "--truth", "0", "--out", tmp_path / "e")
+    report = report_of(tmp_path / "e")
+    assert (report["recall_at_5"], report["recall_at_10"]) == (None, None)
+
+
+def test_as_many_ranks_as_the_file_has(tmp_path: Path) -> None:
+    rows = "".join(f"3,{10 * rank},0.{rank},1,{rank}\n" for rank in range(1, 8))
+    (tmp_path / "m.csv").write_text("query,place,score,accepted,rank\n" + rows)
+    facts = evaluate_file(tmp_path / "m.csv", "47").report.facts  # place 50: rank 5
+    assert (facts["queries"], facts["recall_at_5"], facts["recall_at_10"]) == (1, 1.0, None)
+
+
+def test_a_route_of_fewer_places_than_candidates() -> None:
+    waves = torch.rand(8, 3, generator=torch.Generator().manual_seed(3))
+    model = template_model(periods=Fixed(FrequencyLayer(8, 8, 0, 8, (0, 1, 2))))
+    result = compare(ArrayTraverse(waves), ArrayTraverse(waves + 0.01), model=model, tolerance=0)
+    report = result.report.as_json()
+    assert (report["recall_at_5"], report["recall_at_10"]) == (1.0, None)
+
+
+def test_without_a_truth_there_is_no_recall(tmp_path: Path) -> None:
+    waves = torch.rand(40, 3)
+    model = template_model(periods=Fixed(FrequencyLayer(40, 40, 0, 40, (0, 1, 2))))
+    report = compare(ArrayTraverse(waves), ArrayTraverse(waves[5:]), model=model).report.as_json()
+    assert (report["recall_at_5"], report["recall_at_10"]) == (None, None)
+    assert json.dumps(report)
+
+
+def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp_path: Path) -> None:
+    model = template_model(periods=everything(101), velocity=camera()).learn(footage(REFERENCE))
+    query = ArrayTraverse(footage(QUERY, noise=0.02))
+    steps = model.resample(query, model.step)
+    assert isinstance(steps, ResampledTraverse)
+    candidates = model.candidates(query, 5, apart=6)
+    assert torch.equal(candidates.index[:, 0], model.localize(query).index)
+    assert (candidates.index[:, :, None] - candidates.index[:, None]).abs().add(99 * torch.eye(5)).min() > 6
+    path = tmp_path / "m.csv"
+    write_matches(path, [candidates.as_match()], steps.frame, model.map.frame_of, ranks=5)
+    read = read_matches(path)
+    assert torch.equal(read.query, steps.frame)
+    assert torch.equal(read.candidates, model.map.frame_of(candidates.index))
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(("top", "words"), [("97", "at most 96"), ("0", "at least 1"), ("-2", "at least 1")])
+def test_numbers_that_cannot_be_are_refused(
+    route: Path,
+    pair: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    top: str,
+    words: str,
+) -> None:
+    capsys.readouterr()
+    assert words in fails(capsys, "localize", route, pair[1], "--out", tmp_path / "m.csv", "--top", top)
+    assert words in fails(capsys, "compare", *pair, "--map", route, "--top", top, "--out", tmp_path / "c")
+    assert not list(tmp_path.glob("m.csv*"))
+    assert not (tmp_path / "c" / "report.json").exists()
+
+
+def test_broken_ranks_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "m.csv").write_text("query,place,score,rank\n0,1,0.5,1\n0,9,0.6,3\n")
+    error = fails(capsys, "evaluate", tmp_path / "m.csv", "--truth", "0", "--out", tmp_path / "e")
+    assert "line 3" in error
+    assert "rank 3 of query 0" in error
