@@ -38,8 +38,8 @@ ARROWS = {
     "model": "types data features periods database recognition motion",
     "evaluation": "types resize data features periods database recognition motion model",
     "training": "types resize data features periods database recognition motion model evaluation",
-    "experiments": "types data features periods database motion model evaluation",
-    "cli": "types data features periods database motion model evaluation training experiments",
+    "experiments": "types data features periods database recognition motion model evaluation",
+    "cli": "types data features periods database recognition motion model evaluation training experiments",
 }
 
 
