@@ -63,7 +63,7 @@ def best_candidates(scores: Tensor, k: int, apart: int) -> Candidates:
         ranks.append((torch.where(found, index, -1), score))
         # a window cut off at an end of the route repeats that end, which is in it
         window = (index[:, None] + near).clamp(0, places - 1)
-        left = left.scatter(1, window, torch.inf).masked_fill(~found[:, None], torch.inf)
+        left.scatter_(1, window, torch.inf).masked_fill_(~found[:, None], torch.inf)
     return Candidates(*(torch.stack(column, 1) for column in zip(*ranks, strict=True)))
 
 
