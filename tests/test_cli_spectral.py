@@ -333,6 +333,8 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(tmp_path: Path) -> None:
         run("compare", one, two, "--tolerance", 1, "--sequence", length, "--out", tmp_path / f"{length}")
         reports[length] = report_of(tmp_path / f"{length}")
         assert reports[length]["sequence"] == length
+        page = (tmp_path / f"{length}" / "index.html").read_text()
+        assert ("together with the 8 before it" in page) == (length == 9)
     for key in ("uncompressed", "interpolated", "stride"):
         assert reports[9][key]["auc"] > reports[1][key]["auc"]
     assert reports[9]["null"]["auc"] != reports[1]["null"]["auc"]

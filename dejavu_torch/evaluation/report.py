@@ -167,6 +167,8 @@ def summary(report: Report) -> str:
         )
         both = f"of the reference and {query} of the query" if query else "of the reference"
         lines.append(f"{reference} frames {both} were resampled to even steps of {step:.4g} pixels of ground")
+    if facts.get("sequence", 1) > 1:
+        lines.append(f"Each was matched together with the {facts['sequence'] - 1} before it (--sequence)")
     if facts.get("unknown"):
         lines.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")
     if "with_answer" in facts:
