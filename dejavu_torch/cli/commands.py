@@ -142,6 +142,8 @@ def run_localize(
         query = model.resample(query, model.step, progress=True)
         _print_steps(query)
     matcher = _sequence_of(sequence)
+    if matcher is not None:
+        matcher.check(sequence if query.length is None else query.length, model.map.places)
     matches = model.matches(query, "localizing", matcher)
     if top is not None:
         candidates = model.candidate_batches(query, top, APART, "localizing", matcher)

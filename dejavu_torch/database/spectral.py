@@ -477,7 +477,7 @@ class SpectralMapper(Mapper):
             )
         if not self.exact:
             return _smallest_step(partial(_fits, lines, width, room / CODED), finest, coarsest)
-        aim, fitting = room, coarsest
+        aim, fitting, finer = room, coarsest, finest
         for _ in range(8):
             step = _smallest_step(partial(_fits, lines, width, aim), finest, coarsest)
             size = _coded_bytes(lines, width, lengths, step)
@@ -485,11 +485,16 @@ class SpectralMapper(Mapper):
                 fitting = min(fitting, step)
                 if size >= WITHIN * room or step == finest:
                     return step
+            else:
+                finer = max(finer, step)
             aim = entropy_bytes(quantise(lines, step, width)) * (1 + WITHIN) / 2 * room / size
-        step = fitting if fitting < coarsest else step
-        while _coded_bytes(lines, width, lengths, step) > room:
-            step *= 1.02
-        return step
+        for _ in range(12):  # the levels' entropy says little
+            step = math.sqrt(finer * fitting)
+            size = _coded_bytes(lines, width, lengths, step)
+            finer, fitting = (finer, step) if size <= room else (step, fitting)
+            if WITHIN * room <= size <= room:
+                break
+        return fitting
 
 
 class SpectralCode(nn.Module):

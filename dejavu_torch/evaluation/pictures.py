@@ -202,7 +202,9 @@ def draw_scores(run: Localization) -> dict[str, Picture]:
             plot_score_matrix(matrix, run.scored, run.truth, run.borders, run.query_frames),
             "how well each place fits each query",
             "Dark: the place fits the query about as well as its best one does. What repeats shows as lines "
-            "beside the right places." + (f" Drawn: {'; '.join(shares)}." if shares else ""),
+            "beside the right places."
+            + ("" if run.sequence is None else " Of single queries; the matches are of sequences.")
+            + (f" Drawn: {'; '.join(shares)}." if shares else ""),
         )
     }
 

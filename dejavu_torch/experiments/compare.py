@@ -109,6 +109,7 @@ def compare(
     itself = reference is query
     reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
+    check_candidates(top, tolerance)
     features = _check_sizes(model, reference, query)
     seconds: dict[str, float] = defaultdict(float)
     has_map = model.map.places > 0
@@ -138,9 +139,11 @@ def compare(
     with timed(seconds, "localize"):
         model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)
-        match = model.localize_descriptors(queries, sequence)
-    ranks = max(top, min(max(RANKS), model.map.places))
-    candidates = model.candidates_of_descriptors(queries, ranks, tolerance, sequence)
+        if sequence is not None:
+            sequence.check(len(queries), model.map.places)
+        ranks = max(top, min(max(RANKS), model.map.places))
+        candidates = model.candidates_of_descriptors(queries, ranks, tolerance, sequence)
+    match = Candidates(*(column[:, :1] for column in candidates)).as_match(model.threshold)
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:

@@ -28,7 +28,8 @@ class SequenceMatcher(nn.Module):
 
     Convention: the first queries have fewer before them, and use these. The part of a trajectory that lies
         off the map, or on places that nothing covers, is left out of the mean; less than half of it on the
-        map scores +inf. Half a place is rounded up. Gradients reach the scores.
+        map scores +inf, and so does a place that nothing covers for the latest query. Half a place is rounded
+        up. Gradients reach the scores.
 
     Source: constant-speed search of SeqSLAM (Milford and Wyeth, ICRA 2012), causal and without its
         normalisation.
@@ -45,16 +46,18 @@ class SequenceMatcher(nn.Module):
 
     def __init__(self, length: int = 11, speeds: Sequence[float] = (1.0,)) -> None:
         super().__init__()
-        if length < 1:
-            raise InputError(f"a sequence of {length} queries; expected at least 1")
+        if not isinstance(length, int) or length < 1:
+            raise InputError(f"a sequence of {length} queries; expected a whole number, at least 1")
         if not len(speeds) or not all(math.isfinite(speed) for speed in speeds):
             raise InputError(f"the speeds are {list(speeds)}; expected finite numbers of places a query")
         self.length, self.speeds = length, tuple(float(speed) for speed in speeds)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
-        if scores.ndim != 2 or (before is not None and before.shape[1:] != scores.shape[1:]):
-            seen = f"{tuple(scores.shape)}" + (f" behind {tuple(before.shape)}" if before is not None else "")
-            raise InputError(f"scores are {seen}; expected (Q,N), and (R,N) ahead of them")
+        fits = before is None or before.shape[1:] == scores.shape[1:]
+        if scores.ndim != 2 or not fits or not scores.is_floating_point():
+            seen = f"{tuple(scores.shape)} {scores.dtype}"
+            seen += f" behind {tuple(before.shape)}" if before is not None else ""
+            raise InputError(f"scores are {seen}; expected floats (Q,N), and (R,N) ahead of them")
         if self.length == 1:
             return scores
         rows = scores if before is None else torch.cat([before[1 - self.length :], scores])
@@ -77,21 +80,31 @@ class SequenceMatcher(nn.Module):
                 inside[first:, to] += count[part, of]
             mean = total / inside.clamp(min=1)
             best = torch.minimum(best, torch.where(2 * inside >= used, mean, math.inf))
-        return best
+        return torch.where(scores.isfinite(), best, math.inf)
 
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
         """As `forward`, of scores (B,N) that come in batches one behind the other.
 
-        Between two batches T - 1 rows are kept, however many queries there are. A line says where there are
-        fewer queries than T.
+        Between two batches T - 1 rows are kept, however many queries there are.
         """
-        before, count = None, 0
+        before = None
         for scores in batches:
             yield self(scores, before)
             rows = scores if before is None else torch.cat([before, scores])
-            before, count = rows[max(0, len(rows) - self.length + 1) :], count + len(scores)
-        if count < self.length:
-            log.warning("a sequence of %d queries, but there are %d: all of them count", self.length, count)
+            before = rows[max(0, len(rows) - self.length + 1) :]
+
+    def check(self, queries: int, places: int) -> None:
+        """Say where there are fewer queries than T; refuse fewer places.
+
+        Raises:
+            InputError: naming both.
+        """
+        if self.length > places:
+            raise InputError(
+                f"a sequence of {self.length} queries on a map of {places} places; expected at most as many"
+            )
+        if self.length > queries:
+            log.warning("a sequence of %d queries, but there are %d: all of them count", self.length, queries)
 
     def extra_repr(self) -> str:
         return f"length={self.length}, speeds={list(self.speeds)}"

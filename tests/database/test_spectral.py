@@ -145,10 +145,12 @@ def test_names_leave_the_lines_half_of_what_mean_and_chunks_leave(caplog: pytest
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.2])
 def test_the_budget_is_met_where_levels_are_nearly_all_different(numbers: int, share: float) -> None:
     """Of few large levels the counts say little of what they take."""
-    noise = torch.randn(200, numbers)
-    learned = SpectralMapper(numbers * share + 0.4)(noise).summary()
-    assert learned.route_bytes <= (numbers * share + 0.4) * 200
-    assert learned.lines > 50 * numbers
+    budget = numbers * share + 0.4
+    for noise in (torch.randn(200, numbers), torch.randn(200, numbers) / torch.rand(200, numbers)):
+        learned = SpectralMapper(budget)(noise)
+        finest = float(learned.steps) < 0.02 * float(learned.rebuilt(0).std())  # no finer step is tried
+        assert learned.summary().route_bytes <= budget * 200
+        assert learned.summary().route_bytes >= 0.97 * budget * 200 or finest
 
 
 def test_a_budget_that_no_line_fits_in_is_refused() -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch import DejaVu, SequenceMatcher
+from dejavu_torch import DejaVu, SequenceMatcher, compare
 from dejavu_torch.types import FrequencyLayer, Match
 
 
@@ -29,7 +29,7 @@ def literal(scores: list[list[float]], length: int, speeds: list[float]) -> list
                     for k, place in enumerate(passed)
                     if 0 <= place < places and math.isfinite(scores[t - k][place])
                 ]
-                if on_map and 2 * len(on_map) >= used:
+                if math.isfinite(scores[t][i]) and 2 * len(on_map) >= used:
                     best = min(best, sum(on_map) / len(on_map))
             row.append(best)
         found.append(row)
@@ -105,13 +105,21 @@ def test_a_sequence_finds_what_single_frames_do_not(kind: str) -> None:
     assert torch.equal(model.localize(route(1), sequence=SequenceMatcher(15)).index, many.index)
 
 
-def test_a_sequence_longer_than_the_queries_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    model = DejaVu(whitening="none").learn(route(0))
-    model.localize(route(1)[:6], sequence=SequenceMatcher(11))
-    assert "a sequence of 11 queries, but there are 6" in caplog.text
-    caplog.clear()
-    model.localize(route(1)[:11], sequence=SequenceMatcher(11))
-    assert not caplog.text
+def test_a_sequence_longer_than_the_queries_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    model = DejaVu(whitening="none")
+    compare(route(0), route(1)[:6], "0", model, sequence=SequenceMatcher(11))
+    told = [line for line in caplog.messages if "sequence" in line]
+    assert told == ["a sequence of 11 queries, but there are 6: all of them count"]
+    SequenceMatcher(11).check(11, 11)
+    with refused("a sequence of 11 queries on a map of 10 places"):
+        SequenceMatcher(11).check(20, 10)
+
+
+def test_convention_2_a_place_that_nothing_covers_is_not_reported() -> None:
+    layer = FrequencyLayer(20, 20, 0, 80, (0, 1, 2, 3))
+    model = template_model(periods=Fixed(layer)).learn(route(0)[:90])
+    found = model.localize(route(1)[:90], sequence=SequenceMatcher(9))
+    assert found.index.max() < 80
 
 
 def test_settings_that_make_no_sequence_are_refused() -> None:
@@ -121,9 +129,13 @@ def test_settings_that_make_no_sequence_are_refused() -> None:
         SequenceMatcher(3, [])
     with refused("speeds are [1.0, nan]", "finite"):
         SequenceMatcher(3, [1.0, math.nan])
+    with refused("a sequence of 2.5 queries", "whole number"):
+        SequenceMatcher(2.5)  # type: ignore[arg-type]
+    with refused("(3, 4) torch.int64", "floats"):
+        SequenceMatcher(3)(torch.zeros(3, 4, dtype=torch.int64))
     with refused("scores are (4,)", "(Q,N)"):
         SequenceMatcher(3)(torch.rand(4))
-    with refused("(2, 4) behind (3, 5)"):
+    with refused("(2, 4) torch.float32 behind (3, 5)"):
         SequenceMatcher(3)(torch.rand(2, 4), torch.rand(3, 5))
 
 
