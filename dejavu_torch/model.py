@@ -279,7 +279,7 @@ class DejaVu(nn.Module):
             step, source, frames = traverse.step, traverse.traverse, len(traverse.positions)
             positions = traverse.positions.to(positions.device)
         names = [] if source is None else names_of(source, frames)
-        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names), len(features))
+        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names))
         with torch.no_grad():
             route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
         if route.places != len(features) or route.dimension != features.shape[1]:

@@ -197,8 +197,8 @@ class Mapper(nn.Module, ABC):
     def empty(self) -> PlaceMap:
         """A map without places, which can load any map of this mapper."""
 
-    def beside(self, taken: int, places: int) -> Mapper:
-        """The mapper that leaves room for what a file holds of the places beside the map, in bytes.
+    def beside(self, taken: int) -> Mapper:
+        """The mapper that leaves room for so many bytes, which a file holds of the places beside the map.
 
         A mapper without a budget is itself.
         """

@@ -440,10 +440,11 @@ class SpectralMapper(Mapper):
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
     def empty(self) -> SpectralMap:
-        settings = self.metric, self.transform, self.chunk, self.resolution
-        return SpectralMap(None, None, None, None, None, *settings)
+        return SpectralMap(
+            metric=self.metric, transform=self.transform, chunk=self.chunk, resolution=self.resolution
+        )
 
-    def beside(self, taken: int, places: int) -> SpectralMapper:
+    def beside(self, taken: int) -> SpectralMapper:
         other = copy.copy(self)
         other.taken = taken
         return other

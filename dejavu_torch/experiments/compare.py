@@ -262,11 +262,8 @@ def _contenders(run: Localization, seed: int, leave_out: int | None, progress: b
 
 def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
     """Another model that learns the run's reference."""
-    match, summary = (
-        other.learn(run.reference).localize(run.query, sequence=run.sequence),
-        other.summary(),
-    )
-    match = of_shown_frames(match, run.model.map)
+    found = other.learn(run.reference).localize(run.query, sequence=run.sequence)
+    match, summary = of_shown_frames(found, run.model.map), other.summary()
     return contend(name, match, run.truth, run.tolerance, bytes=summary.map_bytes, fixed=summary.fixed_bytes)
 
 

@@ -136,7 +136,7 @@ def test_names_leave_the_lines_half_of_what_mean_and_chunks_leave(caplog: pytest
     """Of 5 bytes per place the chunks take over 2: with names of 2 more next to nothing would fit."""
     mapper, features = SpectralMapper(5.0, chunk=12), route(400, 24)
     alone = mapper(features).summary()
-    beside = mapper.beside(800, 400)(features).summary()
+    beside = mapper.beside(800)(features).summary()
     assert "come on top" in caplog.messages[-1]
     assert beside.lines == alone.lines > 0
 
