@@ -22,6 +22,7 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     IV-C   precision, recall, area               pr_curve, evaluate  evaluation.curves
     V      (ours) beside baselines and nulls     compare             experiments.compare
     VI     (ours) several queries one by one     SequenceMatcher     recognition.sequence
+    VI     (ours) probabilities on the way        PlaceFilter         recognition.filter
     VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
            frames to train on                    RouteData           training.datamodule
            any backbone                          Embedding           features.embedding
@@ -51,11 +52,12 @@ if TYPE_CHECKING:
     from dejavu_torch.motion.odometry import GroundOdometry
     from dejavu_torch.periods.imposed import ImposedPeriods
     from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+    from dejavu_torch.recognition.filter import PlaceFilter
     from dejavu_torch.recognition.select import best_match
     from dejavu_torch.recognition.sequence import SequenceMatcher
     from dejavu_torch.training.datamodule import RouteData
     from dejavu_torch.training.task import PlaceRecognitionTask
-    from dejavu_torch.types import FrequencyLayer, InputError, Match, PRCurve, Traverse
+    from dejavu_torch.types import FrequencyLayer, InputError, Match, Traverse
 
 __version__ = "0.1.0"
 
@@ -68,8 +70,8 @@ __all__ = [
     "ImposedPeriods",
     "InputError",
     "Match",
-    "PRCurve",
     "PhaseTemplates",
+    "PlaceFilter",
     "PlaceMap",
     "PlaceRecognitionTask",
     "Preprocess",
@@ -102,8 +104,8 @@ _HOMES = {
     "ImposedPeriods": "periods.imposed",
     "InputError": "types",
     "Match": "types",
-    "PRCurve": "types",
     "PhaseTemplates": "database.templates",
+    "PlaceFilter": "recognition.filter",
     "PlaceMap": "database.place_map",
     "PlaceRecognitionTask": "training.task",
     "Preprocess": "features.preprocess",

@@ -38,7 +38,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.candidates import Candidates, best_candidates, check_candidates
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.types import InputError, Match, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -314,14 +314,15 @@ class DejaVu(nn.Module):
         self,
         queries: Traverse | Tensor,
         progress: str | None = None,
-        sequence: SequenceMatcher | None = None,
+        sequence: SequenceModel | None = None,
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
         Args:
             queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D).
             progress: text of a progress bar on a terminal; None is no bar.
-            sequence: adds the scores of consecutive queries up; None takes each by itself.
+            sequence: scores consecutive queries together, as `SequenceMatcher` and `PlaceFilter` do; None
+                takes each by itself.
 
         Shape: -> Match of (Q,) on the CPU.
 
@@ -333,7 +334,7 @@ class DejaVu(nn.Module):
         return _joined(self.matches(queries, progress, sequence))
 
     def localize_descriptors(
-        self, descriptors: Tensor, sequence: SequenceMatcher | None = None, order: Tensor | None = None
+        self, descriptors: Tensor, sequence: SequenceModel | None = None, order: Tensor | None = None
     ) -> Match:
         """As `localize`, of descriptors (Q,K) as the map's own are: whitened where the model whitens.
 
@@ -347,7 +348,7 @@ class DejaVu(nn.Module):
         self,
         queries: Traverse | Tensor,
         progress: str | None = None,
-        sequence: SequenceMatcher | None = None,
+        sequence: SequenceModel | None = None,
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
@@ -358,7 +359,7 @@ class DejaVu(nn.Module):
         queries: Traverse | Tensor,
         k: int,
         apart: int = 5,
-        sequence: SequenceMatcher | None = None,
+        sequence: SequenceModel | None = None,
     ) -> Candidates:
         """The k best places of each query, no two of them near each other; the first is `localize`'s.
 
@@ -380,7 +381,7 @@ class DejaVu(nn.Module):
         return _ranked(self.candidate_batches(queries, k, apart, sequence=sequence))
 
     def candidates_of_descriptors(
-        self, descriptors: Tensor, k: int, apart: int = 5, sequence: SequenceMatcher | None = None
+        self, descriptors: Tensor, k: int, apart: int = 5, sequence: SequenceModel | None = None
     ) -> Candidates:
         """As `candidates`, of descriptors (Q,K) as the map's own are."""
         self._require_map()
@@ -392,7 +393,7 @@ class DejaVu(nn.Module):
         k: int,
         apart: int = 5,
         progress: str | None = None,
-        sequence: SequenceMatcher | None = None,
+        sequence: SequenceModel | None = None,
     ) -> Iterator[Candidates]:
         """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
@@ -411,21 +412,27 @@ class DejaVu(nn.Module):
             yield self.whitened(features)
 
     def _found(
-        self, batches: Iterable[Tensor], sequence: SequenceMatcher | None, order: Tensor | None = None
+        self, batches: Iterable[Tensor], sequence: SequenceModel | None, order: Tensor | None = None
     ) -> Iterator[Match]:
         """Matches of batches of descriptors."""
+        threshold = self.threshold_of(sequence)
         for part in self._scored(batches, sequence, order):
-            yield Match(*(column.cpu() for column in best_match(part, self.threshold)))
+            yield Match(*(column.cpu() for column in best_match(part, threshold)))
 
     def _candidates(
-        self, batches: Iterable[Tensor], k: int, apart: int, sequence: SequenceMatcher | None
+        self, batches: Iterable[Tensor], k: int, apart: int, sequence: SequenceModel | None
     ) -> Iterator[Candidates]:
         """Candidates of batches of descriptors."""
         for part in self._scored(batches, sequence):
             yield Candidates(*(column.cpu() for column in best_candidates(part, k, apart)))
 
+    def threshold_of(self, sequence: SequenceModel | None) -> float | None:
+        """What the score of a query, or of a sequence, has to be below to be accepted."""
+        return self.threshold if sequence is None else sequence.threshold_of(self.threshold)
+
+    @torch.no_grad()
     def _scored(
-        self, batches: Iterable[Tensor], sequence: SequenceMatcher | None, order: Tensor | None = None
+        self, batches: Iterable[Tensor], sequence: SequenceModel | None, order: Tensor | None = None
     ) -> Iterator[Tensor]:
         """Scores of batches of descriptors, of single queries or of sequences of them."""
         scores = self._single(batches)

@@ -21,7 +21,8 @@ from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
-from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.sequence import SequenceMatcher, SequenceModel
 from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:
@@ -109,6 +110,7 @@ def run_localize(
     corners: list[list[float]] | None = None,
     as_is: bool = False,
     sequence: int = 1,
+    filter: bool = False,
     features: nn.Module | None = None,
 ) -> None:
     """Find the frames of a source on a map.
@@ -122,6 +124,8 @@ def run_localize(
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         as_is: take the frames as they are, though the map's are resampled
         sequence: queries that are matched together, one place after another
+        filter: drive a probability for every place along, and for being off the map, at any speed; a match
+            is accepted where it is more likely than not
         features: class of the map's features, if not ours
     """
     check_output_file(out)
@@ -141,17 +145,18 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, progress=True)
         _print_steps(query)
-    matcher = _sequence_of(sequence)
+    matcher = _sequence_of(sequence, filter, APART, threshold)
     if matcher is not None:
         matcher.check(sequence if query.length is None else query.length, model.map.places)
+    threshold = model.threshold_of(matcher)
     matches = model.matches(query, "localizing", matcher)
     if top is not None:
         candidates = model.candidate_batches(query, top, APART, "localizing", matcher)
-        matches = (batch.as_match(model.threshold) for batch in candidates)
+        matches = (batch.as_match(threshold) for batch in candidates)
     total, accepted = _write_matches(out, matches, query, model, top)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
-    elif model.threshold is None:
+    elif threshold is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
     print(f"{total} queries, {accepted} accepted; written to {out}")
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
@@ -172,6 +177,7 @@ def run_compare(
     second_truth: str | None = None,
     map: Path | None = None,
     sequence: int = 1,
+    filter: bool = False,
     top: int | None = None,
     model: DejaVu,
     command: str,
@@ -192,12 +198,13 @@ def run_compare(
         second_truth: which places it shows, as --truth
         map: evaluate this map of the reference as it is, and learn none
         sequence: queries that are matched together, one place after another
+        filter: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
 
-    matcher = _sequence_of(sequence)
+    matcher = _sequence_of(sequence, filter, tolerance, model.threshold)
     if map is not None:
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
@@ -353,9 +360,19 @@ def _check_report_folder(out: Path, *sources: str | None) -> None:
     check_output_folder(out)
 
 
-def _sequence_of(length: int) -> SequenceMatcher | None:
-    """Adds up so many queries; none for one."""
+def _sequence_of(length: int, filter: bool, within: int, threshold: float | None) -> SequenceModel | None:
+    """What scores queries together: the filter, or a sum over so many; none for one.
+
+    Args:
+        within, threshold: of the filter, which keeps its own where that is None.
+    """
     matcher = SequenceMatcher(length)
+    if filter and length > 1:
+        raise InputError(f"--sequence {length} and --filter; expected one or the other")
+    if filter:
+        chosen = PlaceFilter(within=within)
+        chosen.threshold = chosen.threshold if threshold is None else threshold
+        return chosen
     return None if length == 1 else matcher
 
 
@@ -430,7 +447,7 @@ def _publish(
     match = run.match
     if top is not None:
         first = Candidates(*(column[:, :top] for column in result.candidates))
-        match = first.as_match(run.model.threshold)
+        match = first.as_match(run.model.threshold_of(run.sequence))
     _write_matches(out / "matches.csv", [match], run.query, run.model, top)
     write_report(out, result.report, result.pictures, title, command, str(run.model.summary()))
     _print_scores(result.report, out)

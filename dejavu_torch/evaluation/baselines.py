@@ -19,7 +19,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -47,7 +47,7 @@ def nearest_frames(
     strides: Sequence[int] = (1,),
     metric: Metric = "l1",
     progress: str | None = None,
-    sequence: SequenceMatcher | None = None,
+    sequence: SequenceModel | None = None,
 ) -> list[Match]:
     """Nearest stored frame of each query, where every k-th reference frame is stored.
 
@@ -103,7 +103,7 @@ def baselines_of(
     seed: int = 0,
     leave_out: int | None = None,
     progress: bool = False,
-    sequence: SequenceMatcher | None = None,
+    sequence: SequenceModel | None = None,
 ) -> dict[str, Baseline]:
     """The baselines and null controls that every report sets beside the map, by their keys in report.json.
 
@@ -144,7 +144,7 @@ def _plain_stores(
     query: Tensor,
     tolerance: int,
     progress: str | None,
-    sequence: SequenceMatcher | None,
+    sequence: SequenceModel | None,
 ) -> dict[str, Baseline]:
     """The features that a template map is made of, of all frames and of every k-th."""
     frames, dimension = reference.shape
@@ -174,7 +174,7 @@ def _compact_stores(
     query: Tensor,
     tolerance: int,
     progress: str | None,
-    sequence: SequenceMatcher | None,
+    sequence: SequenceModel | None,
 ) -> dict[str, Baseline]:
     """The descriptors that a spectral map codes: all in float, every k-th and interpolated ones in int8."""
     frames, dimension = reference.shape
@@ -230,7 +230,7 @@ def hog_baselines(
     batch_size: int,
     tolerance: int,
     progress: bool = False,
-    sequence: SequenceMatcher | None = None,
+    sequence: SequenceModel | None = None,
 ) -> dict[str, Baseline]:
     """What a map of other features is set beside: HOG of all frames, and of every k-th, k = 2 x tolerance.
 

@@ -18,7 +18,7 @@ from dejavu_torch.database.templates import PhaseTemplates
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.types import FrequencyLayer, InputError, Match
 
 
@@ -47,7 +47,7 @@ def null_control(
     query: Tensor,
     seed: int = 0,
     same_plan: bool = False,
-    sequence: SequenceMatcher | None = None,
+    sequence: SequenceModel | None = None,
 ) -> Match:
     """Matches of a map learned from the reference in shuffled order.
 

@@ -42,7 +42,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Traverse
 
@@ -69,7 +69,7 @@ class Localization(NamedTuple):
     match: Match
     truth: GroundTruth | None
     tolerance: int
-    sequence: SequenceMatcher | None = None
+    sequence: SequenceModel | None = None
 
     @property
     def scored(self) -> Match:

@@ -169,6 +169,8 @@ def summary(report: Report) -> str:
         lines.append(f"{reference} frames {both} were resampled to even steps of {step:.4g} pixels of ground")
     if facts.get("sequence", 1) > 1:
         lines.append(f"Each was matched together with the {facts['sequence'] - 1} before it (--sequence)")
+    if facts.get("filter"):
+        lines.append("Each was matched by a filter over all queries before it (--filter)")
     if facts.get("unknown"):
         lines.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")
     if "with_answer" in facts:

@@ -41,7 +41,8 @@ from dejavu_torch.model import REGISTRY, DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
-from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.sequence import SequenceMatcher, SequenceModel
 from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -76,7 +77,7 @@ def compare(
     interpolate: bool = False,
     second: Views | None = None,
     others: Mapping[str, tuple[str, DejaVu]] | None = None,
-    sequence: SequenceMatcher | None = None,
+    sequence: SequenceModel | None = None,
     top: int = 1,
     progress: bool = False,
 ) -> Comparison:
@@ -97,8 +98,7 @@ def compare(
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They are scored by their matches, so only where there is a truth; none of them
             resamples.
-        sequence: adds the scores of consecutive queries up, those of the map and of all that it is set
-            beside.
+        sequence: scores consecutive queries together, on the map and on all that it is set beside.
         top: how many candidates of each query are wanted.
         progress: show progress bars on a terminal.
 
@@ -143,7 +143,7 @@ def compare(
             sequence.check(len(queries), model.map.places)
         ranks = max(top, min(max(RANKS), model.map.places))
         candidates = model.candidates_of_descriptors(queries, ranks, tolerance, sequence)
-    match = Candidates(*(column[:, :1] for column in candidates)).as_match(model.threshold)
+    match = Candidates(*(column[:, :1] for column in candidates)).as_match(model.threshold_of(sequence))
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
@@ -311,7 +311,8 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
         "threshold": model.threshold,
-        "sequence": 1 if run.sequence is None else run.sequence.length,
+        "sequence": run.sequence.length if isinstance(run.sequence, SequenceMatcher) else 1,
+        "filter": isinstance(run.sequence, PlaceFilter),
         "trained": model.trained and model.trained._asdict(),
         "reference": reference.name,
         "query": query.name,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 
 import torch
@@ -14,7 +15,33 @@ from dejavu_torch.types import InputError
 log = logging.getLogger("dejavu_torch")
 
 
-class SequenceMatcher(nn.Module):
+class SequenceModel(nn.Module, ABC):
+    """Scores of places from consecutive queries, not from one: what `sequence` of `DejaVu.localize` takes.
+
+    Convention: causal; the score of a query tells of the place of that query.
+    """
+
+    @abstractmethod
+    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+        """Scores of batches (B,N) that come one behind the other, from those of single queries.
+
+        Memory does not grow with the queries.
+        """
+
+    @abstractmethod
+    def check(self, queries: int, places: int) -> None:
+        """Refuse, or warn of, a number of queries or places that it makes no sense for.
+
+        Raises:
+            InputError: naming both.
+        """
+
+    def threshold_of(self, threshold: float | None) -> float | None:
+        """What a score has to be below to be accepted, where it is `threshold` for single queries."""
+        return threshold
+
+
+class SequenceMatcher(SequenceModel):
     """Scores of places from the latest T queries instead of one, for any map.
 
     The score of place i is the mean over trajectories that end there: of the query k steps before the latest,
@@ -83,10 +110,7 @@ class SequenceMatcher(nn.Module):
         return torch.where(scores.isfinite(), best, math.inf)
 
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """As `forward`, of scores (B,N) that come in batches one behind the other.
-
-        Between two batches T - 1 rows are kept, however many queries there are.
-        """
+        """See `SequenceModel`; between two batches T - 1 rows are kept."""
         before = None
         for scores in batches:
             yield self(scores, before)
@@ -94,11 +118,7 @@ class SequenceMatcher(nn.Module):
             before = rows[max(0, len(rows) - self.length + 1) :]
 
     def check(self, queries: int, places: int) -> None:
-        """Say where there are fewer queries than T; refuse fewer places.
-
-        Raises:
-            InputError: naming both.
-        """
+        """See `SequenceModel`: say where there are fewer queries than T; refuse fewer places."""
         if self.length > places:
             raise InputError(
                 f"a sequence of {self.length} queries on a map of {places} places; expected at most as many"
