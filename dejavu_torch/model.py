@@ -439,7 +439,7 @@ class DejaVu(nn.Module):
         if order is not None:
             place = order.argsort()
             scores = (part[:, place.to(part.device)] for part in scores)
-        return scores if sequence is None else sequence.stream(scores)
+        yield from scores if sequence is None else sequence.stream(scores)
 
     def _single(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
         """Scores of single queries, of as many at a time as memory allows."""

@@ -59,9 +59,9 @@ class PlaceFilter(SequenceModel):
         moves: Sequence[float] = (0.2, 0.6, 0.2),
         jump: float = 0.001,
         leave: float = 0.001,
-        enter: float = 0.05,
-        sharpness: float = 1.0,
-        off_map: float = 2.0,
+        enter: float = 0.01,
+        sharpness: float = 1.25,
+        off_map: float = 1.5,
         within: int = 5,
         threshold: float | None = math.log(2),
     ) -> None:

@@ -1,0 +1,202 @@
+"""Probabilities of places driven along with the queries, and of being off the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
+
+
+@torch.no_grad()
+def literal(filter_: PlaceFilter, scores: list[list[float]]) -> list[list[float]]:
+    """Each transition from one state to another in a loop of its own; state N is off the map."""
+    places = len(scores[0])
+    moves = filter_.move_logits.softmax(0).tolist()
+    stay, jump, leave = filter_.rate_logits.softmax(0).tolist()
+    enter, sharpness = float(filter_.enter_logit.sigmoid()), float(filter_.log_sharpness.exp())
+    off_share = leave / (leave + enter) if leave + enter else 0.0
+    belief = [(1 - off_share) / places] * places + [off_share]
+    found = []
+    for t, row in enumerate(scores):
+        if t:
+            after = [0.0] * (places + 1)
+            for i in range(places):
+                for v, share in enumerate(moves):
+                    after[min(i + v, places)] += belief[i] * stay * share
+                for j in range(places):
+                    after[j] += belief[i] * jump / places
+                after[places] += belief[i] * leave
+            for j in range(places):
+                after[j] += belief[places] * enter / places
+            after[places] += belief[places] * (1 - enter)
+            belief = after
+        known = [score for score in row if math.isfinite(score)]
+        mean = sum(known) / len(known) if known else 0.0
+        spread = math.sqrt(sum((score - mean) ** 2 for score in known) / len(known)) if known else 0.0
+        if spread > 0:
+            z = [(mean - score) / spread if math.isfinite(score) else -math.inf for score in row]
+            z.append(float(filter_.off_map))
+            joint = [b * math.exp(sharpness * one) for b, one in zip(belief, z, strict=True)]
+            if sum(joint) > 0:
+                belief = [one / sum(joint) for one in joint]
+        found.append(belief)
+    return found
+
+
+SCORE = st.one_of(st.integers(0, 9).map(float), st.just(math.inf))
+TABLE = st.integers(3, 7).flatmap(
+    lambda n: st.lists(st.lists(SCORE, min_size=n, max_size=n), min_size=1, max_size=9)
+)
+FILTER = st.builds(
+    PlaceFilter,
+    st.sampled_from([(1.0,), (0.1, 0.8, 0.1), (0.0, 1.0), (0.5, 0.25, 0.25)]),
+    jump=st.sampled_from([0.0, 0.01, 0.3]),
+    leave=st.sampled_from([0.0, 0.02, 0.5]),
+    enter=st.sampled_from([0.0, 0.1, 1.0]),
+    sharpness=st.sampled_from([0.3, 1.0, 2.0]),
+    off_map=st.sampled_from([-1.0, 0.0, 1.5]),
+)
+
+
+@given(TABLE, FILTER)
+def test_equals_a_literal_loop(rows: list[list[float]], filter_: PlaceFilter) -> None:
+    filter_ = filter_.double()
+    found = filter_.posterior(torch.tensor(rows, dtype=torch.float64))
+    assert torch.allclose(found, torch.tensor(literal(filter_, rows), dtype=torch.float64), atol=1e-9)
+    assert torch.allclose(found.sum(1), torch.ones(len(rows), dtype=torch.float64))
+
+
+@given(TABLE, FILTER, st.integers(1, 4))
+def test_batches_do_not_matter(rows: list[list[float]], filter_: PlaceFilter, size: int) -> None:
+    scores = torch.tensor(rows)
+    assert torch.allclose(torch.cat(list(filter_.stream(scores.split(size)))), filter_(scores), rtol=1e-4)
+
+
+def test_later_queries_change_nothing() -> None:
+    scores = torch.rand(20, 30)
+    assert torch.equal(PlaceFilter()(scores)[:12], PlaceFilter()(scores[:12]))
+
+
+def test_neither_unit_nor_origin_of_the_scores_matters() -> None:
+    scores = torch.rand(20, 30, dtype=torch.float64)
+    assert torch.allclose(PlaceFilter().posterior(scores), PlaceFilter().posterior(7 * scores + 3))
+
+
+def test_gradients_reach_the_scores_and_every_parameter() -> None:
+    scores = torch.rand(4, 6, dtype=torch.float64, requires_grad=True)
+    filter_ = PlaceFilter().double()
+    assert torch.autograd.gradcheck(filter_, (scores,))
+    names, values = zip(*filter_.named_parameters(), strict=True)
+
+    def run(*values: Tensor) -> Tensor:
+        given_ = dict(zip(names, values, strict=True))
+        return torch.func.functional_call(filter_, given_, (scores.detach(),))
+
+    assert torch.autograd.gradcheck(run, values)
+    gradients = torch.autograd.grad(run(*values).sum(), values)
+    assert all(bool((gradient != 0).all()) for gradient in gradients)
+
+
+def test_the_score_is_the_probability_of_a_place_and_its_neighbours() -> None:
+    scores = torch.rand(3, 9, dtype=torch.float64)
+    posterior = PlaceFilter().posterior(scores)[:, :-1]
+    assert torch.allclose((-PlaceFilter(within=0)(scores)).exp(), posterior)
+    near = (-PlaceFilter(within=2)(scores)).exp()
+    assert torch.allclose(near[:, 4], (posterior[:, 2:7] * torch.tensor([1, 2, 3, 2, 1]) / 3).sum(1))
+    assert torch.allclose(near[:, 0], (posterior[:, :3] * torch.tensor([3, 2, 1]) / 3).sum(1))
+
+
+def standing_out(places: int, shown: list[int], seed: int = 0) -> Tensor:
+    """Scores of queries that show a place each, or -1 where they show none."""
+    scores = torch.randn(len(shown), places, generator=torch.Generator().manual_seed(seed))
+    for t, place in enumerate(shown):
+        if place >= 0:
+            scores[t, place] -= 2.5
+    return scores
+
+
+def test_a_route_at_any_speed_is_found() -> None:
+    """Standing, then twice as fast as the reference: no sum at one speed finds it."""
+    shown = [20] * 30 + list(range(20, 140, 2))
+    scores, truth = standing_out(200, shown), torch.tensor(shown)
+    near = {
+        name: float(((model(scores).argmin(1) - truth).abs() <= 2).float().mean())
+        for name, model in {"sum": SequenceMatcher(21), "filter": PlaceFilter()}.items()
+    }
+    assert near["filter"] > 0.8
+    assert near["sum"] < 0.5
+
+
+def test_off_the_map_is_noticed_and_left() -> None:
+    shown = [*range(50, 100), *[-1] * 60, *range(10, 60)]
+    off = PlaceFilter().posterior(standing_out(200, shown))[:, -1]
+    assert off[30:50].max() < 0.5
+    assert off[80:110].min() > 0.5
+    assert off[140:].max() < 0.5
+
+
+def test_who_drives_off_the_end_is_off_the_map() -> None:
+    filter_ = PlaceFilter((0, 1), jump=0, leave=0, enter=0)
+    at_the_end = torch.tensor([0.0, 0, 0, 1, 0])
+    assert torch.allclose(filter_.predicted(at_the_end), torch.tensor([0.0, 0, 0, 0, 1]))
+
+
+def test_a_query_that_scores_all_places_alike_says_nothing() -> None:
+    filter_, before = PlaceFilter(), torch.rand(8).softmax(0)
+    for alike in (torch.full((1, 7), 3.1), torch.full((1, 7), torch.inf)):
+        assert torch.allclose(filter_.posterior(alike, before)[0], filter_.predicted(before))
+
+
+def test_what_a_filter_learned_is_kept_by_its_state() -> None:
+    learned, scores = PlaceFilter(sharpness=2, moves=(0.5, 0.3, 0.2)), torch.rand(5, 9)
+    with torch.no_grad():
+        learned.off_map += 0.7
+    fresh = PlaceFilter()
+    fresh.load_state_dict(learned.state_dict())
+    assert torch.equal(fresh(scores), learned(scores))
+
+
+def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
+    route = torch.randn(80, 32, generator=torch.Generator().manual_seed(3))
+    model = DejaVu(whitening="none", threshold=1e-9).learn(route)
+    found = model.localize(route[10:50], sequence=PlaceFilter())
+    assert torch.equal(found.index, torch.arange(10, 50))
+    assert torch.equal(found.accepted, found.score < math.log(2))
+    assert found.accepted[1:].all()
+    assert model.localize(route[10:50], sequence=PlaceFilter(threshold=None)).accepted.all()
+    assert not found.score.requires_grad
+    model.batch_size = 7
+    again = model.localize(route[10:50], sequence=PlaceFilter())
+    assert torch.allclose(again.score, found.score, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: PlaceFilter(moves=()), ["moves are []", "add up to 1"]),
+        (lambda: PlaceFilter(moves=(0.5, 0.6)), ["moves are [0.5, 0.6]", "add up to 1"]),
+        (lambda: PlaceFilter(moves=(1.5, -0.5)), ["moves are [1.5, -0.5]"]),
+        (lambda: PlaceFilter(moves=(math.nan, 1)), ["moves are [nan, 1]"]),
+        (lambda: PlaceFilter(jump=0.7, leave=0.5), ["jump 0.7, leave 0.5", "at most 1"]),
+        (lambda: PlaceFilter(enter=-0.1), ["enter -0.1"]),
+        (lambda: PlaceFilter(jump=math.nan), ["jump nan"]),
+        (lambda: PlaceFilter(sharpness=0), ["sharpness 0", "above 0"]),
+        (lambda: PlaceFilter(off_map=math.inf), ["off_map inf"]),
+        (lambda: PlaceFilter(within=-1), ["within -1"]),
+        (lambda: PlaceFilter()(torch.rand(4)), ["(4,)", "(Q,N)"]),
+        (lambda: PlaceFilter()(torch.zeros(3, 4, dtype=torch.int64)), ["torch.int64", "floats"]),
+        (lambda: PlaceFilter()(torch.rand(2, 4), torch.rand(6)), ["posterior (6,)", "(5,)"]),
+        (lambda: PlaceFilter().check(10, 2), ["up to 2 places on a map of 2"]),
+    ],
+)
+def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> None:
+    with refused(*told):
+        make()
