@@ -60,8 +60,8 @@ class PlaceFilter(SequenceModel):
         jump: float = 0.001,
         leave: float = 0.001,
         enter: float = 0.01,
-        sharpness: float = 1.25,
-        off_map: float = 1.5,
+        sharpness: float = 1.0,
+        off_map: float = 1.25,
         within: int = 5,
         threshold: float | None = math.log(2),
     ) -> None:
@@ -169,6 +169,7 @@ class PlaceFilter(SequenceModel):
         """The filter's own: its scores are probabilities, not distances."""
         return self.threshold
 
+    @torch.no_grad()
     def extra_repr(self) -> str:
         moves = [round(move, 4) for move in self.move_logits.softmax(0).tolist()]
         _, jump, leave = self.rate_logits.softmax(0).tolist()
