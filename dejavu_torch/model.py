@@ -435,20 +435,16 @@ class DejaVu(nn.Module):
         self, batches: Iterable[Tensor], sequence: SequenceModel | None, order: Tensor | None = None
     ) -> Iterator[Tensor]:
         """Scores of batches of descriptors, of single queries or of sequences of them."""
-        scores = self._single(batches)
+        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))  # as memory allows
+        parts = (part for descriptors in batches for part in descriptors.split(at_once))
+        if sequence is not None and order is None:
+            yield from self.map.sequences(parts, sequence)
+            return
+        scores: Iterator[Tensor] = map(self.map.scores, parts)
         if order is not None:
             place = order.argsort()
             scores = (part[:, place.to(part.device)] for part in scores)
         yield from scores if sequence is None else sequence.stream(scores)
-
-    def _single(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Scores of single queries, of as many at a time as memory allows."""
-        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
-        for descriptors in batches:
-            for part in descriptors.split(at_once):
-                with torch.no_grad():
-                    scores = self.map.scores(part)
-                yield scores
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from collections.abc import Iterable, Iterator
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +14,22 @@ from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.types import InputError
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
+
+
+class Sequences(Protocol):
+    """What scores consecutive queries together, as `recognition.sequence` does.
+
+    Attributes:
+        shifts: where scores are the best mean along trajectories, of each how many places it lies back
+            0, 1, .., T - 1 queries before the latest, T alike for all; else ().
+    """
+
+    @property
+    def shifts(self) -> tuple[tuple[int, ...], ...]: ...
+
+    def __call__(self, scores: Tensor, before: Tensor | None = None) -> Tensor: ...
+
+    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]: ...
 
 
 class PlaceMap(nn.Module, ABC):
@@ -60,6 +77,13 @@ class PlaceMap(nn.Module, ABC):
 
     def forward(self, queries: Tensor) -> Tensor:
         return self.scores(queries)
+
+    def sequences(self, batches: Iterable[Tensor], sequence: Sequences) -> Iterator[Tensor]:
+        """Scores of consecutive queries together, from batches (B,D) of them: (B,N) each.
+
+        Convention: what `sequence` gives of `scores`; a kind of map may have a shorter way there.
+        """
+        return sequence.stream(map(self.scores, batches))
 
     def extend(self, features: Tensor) -> None:
         """Add the places of (n,D) features behind the last one.

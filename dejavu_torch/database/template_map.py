@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import accumulate, pairwise
 from typing import Any, Literal, NamedTuple
@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.database.distance import Metric, check_metric, metric_name, phase_distances
-from dejavu_torch.database.place_map import Mapper, PlaceMap
+from dejavu_torch.database.place_map import Mapper, PlaceMap, Sequences
 from dejavu_torch.database.summary import MapSummary, summarise
 from dejavu_torch.database.templates import PhaseTemplates
+from dejavu_torch.database.trajectories import LayerSums
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
@@ -233,8 +234,17 @@ class TemplateMap(PlaceMap):
             for j in (range(len(blocks)) if layers is None else layers)
         ]
 
-    def combine(self, distances: Sequence[Tensor]) -> Tensor:
+    def combine(
+        self,
+        distances: Sequence[Tensor],
+        segments: Sequence[Segment] | None = None,
+        columns: Sequence[Tensor] | None = None,
+    ) -> Tensor:
         """S(i) from the phase distances of each layer (eq. 4): L tensors (Q,P) -> (Q,N).
+
+        Args:
+            segments: of which places, in order; None is all of them.
+            columns: of each layer, the column of its distances for each of its places; None is the phase.
 
         Convention: a place that no layer covers scores +inf.
 
@@ -244,16 +254,17 @@ class TemplateMap(PlaceMap):
         if not distances:
             raise InputError("there are no layers to combine; expected at least one")
         first = distances[0]
-        own_phases = self.place_phases.split([layer.stop - layer.start for layer in self.plan])
+        if columns is None:
+            columns = self.place_phases.split([layer.stop - layer.start for layer in self.plan])
         parts = []
-        for start, stop, members in self.segments:
+        for start, stop, members in self.segments if segments is None else segments:
             if not members:
                 parts.append(torch.full_like(first[:, :1], math.inf).expand(-1, stop - start))
                 continue
             total = torch.zeros_like(first[:, :1])
             for j in members:
                 offset = self.plan[j].start
-                total = total + distances[j].index_select(1, own_phases[j][start - offset : stop - offset])
+                total = total + distances[j].index_select(1, columns[j][start - offset : stop - offset])
             if self.reduction == "mean":
                 total = total / sum(
                     weight_per_feature(self.metric, len(self.plan[j].features)) for j in members
@@ -269,6 +280,20 @@ class TemplateMap(PlaceMap):
             return queries.new_full((queries.shape[0], self.places), math.inf, dtype=dtype)
         scores = self.combine(distances)
         return scores if self.temperature is None else log_posterior(scores, self.temperature)
+
+    def sequences(self, batches: Iterable[Tensor], sequence: Sequences) -> Iterator[Tensor]:
+        """See `PlaceMap`; mean scores along trajectories come from `LayerSums` where that is less work."""
+        sums = LayerSums(self, sequence) if sequence.shifts and self.temperature is None else None
+        if sums is None or not sums.worth:
+            yield from super().sequences(batches, sequence)
+            return
+        kept = len(sequence.shifts[0]) - 1
+        rows = [block.new_zeros(0, len(block)) for block in self.blocks()]
+        for queries in batches:
+            ahead = len(rows[0])
+            rows = [torch.cat(pair) for pair in zip(rows, self.distances(queries), strict=True)]
+            yield sums.scores(rows, ahead)
+            rows = [row[max(0, len(row) - kept) :] for row in rows]
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
         """Make parameters of the templates, of the weights, or of both, until `freeze`.

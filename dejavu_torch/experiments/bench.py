@@ -1,4 +1,4 @@
-"""HOG and L1 distances, timed beside other programs that compute the same."""
+"""HOG, L1 distances and sequences, timed beside other programs or ways that compute the same."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from math import inf
@@ -22,13 +23,16 @@ import dejavu_torch
 from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
+from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.hog import hog
-from dejavu_torch.types import InputError
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import FrequencyLayer, InputError
 
 BATCH = 64
 AT_MOST = 60  # seconds for all runs of one contender together
 COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu")
+PERIODS = (191, 193, 197, 199, 211)  # of the layers that sequences are matched in: 991 phases
 MEMORY = Path("/proc/self/statm")
 
 Sizes = Sequence[tuple[int, int]]
@@ -75,15 +79,18 @@ def bench_matcher(
     repeats: int = 3,
     images: Sizes = ((64, 64), (256, 192)),
     distances: Sequence[tuple[int, int, int]] = ((512, 2640, 1000),),
+    sequences: Sequence[tuple[int, int, int]] = ((64, 21, 100_000),),
     torch_compile: bool = True,
     seed: int = 0,
 ) -> list[Row]:
-    """Time HOG beside scikit-image, and L1 distances beside torch, scipy and faiss.
+    """Time HOG beside scikit-image, L1 distances beside torch, scipy and faiss, and sequences both ways.
 
     Args:
         frames: grey frames to describe, of each size in `images` (height, width in pixels).
         repeats: timed runs of each contender, in turn; the best counts.
         distances: queries, features and templates of each case of L1.
+        sequences: queries, queries of a sequence and places of each case of a template map whose sequences
+            are matched in its layers, beside its score rows.
         torch_compile: also a sum that `torch.compile` makes a loop of; compiling takes its time.
         seed: of the random frames and features.
 
@@ -93,10 +100,10 @@ def bench_matcher(
     Raises:
         InputError: a number below 1.
     """
-    if min(frames, repeats, *(n for size in (*images, *distances) for n in size)) < 1:
+    if min(frames, repeats, *(n for size in (*images, *distances, *sequences) for n in size)) < 1:
         raise InputError(
-            f"the bench got frames={frames}, repeats={repeats}, images {images} and distances {distances}; "
-            "expected at least 1 of each"
+            f"the bench got frames={frames}, repeats={repeats}, images {images}, distances {distances} and "
+            f"sequences {sequences}; expected at least 1 of each"
         )
     generator = torch.Generator().manual_seed(seed)
     rows = []
@@ -107,6 +114,11 @@ def bench_matcher(
         for q, f, p in distances:
             query, templates = (torch.rand(n, f, generator=generator) for n in (q, p))
             rows += _l1_case(f"l1 {q} x {f} x {p}", query, templates, repeats, torch_compile)
+        for q, length, places in sequences:
+            query, templates = (torch.rand(n, len(PERIODS), generator=generator) for n in (q, max(PERIODS)))
+            rows += _sequence_case(
+                f"sequence {q} x {length} x {places}", query, templates, length, places, repeats
+            )
     return rows
 
 
@@ -204,6 +216,26 @@ def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_co
         Program("faiss", threads, faiss),
     ]
     return benchmark(case, contenders, repeats)
+
+
+def _sequence_case(
+    case: str, query: Tensor, templates: Tensor, length: int, places: int, repeats: int
+) -> list[Row]:
+    """A feature a layer, so that it is not the distances that take the time."""
+    plan = tuple(FrequencyLayer(Fraction(tau), tau, 0, places, (j,)) for j, tau in enumerate(PERIODS))
+    blocks = [templates[:tau, j, None] for j, tau in enumerate(PERIODS)]
+    route, matcher = TemplateMap(plan, blocks, places, len(plan)), SequenceMatcher(length)
+
+    def tables() -> Tensor:
+        (scores,) = route.sequences([query], matcher)
+        return scores[:, length:]  # ahead of it some are +inf
+
+    def rows() -> Tensor:
+        (scores,) = matcher.stream([route.scores(query)])
+        return scores[:, length:]
+
+    beside = Program("dejavu (score rows)", torch.get_num_threads(), lambda: rows)
+    return benchmark(case, [*_ours(tables), beside], repeats)
 
 
 def benchmark(case: str, contenders: Sequence[Program], repeats: int) -> list[Row]:

@@ -21,6 +21,15 @@ class SequenceModel(nn.Module, ABC):
     Convention: causal; the score of a query tells of the place of that query.
     """
 
+    @property
+    def shifts(self) -> tuple[tuple[int, ...], ...]:
+        """Where scores are the best mean along trajectories: how far back each lies, as maps may use it.
+
+        Of each trajectory the places 0, 1, .., T - 1 queries before the latest; () where they are no means,
+        as of a subclass that scores otherwise.
+        """
+        return ()
+
     @abstractmethod
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
         """Scores of batches (B,N) that come one behind the other, from those of single queries.
@@ -79,6 +88,11 @@ class SequenceMatcher(SequenceModel):
             raise InputError(f"the speeds are {list(speeds)}; expected finite numbers of places a query")
         self.length, self.speeds = length, tuple(float(speed) for speed in speeds)
 
+    @property
+    def shifts(self) -> tuple[tuple[int, ...], ...]:
+        """See `SequenceModel`; half a place is rounded up."""
+        return tuple(tuple(math.floor(speed * k + 0.5) for k in range(self.length)) for speed in self.speeds)
+
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         fits = before is None or before.shape[1:] == scores.shape[1:]
         if scores.ndim != 2 or not fits or not scores.is_floating_point():
@@ -93,10 +107,9 @@ class SequenceMatcher(SequenceModel):
         known, count = torch.where(on_map, rows, 0), on_map.to(rows.dtype)
         used = torch.arange(ahead + 1, len(rows) + 1, device=rows.device).clamp(max=self.length)[:, None]
         best = torch.full_like(scores, math.inf)
-        for speed in self.speeds:
+        for shifts in self.shifts:
             total, inside = torch.zeros_like(scores), torch.zeros_like(scores)
-            for k in range(min(self.length, len(rows))):
-                shift = math.floor(speed * k + 0.5)
+            for k, shift in enumerate(shifts[: len(rows)]):
                 first = max(0, k - ahead)  # the first query that has one k steps before it
                 to = slice(max(0, shift), scores.shape[1] + min(0, shift))
                 of = slice(max(0, -shift), scores.shape[1] - max(0, shift))

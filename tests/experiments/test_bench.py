@@ -29,7 +29,13 @@ from dejavu_torch.experiments.bench import (
 
 
 def small(**options: object) -> list[Row]:
-    sizes = {"frames": 70, "repeats": 1, "images": [(24, 16)], "distances": [(9, 40, 410)]}
+    sizes = {
+        "frames": 70,
+        "repeats": 1,
+        "images": [(24, 16)],
+        "distances": [(9, 40, 410)],
+        "sequences": [(9, 5, 5000)],
+    }
     return bench_matcher(**{"torch_compile": False, **sizes, **options})  # type: ignore[arg-type]
 
 
@@ -40,6 +46,7 @@ def rows() -> dict[tuple[str, str], Row]:
 
 L1 = "l1 9 x 40 x 410"
 HOG = "hog 24 x 16"
+SEQUENCE = "sequence 9 x 5 x 5000"
 
 
 def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
@@ -52,6 +59,8 @@ def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
         (L1, "torch.compile"),
         (L1, "scipy cdist"),
         (L1, "faiss"),
+        (SEQUENCE, "dejavu"),
+        (SEQUENCE, "dejavu (score rows)"),
     ]
 
 
@@ -75,7 +84,7 @@ def test_threads_are_reported(rows: dict[tuple[str, str], Row]) -> None:
 
 
 def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
-    for case in (HOG, L1):
+    for case in (HOG, L1, SEQUENCE):
         mine = [row for row in rows.values() if row.case == case and row.seconds]
         ours = min(row.seconds for row in mine if row.contender.startswith("dejavu") and row.seconds)
         assert [row.ratio_to_ours for row in mine] == [row.seconds and row.seconds / ours for row in mine]
@@ -83,7 +92,7 @@ def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
 
 def test_a_program_that_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
-    found = {row.contender: row for row in small(images=[])}
+    found = {row.contender: row for row in small(images=[], sequences=[])}
     assert found["faiss"].skipped is not None
     assert "faiss" in found["faiss"].skipped
     assert found["faiss"]._replace(skipped=None) == Row(L1, "faiss")
@@ -93,7 +102,7 @@ def test_a_program_that_is_not_installed_is_a_row_that_says_so(monkeypatch: pyte
 
 def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "AT_MOST", 0)
-    ours, theirs = small(distances=[])
+    ours, theirs = small(distances=[], sequences=[])
     assert (ours.measured_rows, theirs.measured_rows) == (None, 1)
     assert theirs.bytes == ours.bytes
     assert theirs.difference is not None
