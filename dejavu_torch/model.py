@@ -38,8 +38,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.candidates import Candidates, best_candidates, check_candidates
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.recognition.sequence import SequenceModel
-from dejavu_torch.types import InputError, Match, Training, Traverse
+from dejavu_torch.types import InputError, Match, SequenceModel, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
 

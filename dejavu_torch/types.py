@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch: 256 MB
 
@@ -172,6 +172,58 @@ class GroundTruth(NamedTuple):
     positives: Tensor
     judged: Tensor
     ignored: Tensor
+
+
+class Scorer(Protocol):
+    """What scores places: of a map, what a `SequenceModel` needs."""
+
+    places: int
+
+    def scores(self, queries: Tensor) -> Tensor:
+        """Scores of all places: (Q,D) -> (Q,N), lower is better."""
+
+    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+        """Scores of the places [start, stop): (Q,D) -> (Q,stop - start)."""
+
+
+class SequenceModel(nn.Module, ABC):
+    """Scores of places from consecutive queries, not from one: what `sequence` of `DejaVu.localize` takes.
+
+    Convention: causal; the score of a query tells of the place of that query. Memory does not grow with the
+    queries.
+    """
+
+    @property
+    def shifts(self) -> tuple[tuple[int, ...], ...]:
+        """Where scores are the best mean along trajectories: how far back each lies, as maps may use it.
+
+        Of each trajectory the places 0, 1, .., T - 1 queries before the latest; () where they are no means,
+        as of a subclass that scores otherwise.
+        """
+        return ()
+
+    @abstractmethod
+    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+        """Scores of batches (B,N) that come one behind the other, from those of single queries."""
+
+    def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
+        """Scores of batches of descriptors (B,D) that come one behind the other: (B,N) each.
+
+        A subclass that needs no scores of most places does not ask for them.
+        """
+        return self.stream(map(route.scores, batches))
+
+    @abstractmethod
+    def check(self, queries: int, places: int) -> None:
+        """Refuse, or warn of, a number of queries or places that it makes no sense for.
+
+        Raises:
+            InputError: naming both.
+        """
+
+    def threshold_of(self, threshold: float | None) -> float | None:
+        """What a score has to be below to be accepted, where it is `threshold` for single queries."""
+        return threshold
 
 
 class PRCurve(NamedTuple):

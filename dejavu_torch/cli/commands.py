@@ -22,8 +22,8 @@ from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.sequence import SequenceMatcher, SequenceModel
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report

@@ -4,32 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.positions import borders, look_up, place_of, shown_frames
 from dejavu_torch.database.summary import MapSummary
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, SequenceModel
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
-
-
-class Sequences(Protocol):
-    """What scores consecutive queries together, as `recognition.sequence` does.
-
-    Attributes:
-        shifts: where scores are the best mean along trajectories, of each how many places it lies back
-            0, 1, .., T - 1 queries before the latest, T alike for all; else ().
-    """
-
-    @property
-    def shifts(self) -> tuple[tuple[int, ...], ...]: ...
-
-    def __call__(self, scores: Tensor, before: Tensor | None = None) -> Tensor: ...
-
-    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]: ...
 
 
 class PlaceMap(nn.Module, ABC):
@@ -78,12 +62,19 @@ class PlaceMap(nn.Module, ABC):
     def forward(self, queries: Tensor) -> Tensor:
         return self.scores(queries)
 
-    def sequences(self, batches: Iterable[Tensor], sequence: Sequences) -> Iterator[Tensor]:
+    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+        """Scores of the places [start, stop) alone: (Q,D) -> (Q,stop - start).
+
+        Convention: those of `scores`; a kind of map may not need all places for them.
+        """
+        return self.scores(queries)[:, start:stop]
+
+    def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """Scores of consecutive queries together, from batches (B,D) of them: (B,N) each.
 
         Convention: what `sequence` gives of `scores`; a kind of map may have a shorter way there.
         """
-        return sequence.stream(map(self.scores, batches))
+        return sequence.follow(batches, self)
 
     def extend(self, features: Tensor) -> None:
         """Add the places of (n,D) features behind the last one.

@@ -204,6 +204,10 @@ class SpectralMap(PlaceMap):
 
     def scores(self, queries: Tensor) -> Tensor:
         """Scores of all places: (Q,K) -> (Q,N)."""
+        return self.scores_between(queries, 0, self.places)
+
+    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+        """See `PlaceMap`: from the chunks that hold these places."""
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
             raise InputError(
                 f"the query descriptors are {tuple(queries.shape)}; the map expects (Q, {self.dimension})"
@@ -214,14 +218,16 @@ class SpectralMap(PlaceMap):
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
+        inside = [g for g, chunk in enumerate(self.chunks) if chunk[0] < stop and chunk[1] > start]
         parts = [
-            queries @ self.rebuilt(g).to(queries).T if rebuild else self.products(queries, g)
-            for g in range(len(self.chunks))
+            queries @ self.rebuilt(g).to(queries).T if rebuild else self.products(queries, g) for g in inside
         ]
-        products = torch.cat(parts, 1)
+        first = self.chunks[inside[0]][0] if inside else 0
+        products = torch.cat(parts, 1)[:, start - first : stop - first]
         if self.metric == "cosine":
-            return 1 - products * self.per_norm.to(products)
-        return (length.square() - 2 * products + self.norms.to(products).square()).clamp(min=0)
+            return 1 - products * self.per_norm[start:stop].to(products)
+        norms = self.norms[start:stop].to(products)
+        return (length.square() - 2 * products + norms.square()).clamp(min=0)
 
     def extend(self, features: Tensor) -> None:
         """Add the places of (n,K) descriptors in chunks of their own; the others stay as they are.

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.database.distance import Metric, check_metric, metric_name, phase_distances
-from dejavu_torch.database.place_map import Mapper, PlaceMap, Sequences
+from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.summary import MapSummary, summarise
 from dejavu_torch.database.templates import PhaseTemplates
 from dejavu_torch.database.trajectories import LayerSums
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel
 
 Reduction = Literal["mean", "sum"]
 TRAINABLE = ("templates", "weights")
@@ -281,7 +281,19 @@ class TemplateMap(PlaceMap):
         scores = self.combine(distances)
         return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
-    def sequences(self, batches: Iterable[Tensor], sequence: Sequences) -> Iterator[Tensor]:
+    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+        """See `PlaceMap`: from the layers that cover these places."""
+        inside = [segment for segment in self.segments if segment.start < stop and segment.stop > start]
+        members = sorted({j for segment in inside for j in segment.layers})
+        if not members or self.temperature is not None:
+            return super().scores_between(queries, start, stop)
+        distances = self.distances(queries, members)
+        rows = [distances[0]] * len(self.plan)  # no other row is looked up
+        for j, row in zip(members, distances, strict=True):
+            rows[j] = row
+        return self.combine(rows, inside)[:, start - inside[0].start : stop - inside[0].start]
+
+    def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """See `PlaceMap`; mean scores along trajectories come from `LayerSums` where that is less work."""
         sums = LayerSums(self, sequence) if sequence.shifts and self.temperature is None else None
         if sums is None or not sums.worth:

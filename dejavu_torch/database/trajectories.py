@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.database.place_map import Sequences
+from dejavu_torch.types import SequenceModel
 
 if TYPE_CHECKING:
     from dejavu_torch.database.template_map import Segment, TemplateMap
@@ -36,7 +36,7 @@ class LayerSums:
         worth: whether that is less to add up than the scores of all places. `scores` is for maps where it is.
     """
 
-    def __init__(self, route: TemplateMap, sequence: Sequences) -> None:
+    def __init__(self, route: TemplateMap, sequence: SequenceModel) -> None:
         self.route, self.sequence, self.shifts = route, sequence, sequence.shifts
         every = [shift for shifts in self.shifts for shift in shifts]
         back, ahead = max(0, *every), max(0, -min(every))  # how far from a place trajectories go
@@ -73,7 +73,8 @@ class LayerSums:
         combine, sequence = self.route.combine, self.sequence
         if not all(bool(row.isfinite().all()) for row in rows):  # what is inf is left out of a mean
             scores = combine(rows)
-            return sequence(scores[ahead:], scores[:ahead])
+            together: Tensor = sequence(scores[ahead:], scores[:ahead])
+            return together
         steps = min(len(self.shifts[0]), len(rows[0]))
         missing = max(0, steps - 1 - ahead)  # rows, ahead of the first query there was
         pairs = zip(rows, self.phases, strict=True)
@@ -91,7 +92,8 @@ class LayerSums:
             ways.append(combine((total / used).split(self.sizes, 1), columns=self.columns))
         near = combine(rows, self.near)
         edges = sequence(near[ahead:], near[:ahead])[:, self.of]
-        return reduce(torch.minimum, ways).index_copy_(1, self.to, edges)
+        best: Tensor = reduce(torch.minimum, ways)
+        return best.index_copy_(1, self.to, edges)
 
 
 def _near_cuts(segments: Sequence[Segment], reach: int) -> Iterator[Segment]:

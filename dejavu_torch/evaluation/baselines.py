@@ -19,8 +19,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.recognition.sequence import SequenceModel
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 log = logging.getLogger("dejavu_torch")
 

@@ -18,8 +18,7 @@ from dejavu_torch.database.templates import PhaseTemplates
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.recognition.sequence import SequenceModel
-from dejavu_torch.types import FrequencyLayer, InputError, Match
+from dejavu_torch.types import FrequencyLayer, InputError, Match, SequenceModel
 
 
 def with_mapper(model: DejaVu, mapper: Mapper) -> DejaVu:

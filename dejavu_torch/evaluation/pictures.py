@@ -42,9 +42,8 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, Traverse
+from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, SequenceModel, Traverse
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 EXAMPLES = 4  # places of which the frames of both traverses are shown

@@ -42,8 +42,8 @@ from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, s
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.sequence import SequenceMatcher, SequenceModel
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 log = logging.getLogger("dejavu_torch")
 

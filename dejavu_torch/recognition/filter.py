@@ -4,13 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dejavu_torch.recognition.sequence import SequenceModel
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Scorer, SequenceModel
+
+LIKELY = 0.5  # of all probability has to lie in a stretch of places for these to be scored alone
+FLOOR = 1e-9  # probability below which a place is not likely, however few jump
+
+
+class Moments(NamedTuple):
+    """Mean and standard deviation (Q,1) of each query's finite scores, and whether these differ at all."""
+
+    mean: Tensor
+    spread: Tensor
+    tells: Tensor
+
+
+def moments_of(scores: Tensor) -> Moments:
+    """Of scores (Q,N); the spread is 1 where all are alike."""
+    known = scores.isfinite()
+    count = known.sum(1, keepdim=True).clamp(min=1)
+    mean = torch.where(known, scores, 0).sum(1, keepdim=True) / count
+    variance = torch.where(known, mean - scores, 0).square().sum(1, keepdim=True) / count
+    tells = variance > torch.finfo(scores.dtype).eps ** 2 * mean.square()
+    return Moments(mean, torch.where(tells, variance, 1).sqrt(), tells)
 
 
 class PlaceFilter(SequenceModel):
@@ -32,6 +53,9 @@ class PlaceFilter(SequenceModel):
             as next to the right place is nearly right.
         threshold: accept a match whose score is below; the default is what is more likely than not, None
             accepts every match.
+        search_every: score all places for every so many queries, and where the last posterior has no single
+            stretch of places that is likely; in between only that stretch is scored, as far as the map can
+            score a stretch alone: a spectral map by its chunks.
 
     Shape: scores (Q,N), the posterior (N+1,) of the query before them or None -> (Q,N), -log of a
         probability in nats, lower is better.
@@ -64,6 +88,7 @@ class PlaceFilter(SequenceModel):
         off_map: float = 1.25,
         within: int = 5,
         threshold: float | None = math.log(2),
+        search_every: int = 1,
     ) -> None:
         super().__init__()
         rates = {"jump": jump, "leave": leave, "enter": enter}
@@ -77,13 +102,15 @@ class PlaceFilter(SequenceModel):
                 f"sharpness {sharpness}, off_map {off_map}, within {within}; expected finite numbers, a "
                 "sharpness above 0 and at least 0 places"
             )
+        if search_every < 1:
+            raise InputError(f"search_every is {search_every}; expected at least 1 query")
         stay = max(0.0, 1 - jump - leave)
         self.move_logits = nn.Parameter(torch.tensor(moves).log())
         self.rate_logits = nn.Parameter(torch.tensor([stay, jump, leave]).log())
         self.enter_logit = nn.Parameter(torch.tensor(enter).logit())
         self.log_sharpness = nn.Parameter(torch.tensor(sharpness).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map)))
-        self.within, self.threshold = within, threshold
+        self.within, self.threshold, self.search_every = within, threshold, search_every
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         return self._scores(self.posterior(scores, before), scores.isfinite())
@@ -103,23 +130,28 @@ class PlaceFilter(SequenceModel):
             )
         rows = []
         for row in self.evidence(scores):
-            expected = self.start(places).to(row) if before is None else self.predicted(before.to(row))
-            joint = expected * row
-            total = joint.sum()
-            # where what is likely was impossible, what was expected stands
-            before = torch.where(total > 0, joint / torch.where(total > 0, total, 1), expected)
+            before = self._updated(self._expected(before, places).to(row), row)
             rows.append(before)
         return torch.stack(rows) if rows else scores.new_zeros(0, places + 1)
 
-    def evidence(self, scores: Tensor) -> Tensor:
-        """Likelihoods of each query up to a factor: (Q,N) -> (Q,N+1), the greatest of each row 1."""
+    def _expected(self, before: Tensor | None, places: int) -> Tensor:
+        return self.start(places) if before is None else self.predicted(before)
+
+    def _updated(self, expected: Tensor, likelihood: Tensor) -> Tensor:
+        """Bayes' rule; where what is likely was impossible, what was expected stands."""
+        joint = expected * likelihood
+        total = joint.sum()
+        return torch.where(total > 0, joint / torch.where(total > 0, total, 1), expected)
+
+    def evidence(self, scores: Tensor, moments: Moments | None = None) -> Tensor:
+        """Likelihoods of each query up to a factor: (Q,N) -> (Q,N+1), the greatest of each row 1.
+
+        Args:
+            moments: mean and spread that are not those of these scores.
+        """
         known = scores.isfinite()
-        count = known.sum(1, keepdim=True).clamp(min=1)
-        mean = torch.where(known, scores, 0).sum(1, keepdim=True) / count
-        below = torch.where(known, mean - scores, 0)
-        variance = below.square().sum(1, keepdim=True) / count
-        tells = variance > torch.finfo(scores.dtype).eps ** 2 * mean.square()
-        z = below / torch.where(tells, variance, 1).sqrt()
+        mean, spread, tells = moments_of(scores) if moments is None else moments
+        z = torch.where(known, mean - scores, 0) / spread
         z = torch.cat([z, self.off_map.to(z).expand(len(z), 1)], 1)
         logits = torch.where(tells, self.log_sharpness.to(z).exp() * z, 0)
         open_ = torch.cat([known, known.new_ones(len(z), 1)], 1) | ~tells
@@ -152,6 +184,45 @@ class PlaceFilter(SequenceModel):
             posterior = self.posterior(scores, before)
             before = posterior[-1] if len(posterior) else before
             yield self._scores(posterior, scores.isfinite())
+
+    def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
+        """See `SequenceModel`; between two searches only what is likely is scored.
+
+        Other places then count as if they scored as the mean, and mean and spread are those of the last
+        search.
+        """
+        if self.search_every == 1:
+            yield from super().follow(batches, route)
+            return
+        before: Tensor | None = None
+        moments: Moments | None = None
+        since = 0
+        for queries in batches:
+            found = []
+            for query in queries.split(1):
+                expected = self._expected(before, route.places)
+                near = self._likely(expected) if since < self.search_every else None
+                if moments is None or near is None:
+                    scores, since = route.scores(query), 0
+                    moments = moments_of(scores)
+                else:
+                    scores = moments.mean.expand(1, route.places).clone()
+                    scores[:, near.start : near.stop] = route.scores_between(query, near.start, near.stop)
+                since += 1
+                before = self._updated(expected.to(scores), self.evidence(scores, moments)[0])
+                found.append(self._scores(before[None], scores.isfinite()))
+            yield torch.cat(found)
+
+    def _likely(self, expected: Tensor) -> range | None:
+        """The stretch of places that more leads to than a jump; None where it is not where the camera is."""
+        on, places = expected[:-1].detach(), len(expected) - 1
+        jump, enter = self.rate_logits.detach().softmax(0)[1], self.enter_logit.detach().sigmoid()
+        anywhere = (jump * on.sum() + enter * expected[-1].detach()) / places  # as much comes to every place
+        (likely,) = (on > 2 * anywhere.clamp(min=FLOOR)).nonzero(as_tuple=True)
+        if not len(likely):
+            return None
+        near = range(int(likely[0]), int(likely[-1]) + 1)
+        return near if float(on[near.start : near.stop].sum()) > LIKELY else None
 
     def _scores(self, posterior: Tensor, covered: Tensor) -> Tensor:
         near = 1 - torch.arange(-self.within, self.within + 1).abs().to(posterior) / (self.within + 1)

@@ -4,50 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, SequenceModel
 
 log = logging.getLogger("dejavu_torch")
-
-
-class SequenceModel(nn.Module, ABC):
-    """Scores of places from consecutive queries, not from one: what `sequence` of `DejaVu.localize` takes.
-
-    Convention: causal; the score of a query tells of the place of that query.
-    """
-
-    @property
-    def shifts(self) -> tuple[tuple[int, ...], ...]:
-        """Where scores are the best mean along trajectories: how far back each lies, as maps may use it.
-
-        Of each trajectory the places 0, 1, .., T - 1 queries before the latest; () where they are no means,
-        as of a subclass that scores otherwise.
-        """
-        return ()
-
-    @abstractmethod
-    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Scores of batches (B,N) that come one behind the other, from those of single queries.
-
-        Memory does not grow with the queries.
-        """
-
-    @abstractmethod
-    def check(self, queries: int, places: int) -> None:
-        """Refuse, or warn of, a number of queries or places that it makes no sense for.
-
-        Raises:
-            InputError: naming both.
-        """
-
-    def threshold_of(self, threshold: float | None) -> float | None:
-        """What a score has to be below to be accepted, where it is `threshold` for single queries."""
-        return threshold
 
 
 class SequenceMatcher(SequenceModel):

@@ -191,6 +191,7 @@ def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
         (lambda: PlaceFilter(sharpness=0), ["sharpness 0", "above 0"]),
         (lambda: PlaceFilter(off_map=math.inf), ["off_map inf"]),
         (lambda: PlaceFilter(within=-1), ["within -1"]),
+        (lambda: PlaceFilter(search_every=0), ["search_every is 0", "at least 1"]),
         (lambda: PlaceFilter()(torch.rand(4)), ["(4,)", "(Q,N)"]),
         (lambda: PlaceFilter()(torch.zeros(3, 4, dtype=torch.int64)), ["torch.int64", "floats"]),
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.rand(6)), ["posterior (6,)", "(5,)"]),
@@ -200,3 +201,45 @@ def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
 def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> None:
     with refused(*told):
         make()
+
+
+class Watched:
+    """A route that counts the places that it scores; a query is the row of scores itself."""
+
+    def __init__(self, places: int) -> None:
+        self.places, self.scored = places, 0
+
+    def scores(self, queries: Tensor) -> Tensor:
+        return self.scores_between(queries, 0, self.places)
+
+    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+        self.scored += len(queries) * (stop - start)
+        return queries[:, start:stop]
+
+
+def test_where_the_camera_is_known_only_its_neighbourhood_is_scored() -> None:
+    shown = [*range(100, 300), *range(700, 900)]
+    scores, route = standing_out(1000, shown), Watched(1000)
+    scores[torch.arange(len(shown)), torch.tensor(shown)] -= 3
+    searching = PlaceFilter(search_every=20)
+    found = torch.cat(list(searching.follow(scores.split(33), route)))
+    everything = PlaceFilter()(scores)
+    assert route.scored < 0.2 * scores.numel()
+    assert torch.equal(found.argmin(1)[:200], everything.argmin(1)[:200])
+    after = slice(200 + 20, None)  # a jump is noticed at the next search
+    assert torch.equal(found.argmin(1)[after], everything.argmin(1)[after])
+    difference = ((-found).exp() - (-everything).exp()).abs()
+    assert difference[:200].max() < 0.02
+
+
+def test_a_filter_that_searches_for_every_query_scores_all_places() -> None:
+    scores, route = standing_out(50, [*range(10, 40)]), Watched(50)
+    assert torch.equal(torch.cat(list(PlaceFilter().follow([scores], route))), PlaceFilter()(scores))
+    assert route.scored == scores.numel()
+
+
+def test_who_is_lost_is_searched_for_everywhere() -> None:
+    route = Watched(200)
+    for _ in PlaceFilter(search_every=50).follow([standing_out(200, [-1] * 30)], route):
+        pass
+    assert route.scored > 0.9 * 30 * 200
