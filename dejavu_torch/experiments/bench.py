@@ -1,4 +1,4 @@
-"""HOG, L1 distances and sequences, timed beside other programs or ways that compute the same."""
+"""HOG, L1 distances, sequences and filters, timed beside other programs or ways that compute the same."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
@@ -23,9 +24,11 @@ import dejavu_torch
 from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
+from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.hog import hog
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import FrequencyLayer, InputError
 
@@ -33,6 +36,7 @@ BATCH = 64
 AT_MOST = 60  # seconds for all runs of one contender together
 COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu")
 PERIODS = (191, 193, 197, 199, 211)  # of the layers that sequences are matched in: 991 phases
+WIDE = 64  # numbers of the descriptors that are filtered
 MEMORY = Path("/proc/self/statm")
 
 Sizes = Sequence[tuple[int, int]]
@@ -80,10 +84,11 @@ def bench_matcher(
     images: Sizes = ((64, 64), (256, 192)),
     distances: Sequence[tuple[int, int, int]] = ((512, 2640, 1000),),
     sequences: Sequence[tuple[int, int, int]] = ((64, 21, 100_000),),
+    filters: Sequence[tuple[int, int]] = ((200, 100_000),),
     torch_compile: bool = True,
     seed: int = 0,
 ) -> list[Row]:
-    """Time HOG beside scikit-image, L1 distances beside torch, scipy and faiss, and sequences both ways.
+    """Time HOG beside scikit-image, L1 distances beside torch, scipy and faiss; sequences, filters two ways.
 
     Args:
         frames: grey frames to describe, of each size in `images` (height, width in pixels).
@@ -91,6 +96,8 @@ def bench_matcher(
         distances: queries, features and templates of each case of L1.
         sequences: queries, queries of a sequence and places of each case of a template map whose sequences
             are matched in its layers, beside its score rows.
+        filters: queries and places of each case of a filter that searches all places for every 50th query,
+            beside one that does for every query; the difference is one of probabilities.
         torch_compile: also a sum that `torch.compile` makes a loop of; compiling takes its time.
         seed: of the random frames and features.
 
@@ -100,10 +107,10 @@ def bench_matcher(
     Raises:
         InputError: a number below 1.
     """
-    if min(frames, repeats, *(n for size in (*images, *distances, *sequences) for n in size)) < 1:
+    if min(frames, repeats, *(n for size in (*images, *distances, *sequences, *filters) for n in size)) < 1:
         raise InputError(
-            f"the bench got frames={frames}, repeats={repeats}, images {images}, distances {distances} and "
-            f"sequences {sequences}; expected at least 1 of each"
+            f"the bench got frames={frames}, repeats={repeats}, images {images}, distances {distances}, "
+            f"sequences {sequences} and filters {filters}; expected at least 1 of each"
         )
     generator = torch.Generator().manual_seed(seed)
     rows = []
@@ -119,6 +126,10 @@ def bench_matcher(
             rows += _sequence_case(
                 f"sequence {q} x {length} x {places}", query, templates, length, places, repeats
             )
+        for q, places in filters:
+            route = _smooth(torch.randn(places, WIDE, generator=generator))
+            noise = torch.randn(q, WIDE, generator=generator)
+            rows += _filter_case(f"filter {q} x {places}", route, noise, repeats)
     return rows
 
 
@@ -236,6 +247,26 @@ def _sequence_case(
 
     beside = Program("dejavu (score rows)", torch.get_num_threads(), lambda: rows)
     return benchmark(case, [*_ours(tables), beside], repeats)
+
+
+def _smooth(steps: Tensor) -> Tensor:
+    """A route whose descriptors change little from place to place: the mean of 16 random steps. (N,K)"""
+    summed = F.pad(steps.T, (15, 0))[None]
+    return F.avg_pool1d(summed, 16, 1)[0].T * 4
+
+
+def _filter_case(case: str, route: Tensor, noise: Tensor, repeats: int) -> list[Row]:
+    """A drive along the middle of a route, seen with as much noise as there is route."""
+    spectral = SpectralMapper(None, step=2.0, chunk=1024)(route)
+    first = max(0, (len(route) - len(noise)) // 2)
+    queries = (route[first : first + len(noise)] + noise).split(16)
+
+    def drive(every: int) -> Tensor:
+        scores = spectral.sequences(queries, PlaceFilter(search_every=every))
+        return torch.cat([(-part).exp() for part in scores])
+
+    beside = Program("dejavu (all places)", torch.get_num_threads(), lambda: partial(drive, 1))
+    return benchmark(case, [*_ours(partial(drive, 50)), beside], repeats)
 
 
 def benchmark(case: str, contenders: Sequence[Program], repeats: int) -> list[Row]:

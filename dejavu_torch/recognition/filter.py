@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from dejavu_torch.types import InputError, Scorer, SequenceModel
 
-LIKELY = 0.5  # of all probability has to lie in a stretch of places for these to be scored alone
-FLOOR = 1e-9  # probability below which a place is not likely, however few jump
+LIKELY = 0.99  # of all probability has to lie in a stretch of places for these to be scored alone
+UNLIKELY = 1e-4  # of all probability: a place with less ends such a stretch
 
 
 class Moments(NamedTuple):
@@ -113,7 +113,7 @@ class PlaceFilter(SequenceModel):
         self.within, self.threshold, self.search_every = within, threshold, search_every
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
-        return self._scores(self.posterior(scores, before), scores.isfinite())
+        return self._scores(self.posterior(scores, before)[:, :-1], scores)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         """Probability of each place, and of being off the map, behind each query.
@@ -128,14 +128,57 @@ class PlaceFilter(SequenceModel):
                 f"a posterior {tuple(before.shape)} of another map, of {places} places; expected "
                 f"({places + 1},)"
             )
+        belief = None if before is None else _with_rest(before.to(scores))
         rows = []
-        for row in self.evidence(scores):
-            before = self._updated(self._expected(before, places).to(row), row)
-            rows.append(before)
+        for likelihood in self.evidence(scores, moments_of(scores)):
+            belief = self._updated(self._expected(belief, 0, places).to(scores), likelihood)
+            rows.append(_without_rest(belief))
         return torch.stack(rows) if rows else scores.new_zeros(0, places + 1)
 
-    def _expected(self, before: Tensor | None, places: int) -> Tensor:
-        return self.start(places) if before is None else self.predicted(before)
+    def predicted(self, posterior: Tensor) -> Tensor:
+        """What the motion makes of a posterior, ahead of the next query: (N+1,) -> (N+1,)."""
+        return _without_rest(self._expected(_with_rest(posterior), 0, len(posterior) - 1))
+
+    def evidence(self, scores: Tensor, moments: Moments) -> Tensor:
+        """Likelihoods of each query up to a factor, the greatest of each row 1.
+
+        Args:
+            scores: of W places. moments: of the scores of all places, which may be more.
+
+        Shape: (Q,W) -> (Q,W+2): of each place, of another one that scores as the mean, and of no place.
+        """
+        mean, spread, tells = moments
+        known = scores.isfinite()
+        z = torch.where(known, mean - scores, 0) / spread
+        others = torch.stack([z.new_zeros(()), self.off_map.to(z)]).expand(len(z), 2)
+        logits = torch.where(tells, self.log_sharpness.to(z).exp() * torch.cat([z, others], 1), 0)
+        closed = torch.cat([~known, known.new_zeros(len(z), 2)], 1) & tells
+        logits = logits.masked_fill(closed, -math.inf)
+        return (logits - logits.amax(1, keepdim=True)).exp()
+
+    def _expected(self, belief: Tensor | None, start: int, places: int) -> Tensor:
+        """The belief ahead of the next query.
+
+        A belief (W+2,) holds the probability of the places [start, start + W), that of all others, between
+        which it makes no difference, and that of being off the map. What lies ahead of the W places and can
+        be driven to joins them.
+        """
+        leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
+        if belief is None:  # off the map or on it, as many as leave and enter, and there anywhere
+            off = leave / (leave + enter).clamp(min=1e-30)
+            return torch.cat([((1 - off) / places).expand(places), off.new_zeros(1), off[None]])
+        moves, stay = self.move_logits.to(belief).softmax(0), self.rate_logits.to(belief).softmax(0)[0]
+        jump, leave, enter = self.rate_logits.to(belief).softmax(0)[1], leave.to(belief), enter.to(belief)
+        on, rest, off = belief[:-2], belief[-2], belief[-1]
+        furthest = len(moves) - 1
+        ahead = min(furthest, places - start - len(on))
+        # a convolution turns its kernel round
+        moved = F.conv1d(F.pad(on, (furthest, ahead))[None], moves.flip(0)[None, None])[0]
+        total = on.sum() + rest
+        anywhere = (jump * total + enter * off) / places
+        rest = stay * rest + anywhere * (places - len(moved))
+        off = stay * (on.sum() - moved.sum()) + leave * total + (1 - enter) * off
+        return torch.cat([stay * moved + anywhere, rest[None], off[None]])
 
     def _updated(self, expected: Tensor, likelihood: Tensor) -> Tensor:
         """Bayes' rule; where what is likely was impossible, what was expected stands."""
@@ -143,92 +186,75 @@ class PlaceFilter(SequenceModel):
         total = joint.sum()
         return torch.where(total > 0, joint / torch.where(total > 0, total, 1), expected)
 
-    def evidence(self, scores: Tensor, moments: Moments | None = None) -> Tensor:
-        """Likelihoods of each query up to a factor: (Q,N) -> (Q,N+1), the greatest of each row 1.
-
-        Args:
-            moments: mean and spread that are not those of these scores.
-        """
-        known = scores.isfinite()
-        mean, spread, tells = moments_of(scores) if moments is None else moments
-        z = torch.where(known, mean - scores, 0) / spread
-        z = torch.cat([z, self.off_map.to(z).expand(len(z), 1)], 1)
-        logits = torch.where(tells, self.log_sharpness.to(z).exp() * z, 0)
-        open_ = torch.cat([known, known.new_ones(len(z), 1)], 1) | ~tells
-        logits = logits.masked_fill(~open_, -math.inf)
-        return (logits - logits.amax(1, keepdim=True)).exp()
-
-    def predicted(self, posterior: Tensor) -> Tensor:
-        """What the motion makes of a posterior, ahead of the next query: (N+1,) -> (N+1,)."""
-        on, off = posterior[:-1], posterior[-1]
-        stay, jump, leave = self.rate_logits.to(on).softmax(0)
-        enter = self.enter_logit.to(on).sigmoid()
-        moves = self.move_logits.to(on).softmax(0)
-        # a convolution turns its kernel round
-        moved = F.conv1d(F.pad(on, (len(moves) - 1, 0))[None], moves.flip(0)[None, None])[0]
-        total = on.sum()
-        anywhere = (jump * total + enter * off) / len(on)
-        beyond = stay * (total - moved.sum()) + leave * total + (1 - enter) * off
-        return torch.cat([stay * moved + anywhere, beyond[None]])
-
-    def start(self, places: int) -> Tensor:
-        """What is expected ahead of the first query: any of so many places alike, or off the map. (N+1,)"""
-        leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
-        off = leave / (leave + enter).clamp(min=1e-30)  # where as many leave as enter
-        return torch.cat([((1 - off) / places).expand(places), off[None]])
-
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
         """See `SequenceModel`; between two batches one posterior is kept."""
         before = None
         for scores in batches:
             posterior = self.posterior(scores, before)
             before = posterior[-1] if len(posterior) else before
-            yield self._scores(posterior, scores.isfinite())
+            yield self._scores(posterior[:, :-1], scores)
 
     def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
-        """See `SequenceModel`; between two searches only what is likely is scored.
+        """See `SequenceModel`; between two searches only the stretch that is likely is scored and driven on.
 
-        Other places then count as if they scored as the mean, and mean and spread are those of the last
-        search.
+        All other places then count as if they scored as the mean, and mean and spread are those of the last
+        search: probabilities differ in the third digit or so, see `dejavu bench`.
         """
         if self.search_every == 1:
             yield from super().follow(batches, route)
             return
-        before: Tensor | None = None
+        places, start, since = route.places, 0, 0
+        belief: Tensor | None = None
         moments: Moments | None = None
-        since = 0
         for queries in batches:
             found = []
             for query in queries.split(1):
-                expected = self._expected(before, route.places)
-                near = self._likely(expected) if since < self.search_every else None
-                if moments is None or near is None:
-                    scores, since = route.scores(query), 0
+                near = None if belief is None or since == self.search_every else self._likely(belief)
+                if belief is None or moments is None or near is None:
+                    belief = belief if belief is None else _spread(belief, start, places)
+                    start, since, scores = 0, 0, route.scores(query)
                     moments = moments_of(scores)
+                    expected = self._expected(belief, start, places).to(scores)
                 else:
-                    scores = moments.mean.expand(1, route.places).clone()
-                    scores[:, near.start : near.stop] = route.scores_between(query, near.start, near.stop)
+                    rest = belief[:-2].sum() - belief[near.start : near.stop].sum()
+                    on, others = (
+                        belief[near.start : near.stop],
+                        belief[-2:] + rest * belief.new_tensor([1, 0]),
+                    )
+                    start += near.start
+                    expected = self._expected(torch.cat([on, others]), start, places)
+                    scores = route.scores_between(query, start, start + len(expected) - 2)
                 since += 1
-                before = self._updated(expected.to(scores), self.evidence(scores, moments)[0])
-                found.append(self._scores(before[None], scores.isfinite()))
+                belief = self._updated(expected, self.evidence(scores, moments)[0])
+                found.append(self._row(belief, start, scores, places))
             yield torch.cat(found)
 
-    def _likely(self, expected: Tensor) -> range | None:
-        """The stretch of places that more leads to than a jump; None where it is not where the camera is."""
-        on, places = expected[:-1].detach(), len(expected) - 1
-        jump, enter = self.rate_logits.detach().softmax(0)[1], self.enter_logit.detach().sigmoid()
-        anywhere = (jump * on.sum() + enter * expected[-1].detach()) / places  # as much comes to every place
-        (likely,) = (on > 2 * anywhere.clamp(min=FLOOR)).nonzero(as_tuple=True)
+    def _row(self, belief: Tensor, start: int, scores: Tensor, places: int) -> Tensor:
+        """As `_scores`, of all places: (W+2,) and (1,W) -> (1,N)."""
+        stop, smallest = start + scores.shape[1], torch.finfo(belief.dtype).tiny
+        elsewhere = (self.within + 1) * belief[-2] / max(1, places - stop + start)
+        row = -elsewhere.clamp(smallest, 1).log().repeat(1, places)
+        left, right = min(self.within, start), min(self.within, places - stop)  # neighbours beside the W
+        on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
+        near = torch.minimum(row[:, :1], self._scores(on, seen))
+        row[:, start - left : stop + right] = near.masked_fill(~seen.isfinite(), math.inf)
+        return row
+
+    def _likely(self, belief: Tensor) -> range | None:
+        """The stretch of a belief's places that hold most of it; None where it is not where the camera is."""
+        on = belief[:-2].detach()
+        (likely,) = (on > UNLIKELY).nonzero(as_tuple=True)
         if not len(likely):
             return None
         near = range(int(likely[0]), int(likely[-1]) + 1)
         return near if float(on[near.start : near.stop].sum()) > LIKELY else None
 
-    def _scores(self, posterior: Tensor, covered: Tensor) -> Tensor:
+    def _scores(self, posterior: Tensor, scores: Tensor) -> Tensor:
+        """-log of the probability of each place and its neighbours: (Q,W) and what they are of -> (Q,W)."""
         near = 1 - torch.arange(-self.within, self.within + 1).abs().to(posterior) / (self.within + 1)
-        mass = F.conv1d(posterior[:, None, :-1], near[None, None], padding=self.within)[:, 0]
+        mass = F.conv1d(posterior[:, None], near[None, None], padding=self.within)[:, 0]
         score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1).log()
-        return score.masked_fill(~covered, math.inf)
+        return score.masked_fill(~scores.isfinite(), math.inf)
 
     def check(self, queries: int, places: int) -> None:
         """See `SequenceModel`: refuse moves that leave the map at once."""
@@ -249,3 +275,20 @@ class PlaceFilter(SequenceModel):
             f"moves={moves}, jump={jump:.3g}, leave={leave:.3g}, enter={enter:.3g}, "
             f"sharpness={sharpness:.3g}, off_map={float(self.off_map):.3g}, within={self.within}"
         )
+
+
+def _with_rest(posterior: Tensor) -> Tensor:
+    """A posterior (N+1,) as a belief of all places: there are no others."""
+    return torch.cat([posterior[:-1], posterior.new_zeros(1), posterior[-1:]])
+
+
+def _without_rest(belief: Tensor) -> Tensor:
+    return torch.cat([belief[:-2], belief[-1:]])
+
+
+def _spread(belief: Tensor, start: int, places: int) -> Tensor:
+    """A belief of all places from one of those from `start` on."""
+    others = places - (len(belief) - 2)
+    on = (belief[-2] / max(1, others)).repeat(places)
+    on[start : start + len(belief) - 2] = belief[:-2]
+    return torch.cat([on, belief.new_zeros(1), belief[-1:]])
