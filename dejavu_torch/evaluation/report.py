@@ -240,6 +240,7 @@ def write_report(
         notes=[summary(report)],
         rows=score_table(report),
         sequence_rows=sequence_table(report),
+        sequence_colours=[colour_of(key) for key, one in report.shown().items() if one.sequences],
         every_row=score_table(report, every=True),
         contenders=report.contenders,
         facts=facts,
