@@ -36,8 +36,8 @@ from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, r
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.candidates import Candidates, best_candidates, check_candidates
-from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.candidates import Candidates, check_candidates
+from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.types import InputError, Match, SequenceModel, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -330,7 +330,8 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        return _joined(self.matches(queries, progress, sequence))
+        matches = list(self.matches(queries, progress, sequence))
+        return Match(*map(torch.cat, zip(*matches, strict=True)))
 
     def localize_descriptors(
         self, descriptors: Tensor, sequence: SequenceModel | None = None, order: Tensor | None = None
@@ -340,8 +341,12 @@ class DejaVu(nn.Module):
         Args:
             order: (N,) which frame each place of a shuffled map is; the match then counts frames.
         """
+        return self.found(descriptors, Matching(sequence), order).match(self.threshold_of(sequence))
+
+    def found(self, descriptors: Tensor, matching: Matching, order: Tensor | None = None) -> Found:
+        """All that a matching finds, of descriptors and in an order as of `localize_descriptors`."""
         self._require_map()
-        return _joined(self._found([descriptors], sequence, order))
+        return joined(self._found([descriptors], matching, order))
 
     def matches(
         self,
@@ -351,7 +356,9 @@ class DejaVu(nn.Module):
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
-        yield from self._found(self._checked(queries, progress), sequence)
+        threshold = self.threshold_of(sequence)
+        for part in self._found(self._checked(queries, progress), Matching(sequence)):
+            yield part.match(threshold)
 
     def candidates(
         self,
@@ -377,14 +384,8 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        return _ranked(self.candidate_batches(queries, k, apart, sequence=sequence))
-
-    def candidates_of_descriptors(
-        self, descriptors: Tensor, k: int, apart: int = 5, sequence: SequenceModel | None = None
-    ) -> Candidates:
-        """As `candidates`, of descriptors (Q,K) as the map's own are."""
-        self._require_map()
-        return _ranked(self._candidates([descriptors], k, apart, sequence))
+        parts = list(self.candidate_batches(queries, k, apart, sequence=sequence))
+        return Candidates(*map(torch.cat, zip(*parts, strict=True)))
 
     def candidate_batches(
         self,
@@ -397,7 +398,9 @@ class DejaVu(nn.Module):
         """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
         check_candidates(k, apart, self.map.places)
-        yield from self._candidates(self._checked(queries, progress), k, apart, sequence)
+        matching = Matching(sequence, ranks=k, apart=apart)
+        for part in self._found(self._checked(queries, progress), matching):
+            yield part.candidates
 
     def _checked(self, queries: Traverse | Tensor, progress: str | None) -> Iterator[Tensor]:
         """Descriptors of queries that fit the map, in batches; resampled as the map's places are."""
@@ -410,40 +413,28 @@ class DejaVu(nn.Module):
                 self.check_queries(shape, features.shape[1], queries.name)
             yield self.whitened(features)
 
-    def _found(
-        self, batches: Iterable[Tensor], sequence: SequenceModel | None, order: Tensor | None = None
-    ) -> Iterator[Match]:
-        """Matches of batches of descriptors."""
-        threshold = self.threshold_of(sequence)
-        for part in self._scored(batches, sequence, order):
-            yield Match(*(column.cpu() for column in best_match(part, threshold)))
-
-    def _candidates(
-        self, batches: Iterable[Tensor], k: int, apart: int, sequence: SequenceModel | None
-    ) -> Iterator[Candidates]:
-        """Candidates of batches of descriptors."""
-        for part in self._scored(batches, sequence):
-            yield Candidates(*(column.cpu() for column in best_candidates(part, k, apart)))
-
     def threshold_of(self, sequence: SequenceModel | None) -> float | None:
         """What the score of a query, or of a sequence, has to be below to be accepted."""
         return self.threshold if sequence is None else sequence.threshold_of(self.threshold)
 
-    @torch.no_grad()
-    def _scored(
-        self, batches: Iterable[Tensor], sequence: SequenceModel | None, order: Tensor | None = None
-    ) -> Iterator[Tensor]:
-        """Scores of batches of descriptors, of single queries or of sequences of them."""
-        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))  # as memory allows
+    def _found(
+        self, batches: Iterable[Tensor], matching: Matching, order: Tensor | None = None
+    ) -> Iterator[Found]:
+        """What a matching finds of batches of descriptors, as many queries at a time as memory allows.
+
+        Args:
+            order: as of `localize_descriptors`.
+        """
+        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         parts = (part for descriptors in batches for part in descriptors.split(at_once))
-        if sequence is not None and order is None:
-            yield from self.map.sequences(parts, sequence)
-            return
+        sequence = matching.sequence
+        if sequence is not None and not matching.lengths and order is None:  # not all scores may be needed
+            return matching._replace(sequence=None).stream(self.map.sequences(parts, sequence))
         scores: Iterator[Tensor] = map(self.map.scores, parts)
         if order is not None:
             place = order.argsort()
             scores = (part[:, place.to(part.device)] for part in scores)
-        yield from scores if sequence is None else sequence.stream(scores)
+        return matching.stream(scores)
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""
@@ -573,14 +564,6 @@ class DejaVu(nn.Module):
     def _require_map(self) -> None:
         if not self.map.places:
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
-
-
-def _joined(matches: Iterator[Match]) -> Match:
-    return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
-
-
-def _ranked(candidates: Iterator[Candidates]) -> Candidates:
-    return Candidates(*(torch.cat(column) for column in zip(*candidates, strict=True)))
 
 
 def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

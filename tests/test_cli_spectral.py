@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -322,7 +323,9 @@ def test_a_damaged_map_is_refused(
     assert not (tmp_path / "m.csv").exists()
 
 
-def test_a_sequence_is_of_the_map_and_of_all_beside_it(tmp_path: Path) -> None:
+def test_a_sequence_is_of_the_map_and_of_all_beside_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     noise = np.random.default_rng(0)
     walk = noise.normal(size=(200, 8)).cumsum(0)
     for name in ("one", "two"):
@@ -333,8 +336,13 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(tmp_path: Path) -> None:
         run("compare", one, two, "--tolerance", 1, "--sequence", length, "--out", tmp_path / f"{length}")
         reports[length] = report_of(tmp_path / f"{length}")
         assert reports[length]["sequence"] == length
+        table = re.search(r"^AUC +T = 1 +T = 5 +T = 9 +T = 11 +T = 21\n(.*)$", capsys.readouterr().out, re.M)
+        assert (table is not None) == (tmp_path / f"{length}" / "sequences.png").exists() == (length == 9)
         page = (tmp_path / f"{length}" / "index.html").read_text()
         assert ("together with the 8 before it" in page) == (length == 9)
+    areas = [f"{scores['auc']:.3f}" for scores in reports[9]["sequences"].values()]
+    assert table is not None
+    assert table[1].split() == ["this", "map", *areas]
     for key in ("uncompressed", "interpolated", "stride"):
         assert reports[9][key]["auc"] > reports[1][key]["auc"]
     assert reports[9]["null"]["auc"] != reports[1]["null"]["auc"]

@@ -467,10 +467,10 @@ def _write_matches(
 
 
 def _print_scores(report: Report, out: Path) -> None:
-    from dejavu_torch.evaluation.report import score_table, summary, text_table
+    from dejavu_torch.evaluation.report import score_table, sequence_table, summary, text_table
 
-    rows = score_table(report)
-    if rows:
-        print(text_table(rows))
+    for rows in (score_table(report), sequence_table(report)):
+        if rows:
+            print(text_table(rows))
     print(summary(report))
     print(f"next: open {out / 'index.html'}")

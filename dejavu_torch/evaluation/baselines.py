@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -13,13 +13,16 @@ from tqdm import tqdm
 from dejavu_torch.database.distance import Metric, phase_distances
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.database.template_map import TemplateMap
-from dejavu_torch.evaluation.controls import leave_out_match, null_control
+from dejavu_torch.evaluation.controls import leave_out_match, null_model
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import ForeignPeriods
-from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
+from dejavu_torch.recognition.candidates import Candidates
+from dejavu_torch.recognition.matching import SINGLE, Found, Matching
+from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -27,54 +30,63 @@ DISTANCES_AT_ONCE = 2**22
 
 
 class Baseline(NamedTuple):
-    """Matches of another way to store the route.
+    """What another way to store the route finds.
 
     name: for tables. bytes: that it stores. k: where it stores every k-th frame. fixed: those of the bytes
     that do not grow with the route, such as a backbone's.
     """
 
     name: str
-    match: Match
+    found: Found
     bytes: int | None = None
     k: int | None = None
     fixed: int = 0
 
 
+class Store(NamedTuple):
+    """Frames that are stored as they are, (N,D), or every `apart`-th of them; the rest as of `Baseline`."""
+
+    name: str
+    frames: Tensor
+    metric: Metric
+    bytes: int
+    k: int
+    fixed: int = 0
+    apart: int = 1
+
+    def matched(self, query: Tensor, matching: Matching, progress: str | None = None) -> Baseline:
+        """What is found for queries (Q,D); see `nearest_frames`."""
+        found = nearest_frames(self.frames, query, self.apart, self.metric, progress, matching)
+        return Baseline(self.name, found, self.bytes, self.k, self.fixed)
+
+
 def nearest_frames(
     reference: Tensor,
     query: Tensor,
-    strides: Sequence[int] = (1,),
+    k: int = 1,
     metric: Metric = "l1",
     progress: str | None = None,
-    sequence: SequenceModel | None = None,
-) -> list[Match]:
+    matching: Matching = SINGLE,
+) -> Found:
     """Nearest stored frame of each query, where every k-th reference frame is stored.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
-        strides: each k; 1 stores all frames.
+        k: 1 stores all frames. A frame that is not stored has the distance of the one before it.
         progress: text of a progress bar on a terminal; None is no bar.
-        sequence: as of `DejaVu.localize`; a frame that is not stored has the distance of the one before it.
 
     Returns:
-        For each k a Match of (Q,), index in reference frames, which is one that is stored.
+        What is found, in reference frames that are stored.
     """
-    rows, matches = max(1, DISTANCES_AT_ONCE // len(reference)), []
-    for k in strides:
-        batches = tqdm(query.split(rows), progress, disable=None if progress else True, leave=False)
-        stored = reference[::k]
-        with torch.no_grad():
-            scores: Iterable[Tensor] = (
-                phase_distances(batch.to(stored.device), stored, metric) for batch in batches
-            )
-            if sequence is not None:
-                before = torch.arange(len(reference), device=stored.device) // k
-                scores = sequence.stream(part[:, before] for part in scores)
-            found = [best_match(part) for part in scores]
-        match = Match(*(torch.cat(column).cpu() for column in zip(*found, strict=True)))
-        frame = match.index // k * k if sequence is not None else match.index * k
-        matches.append(match._replace(index=torch.where(match.index >= 0, frame, -1)))
-    return matches
+    stored, before = reference[::k], torch.arange(len(reference), device=reference.device) // k
+    batches = tqdm(
+        query.split(max(1, DISTANCES_AT_ONCE // len(reference))),
+        progress,
+        disable=None if progress else True,
+        leave=False,
+    )
+    scores = (phase_distances(batch.to(stored.device), stored, metric)[:, before] for batch in batches)
+    return matching.found(scores).moved(lambda frame: torch.where(frame >= 0, frame // k * k, -1))
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
@@ -102,7 +114,7 @@ def baselines_of(
     seed: int = 0,
     leave_out: int | None = None,
     progress: bool = False,
-    sequence: SequenceModel | None = None,
+    matching: Matching = SINGLE,
 ) -> dict[str, Baseline]:
     """The baselines and null controls that every report sets beside the map, by their keys in report.json.
 
@@ -110,71 +122,65 @@ def baselines_of(
         model: with the map. reference: (N,D) its features. query: (Q,D) those of the queries.
         tolerance: the coarsest stride is twice as much. seed: of the shuffle of the null controls.
         leave_out: also query the reference with itself, see `leave_out_match`.
-        progress: show progress bars on a terminal. sequence: as of `DejaVu.localize`, of all but `leave_out`.
+        progress: show progress bars on a terminal. matching: of all but `leave_out`.
     """
-    store = _compact_stores if isinstance(model.map, SpectralMap) else _plain_stores
+    stores = (_compact_stores if isinstance(model.map, SpectralMap) else _plain_stores)(
+        model, reference, tolerance
+    )
     text = "baselines: what is stored as it is" if progress else None
-    found = store(model, reference, query, tolerance, text, sequence)
+    found = {key: store.matched(query, matching, text) for key, store in stores.items()}
     one = "place" if len(model.map.positions) else "frame"
+
+    def null(name: str, same_plan: bool = False) -> Baseline:
+        control, order = null_model(model, reference, seed, same_plan)
+        return Baseline(f"null: {name}", control.found(query, matching, order))
+
     foreign = isinstance(getattr(model.mapper, "periods", None), ForeignPeriods)
     if foreign:
         log.warning("no null control learned anew: what found the map's periods is not of this package")
-    if (model.trained is None or isinstance(model.map, SpectralMap)) and not foreign:
-        anew = null_control(model, reference, query, seed, sequence=sequence)
-        name = f"null: everything learned from shuffled {one}s"
-        if isinstance(model.map, SpectralMap):
-            name = f"null: shuffled {one}s, as many bytes"
-        found["null"] = Baseline(name, anew)
+    if isinstance(model.map, SpectralMap):
+        found["null"] = null(f"shuffled {one}s, as many bytes")
+    elif model.trained is None and not foreign:
+        found["null"] = null(f"everything learned from shuffled {one}s")
     if isinstance(model.map, TemplateMap):
-        same = null_control(model, reference, query, seed, same_plan=True, sequence=sequence)
         if model.trained is None:
-            found["null_same_plan"] = Baseline(f"null: this map's layers, shuffled {one}s", same)
+            found["null_same_plan"] = null(f"this map's layers, shuffled {one}s", same_plan=True)
         else:  # training anew is a run of its own
-            found["null"] = Baseline(f"null: templates of shuffled {one}s", same)
+            found["null"] = null(f"templates of shuffled {one}s", same_plan=True)
     if leave_out is not None:
-        itself = leave_out_match(model, reference, leave_out)
+        index, score, _ = leave_out_match(model, reference, leave_out)
+        itself = Found(Candidates(index[:, None], score[:, None]))
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     return found
 
 
-def _plain_stores(
-    model: DejaVu,
-    reference: Tensor,
-    query: Tensor,
-    tolerance: int,
-    progress: str | None,
-    sequence: SequenceModel | None,
-) -> dict[str, Baseline]:
+def _plain_stores(model: DejaVu, reference: Tensor, tolerance: int) -> dict[str, Store]:
     """The features that a template map is made of, of all frames and of every k-th."""
     frames, dimension = reference.shape
     summary, itemsize = model.summary(), reference.element_size()
     backbone = summary.fixed.get("backbone", 0)  # frames need it as well
     fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
-    strides = {"uncompressed": 1, "stride": fair, "stride_coarsest": max(1, 2 * tolerance)}
+    coarsest = max(1, 2 * tolerance)
     of = "" if isinstance(model.features, HOG) else "same features, "
     one = "place" if len(model.map.positions) else "frame"
     skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
-    names = {
-        "uncompressed": f"{of}all {frames} {one}s{skipped}",
-        "stride": f"{of}{every(fair, one)} (at least the map's bytes)",
-        "stride_coarsest": f"{of}{every(strides['stride_coarsest'], one)} (2 x tolerance)",
+    stores = {
+        "uncompressed": (f"{of}all {frames} {one}s{skipped}", 1),
+        "stride": (f"{of}{every(fair, one)} (at least the map's bytes)", fair),
+        "stride_coarsest": (f"{of}{every(coarsest, one)} (2 x tolerance)", coarsest),
     }
     metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
-    nearest = nearest_frames(reference, query, tuple(strides.values()), metric, progress, sequence)
     return {
-        key: Baseline(names[key], match, stride_bytes(frames, dimension, itemsize, k) + backbone, k, backbone)
-        for (key, k), match in zip(strides.items(), nearest, strict=True)
+        key: Store(
+            *(name, reference, metric, stride_bytes(frames, dimension, itemsize, k) + backbone, k),
+            fixed=backbone,
+            apart=k,
+        )
+        for key, (name, k) in stores.items()
     }
 
 
-def _compact_stores(
-    model: DejaVu,
-    reference: Tensor,
-    query: Tensor,
-    tolerance: int,
-    progress: str | None,
-    sequence: SequenceModel | None,
-) -> dict[str, Baseline]:
+def _compact_stores(model: DejaVu, reference: Tensor, tolerance: int) -> dict[str, Store]:
     """The descriptors that a spectral map codes: all in float, every k-th and interpolated ones in int8."""
     frames, dimension = reference.shape
     summary = model.summary()
@@ -182,19 +188,17 @@ def _compact_stores(
     one = "place" if len(model.map.positions) else "frame"
     apart, short = max(1, 2 * tolerance), as_int8(reference)
     between, spaced, keys = interpolated(short, model.map.summary().route_bytes)
-    contenders = {
-        "uncompressed": (f"its descriptors of all {frames} {one}s, float", reference, 1, frames * 4),
-        "stride": (f"its descriptors of {every(apart, one)}, int8", short, apart, -(-frames // apart)),
-        "interpolated": (f"interpolated between {every(spaced, one)}, int8", between, spaced, keys),
+    metric = "l2" if model.map.metric == "l2" else "cosine"
+
+    def store(name: str, stored: Tensor, numbers: int, k: int, apart: int = 1) -> Store:
+        return Store(name, stored, metric, numbers * dimension + fixed, k, fixed, apart)
+
+    kept = -(-frames // apart)
+    return {
+        "uncompressed": store(f"its descriptors of all {frames} {one}s, float", reference, frames * 4, 1),
+        "stride": store(f"its descriptors of {every(apart, one)}, int8", short, kept, apart, apart),
+        "interpolated": store(f"interpolated between {every(spaced, one)}, int8", between, keys, spaced),
     }
-    metric = model.map.metric
-    found = {}
-    for key, (name, stored, k, numbers) in contenders.items():
-        apart = k if key == "stride" else 1
-        near = "l2" if metric == "l2" else "cosine"
-        (match,) = nearest_frames(stored, query, (apart,), near, progress, sequence)
-        found[key] = Baseline(name, match, numbers * dimension + fixed, k, fixed)
-    return found
 
 
 def as_int8(descriptors: Tensor) -> Tensor:
@@ -229,32 +233,62 @@ def hog_baselines(
     batch_size: int,
     tolerance: int,
     progress: bool = False,
-    sequence: SequenceModel | None = None,
+    matching: Matching = SINGLE,
 ) -> dict[str, Baseline]:
     """What a map of other features is set beside: HOG of all frames, and of every k-th, k = 2 x tolerance.
 
     Nothing where the traverses hold ready features, or frames too small for HOG.
     """
-    if len(reference.frame_shape) != 3:
-        return {}
-    plain = DejaVu(batch_size=batch_size)
-    try:
-        stored = plain.extract_all(reference, "baselines: HOG of the reference" if progress else None)
-        queries = plain.extract_all(query, "baselines: HOG of the query" if progress else None)
-    except InputError as error:
-        log.info("no HOG to compare with: %s", error)
-        return {}
     one = "place" if isinstance(reference, ResampledTraverse) else "frame"
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
-    text = "baselines: HOG of all frames" if progress else None
-    nearest = nearest_frames(stored, queries, tuple(strides.values()), "l1", text, sequence)
-    frames, dimension = stored.shape
-    return {
-        key: Baseline(
-            f"HOG, {every(k, one)}", match, stride_bytes(frames, dimension, stored.element_size(), k), k
-        )
-        for (key, k), match in zip(strides.items(), nearest, strict=True)
+    names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
+    plain = DejaVu(whitening="none", batch_size=batch_size)
+    return _described_baselines(plain, "HOG", names, (reference, query), progress, matching)
+
+
+def seqslam_baseline(
+    reference: Traverse,
+    query: Traverse,
+    batch_size: int,
+    progress: bool = False,
+    matching: Matching = SINGLE,
+) -> dict[str, Baseline]:
+    """What SeqSLAM compares: the grey pixels of small frames, see `PatchPixels`, by L1.
+
+    Nothing where the traverses hold ready features, or frames too small for a patch.
+    """
+    names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
+    plain = DejaVu(PatchPixels(), "none", batch_size=batch_size, preprocess=Preprocess("grey"))
+    return _described_baselines(plain, "pixels", names, (reference, query), progress, matching)
+
+
+def _described_baselines(
+    plain: DejaVu,
+    what: str,
+    names: Mapping[str, tuple[str, int]],
+    traverses: tuple[Traverse, Traverse],
+    progress: bool,
+    matching: Matching,
+) -> dict[str, Baseline]:
+    """Every k-th frame of the first of two traverses, described as another model does; by L1.
+
+    Args:
+        what: the features, in words. names: by key, name and k.
+    """
+    if len(traverses[0].frame_shape) != 3:
+        return {}
+    text = f"baselines: {what}" if progress else None
+    try:
+        stored, queries = (plain.extract_all(traverse, text) for traverse in traverses)
+    except InputError as error:
+        log.info("no %s to compare with: %s", what, error)
+        return {}
+    (frames, dimension), itemsize = stored.shape, stored.element_size()
+    stores = {
+        key: Store(name, stored, "l1", stride_bytes(frames, dimension, itemsize, k), k, apart=k)
+        for key, (name, k) in names.items()
     }
+    return {key: store.matched(queries, matching, text) for key, store in stores.items()}
 
 
 def every(k: int, one: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -21,6 +22,7 @@ COLOURS = {
     "hog": "#10b248",
     "hog_stride_coarsest": "#8fdccb",
     "paper": "#e377c2",
+    "seqslam": "#b43cff",
     "null": "#adadad",
     "null_same_plan": "#785567",
     "leave_out": "#8c6d1f",
@@ -41,6 +43,7 @@ class Contender(NamedTuple):
 
     scores, curve: None where there is no ground truth. bytes: None where nothing is stored, as by a null.
     k: where every k-th frame is stored. fixed: those of the bytes that do not grow with the route.
+    sequences: by T, the scores of sequences of T queries; empty where single queries are matched.
     """
 
     name: str
@@ -49,6 +52,7 @@ class Contender(NamedTuple):
     k: int | None = None
     curve: PRCurve | None = None
     fixed: int = 0
+    sequences: Mapping[int, Scores] = MappingProxyType({})
 
     @property
     def route_bytes(self) -> int | None:
@@ -63,13 +67,20 @@ class Contender(NamedTuple):
     def as_json(self) -> dict[str, Any]:
         """The nested entry of report.json."""
         scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
-        extra = {
+        extra: dict[str, Any] = {
             "bytes": self.bytes,
             "route_bytes": self.route_bytes,
             "k": self.k,
             "curve_starts_at_recall": self.starts,
         }
+        if self.sequences:
+            extra["sequences"] = sequences_as_json(self.sequences)
         return scores | {name: value for name, value in extra.items() if value is not None}
+
+
+def sequences_as_json(sequences: Mapping[int, Scores]) -> dict[str, dict[str, float]]:
+    """What report.json holds of sequences, by T."""
+    return {str(T): {"auc": one.auc, "recall_at_1": one.recall_at_1} for T, one in sequences.items()}
 
 
 def contend(
@@ -80,12 +91,26 @@ def contend(
     bytes: int | None = None,
     k: int | None = None,
     fixed: int = 0,
+    sequences: Mapping[int, Match] = MappingProxyType({}),
 ) -> Contender:
-    """Matches as a contender, without scores where there is no ground truth or no query that it scores."""
+    """Matches as a contender, without scores where there is no ground truth or no query that it scores.
+
+    Args:
+        sequences: by T, the matches of sequences of T queries.
+    """
     if truth is None or not counted(match.index, as_ground_truth(truth), tolerance).any():
         return Contender(name, None, bytes, k, fixed=fixed)
     scores, curve = evaluate(match, truth, tolerance), curve_of(match, truth, tolerance)
-    return Contender(name, scores, bytes, k, curve, fixed)
+    return Contender(name, scores, bytes, k, curve, fixed, evaluate_each(sequences, truth, tolerance))
+
+
+def evaluate_each(
+    sequences: Mapping[int, Match], truth: Tensor | GroundTruth, tolerance: int
+) -> dict[int, Scores]:
+    """Scores by T, see `evaluate`; a T of which no query is left to judge is left out."""
+    truth = as_ground_truth(truth)
+    judged = {T: one for T, one in sequences.items() if counted(one.index, truth, tolerance).any()}
+    return {T: evaluate(one, truth, tolerance) for T, one in judged.items()}
 
 
 def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:

@@ -64,6 +64,14 @@ def null_control(
         Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
         the map reports nothing.
     """
+    null, order = null_model(model, reference, seed, same_plan)
+    return null.localize_descriptors(query, sequence, order)
+
+
+def null_model(
+    model: DejaVu, reference: Tensor, seed: int = 0, same_plan: bool = False
+) -> tuple[DejaVu, Tensor]:
+    """What `null_control` matches with: the model that learned shuffled frames, and which each is, (N,)."""
     order, mixed = shuffled(reference, seed)
     mapper = model.mapper
     if isinstance(model.map, SpectralMap):  # as many bytes, however the map's own step was chosen
@@ -74,7 +82,7 @@ def null_control(
     else:
         with without_warnings():
             null.learn_features(mixed)
-    return null.localize_descriptors(query, sequence, order)
+    return null, order
 
 
 def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:

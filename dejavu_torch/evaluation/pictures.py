@@ -35,19 +35,29 @@ from dejavu_torch.evaluation.match_plots import (
 )
 from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
 from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture
-from dejavu_torch.evaluation.score_plots import Stored, plot_auc, plot_curves, plot_storage
+from dejavu_torch.evaluation.score_plots import (
+    Areas,
+    Stored,
+    plot_auc,
+    plot_curves,
+    plot_sequences,
+    plot_storage,
+)
 from dejavu_torch.evaluation.spectral_plots import Lines, plot_spectrum
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.matching import SINGLE, Matching
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, SequenceModel, Traverse
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 EXAMPLES = 4  # places of which the frames of both traverses are shown
 NOTICED = 0.001  # of an area: less is no gain
+SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is shown as well
+ALIKE = 1.1  # times the bytes: sizes whose lines would lie on each other
 STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
 
 
@@ -56,6 +66,7 @@ class Localization(NamedTuple):
 
     reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None where there is none.
     tolerance: distance from a right place, in places, up to which a reported one is right.
+    matching: how the map and all that it is set beside are matched.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -68,7 +79,12 @@ class Localization(NamedTuple):
     match: Match
     truth: GroundTruth | None
     tolerance: int
-    sequence: SequenceModel | None = None
+    matching: Matching = SINGLE
+
+    @property
+    def sequence(self) -> SequenceModel | None:
+        """What scores consecutive queries together."""
+        return self.matching.sequence
 
     @property
     def scored(self) -> Match:
@@ -104,14 +120,17 @@ def draw_pictures(
         contenders: by key, ours under `map`. storage: likewise, each at several sizes.
 
     Returns:
-        Of pairs, coverage, scores, pr, auc, storage, ground, velocity, then of a template map chunks,
-        spectrogram, templates, features and activations, of a spectral one spectrum and components, those
-        that can be drawn, in this order.
+        Of pairs, coverage, scores, pr, auc, storage, sequences, ground, velocity, then of a template map
+        chunks, spectrogram, templates, features and activations, of a spectral one spectrum and components,
+        those that can be drawn, in this order.
     """
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
     pictures |= draw_scores(run) | draw_curves(contenders, f"{run.tolerance} {run.unit}")
-    pictures |= draw_storage(contenders, storage or {}, f"{run.tolerance} {run.unit}") | draw_motion(run)
+    pictures |= draw_storage(contenders, storage or {}, f"{run.tolerance} {run.unit}")
+    coded = (storage or {}).get("map", ())
+    pictures |= draw_sequences(contenders, coded, run.model.map.places, f"{run.tolerance} {run.unit}")
+    pictures |= draw_motion(run)
     if isinstance(run.model.map, SpectralMap):
         pictures |= draw_spectrum(run, run.model.map) | draw_components(run, run.model.map)
     if isinstance(run.model.map, TemplateMap):
@@ -262,7 +281,7 @@ def draw_storage(
         least, most = (f"{limit:.2g}" for limit in (min(factors), max(factors)))
         times = least if least == most else f"{least} to {most}"
         factor = f" For the same area the null takes {times} times the bytes of this map."
-    numbers: dict[str, Any] = {key: [one._asdict() for one in points] for key, points in storage.items()}
+    numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
     return {
         "storage": Picture(
             plot_storage(curves, levels, f"right within {tolerance}"),
@@ -271,6 +290,43 @@ def draw_storage(
             "this map, which gains from what is smooth and from what repeats; its null, for which nothing is "
             f"smooth and nothing repeats; keyframes, which gain from what is smooth.{factor}",
             numbers | {"null_over_map": factors},
+        )
+    }
+
+
+def draw_sequences(
+    contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
+) -> dict[str, Picture]:
+    """Areas over the number of queries matched together; nothing where single ones are.
+
+    Args:
+        contenders: by key, ours under `map`. coded: our descriptors at several sizes.
+        places: of the map. tolerance: with its unit.
+    """
+    lines = {
+        key: Areas(one.name, {T: scores.auc for T, scores in one.sequences.items()})
+        for key, one in distinct(contenders).items()
+        if one.sequences
+    }
+    if not lines:
+        return {}
+    shown: dict[float, Areas] = {}
+    if "map" in lines and coded:
+        route_bytes = contenders["map"].route_bytes or 0
+        own = route_bytes / places
+        lines["map"] = lines["map"]._replace(name=f"this map, {own:.3g} route bytes per place")
+        for budget in SHOWN:
+            one = min(coded, key=lambda one: abs(one.route_bytes_per_place - budget))
+            size = one.route_bytes_per_place
+            if all(max(size, other) > ALIKE * min(size, other) for other in (own, *shown)):
+                areas = {T: scores.auc for T, scores in one.sequences.items()}
+                shown[size] = Areas(f"the same in {size:.3g} bytes", areas)
+    return {
+        "sequences": Picture(
+            plot_sequences(lines, list(shown.values()), f"right within {tolerance}"),
+            "what more queries are worth",
+            "One query by itself, and the last T together, their scores added up along constant speeds. From "
+            "0.9 to 0.99 is as far as from 0.99 to 0.999; what is beyond the ends of the axis lies on them.",
         )
     }
 

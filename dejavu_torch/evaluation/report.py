@@ -17,7 +17,8 @@ from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct
 from dejavu_torch.evaluation.plots import Picture
 
 PICTURES = (
-    *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "ground", "velocity", "chunks"),
+    *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "sequences"),
+    *("ground", "velocity", "chunks"),
     *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
     *("spectrum", "components"),
 )
@@ -87,6 +88,20 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
             row += size if every else size[1:]
         rows.append(row)
     return rows
+
+
+def sequence_table(report: Report) -> list[list[str]]:
+    """AUC over the number T of queries matched together, as rows of text, the header first.
+
+    No rows where single queries are matched.
+    """
+    shown = {key: one for key, one in report.shown().items() if one.sequences}
+    lengths = sorted({length for one in shown.values() for length in one.sequences})
+    rows = [["AUC", *(f"T = {length}" for length in lengths)]]
+    for one in shown.values():
+        areas = (one.sequences.get(length) for length in lengths)
+        rows.append([one.name, *("" if scores is None else f"{scores.auc:.3f}" for scores in areas)])
+    return rows if shown else []
 
 
 def is_late(contender: Contender) -> bool:
@@ -224,6 +239,8 @@ def write_report(
         lead=headline(report),
         notes=[summary(report)],
         rows=score_table(report),
+        sequence_rows=sequence_table(report),
+        sequence_colours=[colour_of(key) for key, one in report.shown().items() if one.sequences],
         every_row=score_table(report, every=True),
         contenders=report.contenders,
         facts=facts,

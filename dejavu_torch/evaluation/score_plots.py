@@ -4,23 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from textwrap import fill
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
-from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of
+from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, sequences_as_json
+from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas
 
 _OURS = COLOURS["map"]
 _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
+LOWEST, HIGHEST = 0.01, 0.999  # areas, where more and less is drawn as this
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
 
 
 class Stored(NamedTuple):
-    """What a route is recognised at where it takes so many bytes."""
+    """What a route is recognised at where it takes so many bytes.
+
+    sequences: by T, the scores of sequences of T queries; empty where single queries are matched.
+    """
 
     route_bytes_per_place: float
     auc: float
     recall_at_1: float
+    sequences: Mapping[int, Scores] = MappingProxyType({})
+
+    def as_json(self) -> dict[str, Any]:
+        """The entry of report.json."""
+        found = self._asdict() | {"sequences": sequences_as_json(self.sequences)}
+        return {name: value for name, value in found.items() if value != {}}
+
+
+class Areas(NamedTuple):
+    """The area under the curve of sequences of T queries, by T."""
+
+    name: str
+    auc: Mapping[int, float]
 
 
 class Length(NamedTuple):
@@ -138,6 +157,46 @@ def plot_storage(
     across = len(levels)
     handles, labels = [*handles[across:], *handles[:across]], [*labels[across:], *labels[:across]]
     figure.legend(handles, labels, loc="outside lower left", frameon=False, fontsize=9)
+    return figure, axis
+
+
+def plot_sequences(lines: Mapping[str, Areas], coded: Sequence[Areas], title: str = "") -> Plot:
+    """Area under the precision-recall curve over the number of queries matched together.
+
+    Args:
+        lines: by key, which gives the colour, the map first; HOG is dashed, nulls are dotted.
+        coded: the map at other sizes, thin lines in its colour with marks of their own.
+
+    Convention: the axis is that of the log odds: from .9 to .99 is as far as from .99 to .999. Areas beyond
+        its ends are drawn at them.
+    """
+    marked = [(one, _OURS, "-", mark, 1.0) for one, mark in zip(coded, "sD^", strict=False)]
+    drawn = [
+        (one, colour_of(key), _LINES.get(key.partition("_")[0], "-"), "o", 2.4 if key == "map" else 1.4)
+        for key, one in lines.items()
+    ]
+    drawn[1:1] = marked
+    names = [fill(one.name, LETTERS - 8) for one, *_ in drawn]
+    rows = sum(1 + name.count("\n") for name in names)
+    figure, axis = canvas(3.6 + 1.1 * LINE * rows)
+    for order, ((one, colour, style, mark, width), name) in enumerate(zip(drawn, names, strict=True)):
+        axis.plot(
+            *(list(one.auc), [min(max(area, LOWEST), HIGHEST) for area in one.auc.values()], style),
+            **{"color": colour, "marker": mark, "markersize": 4.5, "linewidth": width, "label": name},
+            markerfacecolor="white" if mark != "o" else colour,
+            zorder=3 - order / len(drawn),  # the first on top
+        )
+    ticks = sorted({T for one, *_ in drawn for T in one.auc})
+    axis.set_xticks(ticks, [str(T) for T in ticks])
+    areas = {LOWEST: "0.01", 0.1: "0.1", 0.5: "0.5", 0.9: "0.9", 0.99: "0.99", HIGHEST: "0.999"}
+    axis.set_yscale("logit")
+    axis.set_yticks(list(areas), list(areas.values()))
+    axis.minorticks_off()
+    axis.set(ylim=(0.8 * LOWEST, 1 - 0.8 * (1 - HIGHEST)))
+    axis.set(xlabel="queries matched together, T", ylabel="area under the PR curve")
+    axis.set_title(title, fontsize=10)
+    axis.grid(alpha=0.25)
+    figure.legend(loc="outside lower left", frameon=False, fontsize=9)
     return figure, axis
 
 

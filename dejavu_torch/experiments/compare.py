@@ -26,7 +26,7 @@ from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
-from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines
+from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqslam_baseline
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
@@ -42,6 +42,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, s
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.matching import Found, Matching, lengths_beside
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
@@ -142,14 +143,15 @@ def compare(
         if sequence is not None:
             sequence.check(len(queries), model.map.places)
         ranks = max(top, min(max(RANKS), model.map.places))
-        candidates = model.candidates_of_descriptors(queries, ranks, tolerance, sequence)
-    match = Candidates(*(column[:, :1] for column in candidates)).as_match(model.threshold_of(sequence))
+        matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
+        found = model.found(queries, matching._replace(ranks=ranks, apart=tolerance))
+    match, candidates = found.match(model.threshold_of(sequence)), found.candidates
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
-    run = Localization(model, reference, query, places, queries, match, known, tolerance, sequence)
-    contenders = _contenders(run, seed, leave_out, progress)
+    run = Localization(model, reference, query, places, queries, match, known, tolerance, matching)
+    contenders = _contenders(run, found, seed, leave_out, progress)
     for key, (name, other) in (others or {}).items():
         if known is not None:
             contenders[key] = _learned_beside(run, name, other)
@@ -238,33 +240,45 @@ def of_shown_frames(match: Match, route: PlaceMap) -> Match:
     return match._replace(index=route.scored(match.index))
 
 
-def _contenders(run: Localization, seed: int, leave_out: int | None, progress: bool) -> dict[str, Contender]:
-    """The map and what it is set beside, by their keys in report.json; the map's own is `map`."""
+def _contenders(
+    run: Localization, found: Found, seed: int, leave_out: int | None, progress: bool
+) -> dict[str, Contender]:
+    """The map and what it is set beside, by their keys in report.json; the map's own is `map`.
+
+    Args:
+        found: on the map.
+    """
     model, tolerance = run.model, run.tolerance
-    ours, summary = of_shown_frames(run.match, model.map), model.summary()
-    sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
-    contenders = {"map": contend("this map", ours, run.truth, tolerance, **sizes)}
+    contenders = {"map": _contend(run, "this map", found, model)}
     if run.truth is None and leave_out is None:  # nothing that the others find could be scored
         return contenders
     features = run.reference_features, run.query_features
-    baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress, run.sequence)
+    baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress, run.matching)
+    traverses, size = (run.reference, run.query), model.batch_size
     if not _is_plain_hog(model):
-        size = model.batch_size
-        baselines |= hog_baselines(run.reference, run.query, size, tolerance, progress, run.sequence)
-    for key, (name, match, bytes, k, fixed) in baselines.items():
-        truth, match = run.truth, of_shown_frames(match, model.map)
+        baselines |= hog_baselines(*traverses, size, tolerance, progress, run.matching)
+    if run.sequence is not None:
+        baselines |= seqslam_baseline(*traverses, size, progress, run.matching)
+    for key, (name, answers, bytes, k, fixed) in baselines.items():
+        truth, answers = run.truth, answers.moved(model.map.scored)
         if key == "leave_out":  # its queries are the places themselves
             own = model.map.frame_of(torch.arange(model.map.places))[:, None]
             truth = ground_truth_in_places(as_ground_truth(own), model.map.place_of)
-        contenders[key] = contend(name, match, truth, tolerance, bytes, k, fixed)
+        contenders[key] = contend(name, answers.match(), truth, tolerance, bytes, k, fixed, answers.sequences)
     return contenders
+
+
+def _contend(run: Localization, name: str, found: Found, model: DejaVu) -> Contender:
+    """What a model found of the run's places."""
+    found, summary = found.moved(run.model.map.scored), model.summary()
+    sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
+    return contend(name, found.match(), run.truth, run.tolerance, **sizes, sequences=found.sequences)
 
 
 def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
     """Another model that learns the run's reference."""
-    found = other.learn(run.reference).localize(run.query, sequence=run.sequence)
-    match, summary = of_shown_frames(found, run.model.map), other.summary()
-    return contend(name, match, run.truth, run.tolerance, bytes=summary.map_bytes, fixed=summary.fixed_bytes)
+    found = other.learn(run.reference).found(other.extract_all(run.query), run.matching)
+    return _contend(run, name, found, other)
 
 
 def _is_plain_hog(model: DejaVu) -> bool:

@@ -283,8 +283,8 @@ def known_boundaries(
     for key, (name, periods) in contenders.items():
         model = _learned(result, TemplateMapper(periods, mapper.metric, "mean"))
         match, summary = _localized(model, result), model.summary()
-        sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
-        contender = contend(name, match, truth, tolerance, **sizes)
+        size, fixed = summary.map_bytes, summary.fixed_bytes
+        contender = contend(name, match, truth, tolerance, size, fixed=fixed)
         found[key] = contender, boundary_effect(match, truth, cuts, tolerance)
     return found
 

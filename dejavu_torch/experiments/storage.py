@@ -12,11 +12,13 @@ from tqdm import tqdm
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.database.spectrum import from_spectrum, spectrum
 from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_frames
+from dejavu_torch.evaluation.contenders import evaluate_each
 from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.pictures import Localization
 from dejavu_torch.evaluation.score_plots import Stored
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.recognition.matching import Found
+from dejavu_torch.types import InputError
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
 SMALL = 2**17  # numbers that are coded soon enough to meet a budget to 2 %
@@ -57,10 +59,11 @@ def storage_curve(
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
     cases = [(key, budget) for key in kinds for budget in budgets]
     for key, budget in tqdm(cases, "storage", disable=None if progress else True, leave=False):
-        for match, size in kinds[key](budget):
-            match = match._replace(index=route.scored(match.index))
-            scores = evaluate(match, run.truth, run.tolerance)
-            found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1))
+        for answers, size in kinds[key](budget):
+            answers = answers.moved(route.scored)
+            scores = evaluate(answers.match(), run.truth, run.tolerance)
+            beside = evaluate_each(answers.sequences, run.truth, run.tolerance)
+            found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1, beside))
     return found
 
 
@@ -93,8 +96,8 @@ def _coded(
     budget: float,
     order: Tensor | None = None,
     resolution: float = 0.0,
-) -> Iterator[tuple[Match, int]]:
-    """Matches on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
+) -> Iterator[tuple[Found, int]]:
+    """What is found on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
     mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric, resolution)
     mapper.exact = features.numel() < SMALL
     model = with_mapper(run.model, mapper)
@@ -102,14 +105,13 @@ def _coded(
         model.learn_features(features)
     except InputError:  # more than floats, or less than the mean
         return
-    match = model.localize_descriptors(run.query_features, run.sequence, order)
-    yield match, sum(tensor.nbytes for tensor in model.map.packed().values())
+    found = model.found(run.query_features, run.matching, order)
+    yield found, sum(tensor.nbytes for tensor in model.map.packed().values())
 
 
-def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:
-    """Matches of interpolated keyframes of at most so many bytes, and their bytes."""
+def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Found, int]]:
+    """What is found among interpolated keyframes of at most so many bytes, and their bytes."""
     between, _, keys = interpolated(as_int8(run.reference_features), budget * route.places)
     size = keys * route.dimension
     if size <= budget * route.places:
-        matches = nearest_frames(between, run.query_features, (1,), route.metric, sequence=run.sequence)
-        yield matches[0], size
+        yield nearest_frames(between, run.query_features, 1, route.metric, matching=run.matching), size

@@ -56,15 +56,16 @@ def best_candidates(scores: Tensor, k: int, apart: int) -> Candidates:
     places = scores.shape[1]
     check_candidates(k, apart, places)
     near = torch.arange(-min(apart, places), min(apart, places) + 1, device=scores.device)
-    left, ranks = scores.clone(), []
-    for _ in range(k):
-        score, index = left.min(1)
-        found = score.isfinite()
-        ranks.append((torch.where(found, index, -1), score))
+    score, index = scores.min(1)
+    ranks, left = [(index, score)], scores.clone() if k > 1 else scores
+    for _ in range(k - 1):
         # a window cut off at an end of the route repeats that end, which is in it
         window = (index[:, None] + near).clamp(0, places - 1)
-        left.scatter_(1, window, torch.inf).masked_fill_(~found[:, None], torch.inf)
-    return Candidates(*(torch.stack(column, 1) for column in zip(*ranks, strict=True)))
+        left.scatter_(1, window, torch.inf).masked_fill_(~score.isfinite()[:, None], torch.inf)
+        score, index = left.min(1)
+        ranks.append((index, score))
+    index, score = (torch.stack(column, 1) for column in zip(*ranks, strict=True))
+    return Candidates(torch.where(score.isfinite(), index, -1), score)
 
 
 def check_candidates(k: int, apart: int, places: int | None = None) -> None:

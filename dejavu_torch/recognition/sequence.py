@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -55,44 +56,59 @@ class SequenceMatcher(SequenceModel):
     @property
     def shifts(self) -> tuple[tuple[int, ...], ...]:
         """See `SequenceModel`; half a place is rounded up."""
-        return tuple(tuple(math.floor(speed * k + 0.5) for k in range(self.length)) for speed in self.speeds)
+        return tuple(_shifts(speed, self.length) for speed in self.speeds)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
+        (found,) = self.sums(scores, (self.length,), before)
+        return found
+
+    def sums(self, scores: Tensor, lengths: Sequence[int], before: Tensor | None = None) -> Iterator[Tensor]:
+        """As `forward`, for each of several lengths: the sums of short ones are on the way to the long.
+
+        Args:
+            lengths: each T, ascending.
+
+        Shape: as `forward`, one (Q,N) for each length.
+        """
         fits = before is None or before.shape[1:] == scores.shape[1:]
         if scores.ndim != 2 or not fits or not scores.is_floating_point():
             seen = f"{tuple(scores.shape)} {scores.dtype}"
             seen += f" behind {tuple(before.shape)}" if before is not None else ""
             raise InputError(f"scores are {seen}; expected floats (Q,N), and (R,N) ahead of them")
-        if self.length == 1:
-            return scores
-        rows = scores if before is None else torch.cat([before[1 - self.length :], scores])
-        ahead = len(rows) - len(scores)
-        on_map = rows.isfinite()
-        known, count = torch.where(on_map, rows, 0), on_map.to(rows.dtype)
-        used = torch.arange(ahead + 1, len(rows) + 1, device=rows.device).clamp(max=self.length)[:, None]
-        best = torch.full_like(scores, math.inf)
-        for shifts in self.shifts:
-            total, inside = torch.zeros_like(scores), torch.zeros_like(scores)
-            for k, shift in enumerate(shifts[: len(rows)]):
-                first = max(0, k - ahead)  # the first query that has one k steps before it
-                to = slice(max(0, shift), scores.shape[1] + min(0, shift))
-                of = slice(max(0, -shift), scores.shape[1] - max(0, shift))
-                if to.start >= to.stop:
-                    break  # so far back no trajectory is on the map
-                part = slice(ahead + first - k, len(rows) - k)
-                total[first:, to] += known[part, of]
-                inside[first:, to] += count[part, of]
-            mean = total / inside.clamp(min=1)
-            best = torch.minimum(best, torch.where(2 * inside >= used, mean, math.inf))
-        return torch.where(scores.isfinite(), best, math.inf)
+        rows = scores if before is None else torch.cat([_last(before, lengths[-1] - 1), scores])
+        ahead, steps = len(rows) - len(scores), min(lengths[-1], len(rows))
+        gaps = ~rows.isfinite()
+        covered = not gaps.any()
+        known = rows if covered else rows.masked_fill(gaps, 0)
+        ways = [_Way(scores, speed, steps) for speed in self.speeds]
+        done = 0
+        for length in lengths:
+            for k in range(done, min(length, steps)):
+                for way in ways:
+                    way.add(known, k, ahead)
+                    if not covered:
+                        way.leave_out(gaps, k, ahead)
+            done = max(done, min(length, steps))
+            if length == 1:
+                yield scores
+                continue
+            first = min(ahead + 1, length)  # queries of the first row's sequence; the same for all is one row
+            used = torch.arange(first, first + (1 if first == length else len(scores)), device=rows.device)
+            means = (way.mean(used.clamp(max=length)) for way in ways)
+            best = functools.reduce(torch.minimum, means)
+            yield best if covered else best.masked_fill(gaps[ahead:], math.inf)
 
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
         """See `SequenceModel`; between two batches T - 1 rows are kept."""
+        return (found for (found,) in self.stream_sums(batches, (self.length,)))
+
+    def stream_sums(self, batches: Iterable[Tensor], lengths: Sequence[int]) -> Iterator[list[Tensor]]:
+        """`sums` of batches (B,N) that come one behind the other; the longest T - 1 rows are kept."""
         before = None
         for scores in batches:
-            yield self(scores, before)
+            yield list(self.sums(scores, lengths, before))
             rows = scores if before is None else torch.cat([before, scores])
-            before = rows[max(0, len(rows) - self.length + 1) :]
+            before = _last(rows, lengths[-1] - 1)
 
     def check(self, queries: int, places: int) -> None:
         """See `SequenceModel`: say where there are fewer queries than T; refuse fewer places."""
@@ -105,3 +121,52 @@ class SequenceMatcher(SequenceModel):
 
     def extra_repr(self) -> str:
         return f"length={self.length}, speeds={list(self.speeds)}"
+
+
+class _Way:
+    """Sums along trajectories of one speed that grow a step at a time.
+
+    scores: (Q,N), whose size they have. steps: how many at most.
+    """
+
+    def __init__(self, scores: Tensor, speed: float, steps: int) -> None:
+        places = scores.shape[1]
+        self.shifts = _shifts(speed, steps)
+        passed = torch.arange(places) - torch.tensor(self.shifts)[:, None]
+        on_map = ((passed >= 0) & (passed < places)).to(scores)
+        self.inside = on_map.cumsum(0)  # (steps,N) of the trajectories that end at a place, steps on the map
+        self.total = torch.zeros_like(scores)
+        self.missing: Tensor | None = None
+
+    def add(self, rows: Tensor, k: int, ahead: int) -> None:
+        """The scores k steps before the last; `ahead` of the rows are ahead of the first of these."""
+        self._add(self.total, rows, k, ahead)
+
+    def leave_out(self, gaps: Tensor, k: int, ahead: int) -> None:
+        """Count steps on the map that have no score."""
+        self.missing = torch.zeros_like(self.total) if self.missing is None else self.missing
+        self._add(self.missing, gaps, k, ahead)
+
+    def _add(self, total: Tensor, rows: Tensor, k: int, ahead: int) -> None:
+        shift, places = self.shifts[k], total.shape[1]
+        to = slice(max(0, shift), places + min(0, shift))
+        of = slice(max(0, -shift), places - max(0, shift))
+        if to.start < to.stop:  # else no trajectory is on the map so far back
+            first = max(0, k - ahead)  # the first query that has one k steps before it
+            total[first:, to] += rows[ahead + first - k : len(rows) - k, of]
+
+    def mean(self, used: Tensor) -> Tensor:
+        """Of the sums so far, over so many queries, (Q,) or one for all; +inf on too little of the map."""
+        count = self.inside[used - 1]
+        if self.missing is not None:
+            count = count - self.missing
+        return torch.where(2 * count >= used[:, None], self.total / count.clamp(min=1), math.inf)
+
+
+def _shifts(speed: float, steps: int) -> tuple[int, ...]:
+    """How many places back a trajectory lies 0, 1, .. queries before the latest."""
+    return tuple(math.floor(speed * k + 0.5) for k in range(steps))
+
+
+def _last(rows: Tensor, count: int) -> Tensor:
+    return rows[max(0, len(rows) - count) :]

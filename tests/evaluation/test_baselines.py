@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames, stride_bytes
+from dejavu_torch.recognition.matching import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
 DISTANCES = {
@@ -32,7 +33,8 @@ def literal_nearest(reference: Tensor, query: Tensor, k: int, metric: str) -> li
 def test_the_nearest_stored_frame(metric: str) -> None:
     torch.manual_seed(0)
     reference, query = torch.rand(23, 5, dtype=torch.float64), torch.rand(9, 5, dtype=torch.float64)
-    for k, match in zip((1, 2, 7, 50), nearest_frames(reference, query, (1, 2, 7, 50), metric), strict=True):
+    for k in (1, 2, 7, 50):
+        match = nearest_frames(reference, query, k, metric).match()
         expected = literal_nearest(reference, query, k, metric)
         assert match.index.tolist() == [index for index, _ in expected]
         assert match.score.tolist() == pytest.approx([score for _, score in expected], abs=1e-12)
@@ -41,13 +43,13 @@ def test_the_nearest_stored_frame(metric: str) -> None:
 
 def test_of_equally_near_frames_the_first_is_reported() -> None:
     reference = torch.tensor([[2.0], [0.0], [2.0], [0.0]])
-    (match,) = nearest_frames(reference, torch.tensor([[0.0], [1.0], [2.0]]))
+    match = nearest_frames(reference, torch.tensor([[0.0], [1.0], [2.0]])).match()
     assert match.index.tolist() == [1, 0, 0]
 
 
 def test_the_uncompressed_reference_finds_its_own_frames() -> None:
     reference = torch.rand(50, 8)
-    (match,) = nearest_frames(reference, reference)
+    match = nearest_frames(reference, reference).match()
     assert match.index.tolist() == list(range(50))
     assert match.score.tolist() == [0.0] * 50
 
@@ -56,7 +58,7 @@ def test_the_uncompressed_reference_finds_its_own_frames() -> None:
 def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> None:
     """Its distances are those of the stored frame before it, and the frame reported is a stored one."""
     reference, query, matcher = torch.rand(30, 3), torch.rand(25, 3), SequenceMatcher(6)
-    (match,) = nearest_frames(reference, query, (k,), sequence=matcher)
+    match = nearest_frames(reference, query, k, matching=Matching(matcher)).match()
     stored = reference[torch.arange(30) // k * k]
     score, index = matcher(torch.cdist(query, stored, p=1)).min(1)
     assert match.index.tolist() == (index // k * k).tolist()
@@ -65,14 +67,13 @@ def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> Non
 
 def test_distances_in_parts_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     reference, query = torch.rand(20, 4), torch.rand(11, 4)
-    for sequence in (None, SequenceMatcher(4)):
-        whole = nearest_frames(reference, query, (1, 3), sequence=sequence)
+    for k, sequence in ((1, None), (3, None), (1, SequenceMatcher(4)), (3, SequenceMatcher(4))):
+        whole = nearest_frames(reference, query, k, matching=Matching(sequence)).match()
         for numbers in (1, 20, 45):
             with monkeypatch.context() as patch:
                 patch.setattr("dejavu_torch.evaluation.baselines.DISTANCES_AT_ONCE", numbers)
-                parts = nearest_frames(reference, query, (1, 3), sequence=sequence)
-            for a, b in zip(parts, whole, strict=True):
-                assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+                parts = nearest_frames(reference, query, k, matching=Matching(sequence)).match()
+            assert all(torch.equal(x, y) for x, y in zip(parts, whole, strict=True))
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from dejavu_torch.evaluation.report import (
     Report,
     headline,
     score_table,
+    sequence_table,
     summary,
     text_table,
     write_index,
@@ -95,6 +96,24 @@ def test_bytes_that_do_not_grow_with_the_route_stand_apart() -> None:
     assert one.route_bytes == one.as_json()["route_bytes"] == 800
     assert score_table(report({"frames": 32}, stride=one))[2][-2:] == ["125.0", "25.0"]
     assert Contender("null", SCORES).route_bytes is None
+
+
+def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path: Path) -> None:
+    areas = {1: SCORES, 5: SCORES._replace(auc=0.875)}
+    null = Contender("null", SCORES, sequences=areas)
+    aside = Contender("without", SCORES)
+    ours = Contender("this map", SCORES, sequences=areas | {11: SCORES._replace(auc=1.0)})
+    one = report(leave_out=aside, null=null)._replace(ours=ours)
+    assert sequence_table(one) == [
+        ["AUC", "T = 1", "T = 5", "T = 11"],
+        ["this map", "0.500", "0.875", "1.000"],
+        ["null", "0.500", "0.875", ""],
+    ]
+    assert null.as_json()["sequences"]["5"] == {"auc": 0.875, "recall_at_1": 0.75}
+    assert "0.875" in written(tmp_path, one)
+    assert sequence_table(report(null=aside)) == []
+    assert "sequences" not in aside.as_json()
+    assert "T = " not in written(tmp_path, report(null=aside))
 
 
 def test_frames_that_are_used_otherwise_are_listed_as_well() -> None:

@@ -81,7 +81,7 @@ def oklab(colour: str, sight: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("sight", SIGHT)
 @pytest.mark.parametrize(
     "together",
-    [list(COLOURS.values())[:9], [RIGHT, WRONG, DARK], [RIGHT, WRONG, GREY], [*LAYERS, COLOURS["map"]]],
+    [list(COLOURS.values())[:10], [RIGHT, WRONG, DARK], [RIGHT, WRONG, GREY], [*LAYERS, COLOURS["map"]]],
 )
 def test_colours_that_share_a_picture_differ_for_the_colour_blind(together: list[str], sight: str) -> None:
     for one, other in combinations(together, 2):

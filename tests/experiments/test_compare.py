@@ -8,14 +8,18 @@ import pytest
 import torch
 from footage import QUERY, REFERENCE, STEP, camera, everything
 from footage import footage as ground
-from helpers import Fixed, refused, template_model
+from helpers import Fixed, all_of, refused, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, DejaVu, InputError, SpectrogramAnalysis
+from dejavu_torch import HOG, DejaVu, InputError, SequenceMatcher, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.distance import phase_distances
+from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.compare import compare
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import FrequencyLayer, Training, Traverse
 
 
@@ -280,3 +284,96 @@ def test_frames_too_small_for_hog_are_compared_without() -> None:
     found = contenders(nn.Flatten(), size=8)
     assert "uncompressed" in found
     assert not {"hog", "hog_stride_coarsest"} & found.keys()
+
+
+# sequences
+
+
+def passing(seed: int, places: int = 64) -> Tensor:
+    """Features of single places that a visit changes too much to be told apart."""
+    noise, profile = (torch.Generator().manual_seed(one) for one in (seed, 7))
+    return torch.randn(places, 12, generator=profile) + 1.5 * torch.randn(places, 12, generator=noise)
+
+
+@pytest.mark.parametrize("kind", ["templates", "spectral"])
+def test_sequences_of_every_contender(kind: str) -> None:
+    model = DejaVu(whitening="none")
+    if kind == "templates":
+        model = template_model(periods=Fixed(FrequencyLayer(64, 64, 0, 64, tuple(range(12)))))
+    pair = ArrayTraverse(passing(1)), ArrayTraverse(passing(2))
+
+    def report(sequence: Any) -> dict[str, Any]:
+        return compare(*pair, model=model, tolerance=1, sequence=sequence).report.as_json()
+
+    single, seven, filtered = report(None), report(SequenceMatcher(7)), report(PlaceFilter(within=1))
+    keys = {key for key, entry in single.items() if isinstance(entry, dict) and "auc" in entry}
+    assert {"uncompressed", "stride", "null"} <= keys
+    for key in (None, *keys):
+        one, many, by_filter = (all_ if key is None else all_[key] for all_ in (single, seven, filtered))
+        assert "sequences" not in one
+        assert list(many["sequences"]) == ["1", "5", "7", "11", "21"]
+        assert list(by_filter["sequences"]) == ["1", "5", "11", "21"]
+        for name in ("auc", "recall_at_1"):
+            assert many["sequences"]["1"][name] == one[name]
+            assert many["sequences"]["7"][name] == many[name]
+            for length, scores in by_filter["sequences"].items():  # of the very same scores
+                assert scores[name] == many["sequences"][length][name]
+    ours = seven["sequences"]
+    assert ours["1"]["auc"] < 0.7 < 0.9 < ours["21"]["auc"]
+    assert (ours["21"], filtered["sequences"]["21"]) == (
+        {name: report(SequenceMatcher(21))[name] for name in ("auc", "recall_at_1")},
+    ) * 2
+    # 20 queries have no sequence of 21
+    short = compare(pair[0], ArrayTraverse(passing(2)[:20]), "0", model, sequence=SequenceMatcher(3))
+    assert list(short.report.as_json()["null"]["sequences"]) == ["1", "3", "5", "11"]
+
+
+def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Maps and stores are asked as many queries with a sequence as without."""
+    asked: list[int] = []
+
+    def counting(function: Any, queries: int) -> Any:
+        def counted(*args: Any, **settings: Any) -> Tensor:
+            asked.append(len(args[queries]))
+            scores: Tensor = function(*args, **settings)
+            return scores
+
+        return counted
+
+    monkeypatch.setattr(SpectralMap, "scores", counting(SpectralMap.scores, 1))
+    stores = "dejavu_torch.evaluation.baselines.phase_distances"
+    monkeypatch.setattr(stores, counting(phase_distances, 0))
+    totals = []
+    for sequence in (None, SequenceMatcher(21), PlaceFilter()):
+        asked.clear()
+        model = DejaVu(whitening="none")
+        compare(ArrayTraverse(passing(1)), ArrayTraverse(passing(2)), model=model, sequence=sequence)
+        totals.append(sum(asked))
+    assert len(set(totals)) == 1
+    assert totals[0] > 64 * 10
+
+
+def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames() -> None:
+    """In frames of noise that repeat after 8, its sequences find what single frames do not."""
+    model = template_model(nn.Flatten(), SpectrogramAnalysis(window=64, min_period=4, strongest=1))
+    found = compare(pictures(1), pictures(2), "0", model, tolerance=3, sequence=SequenceMatcher(5)).report
+    one = found.contenders["seqslam"]
+    assert one.bytes == one.route_bytes == 64 * 24 * 24 * 4
+    assert one.k == 1
+    assert list(one.sequences) == [1, 5, 11, 21]
+    pixels = [PatchPixels()(all_of(pictures(seed))) for seed in (1, 2)]
+    expected = SequenceMatcher(5)(torch.cdist(pixels[1], pixels[0], p=1)).argmin(1)
+    right = (expected - torch.arange(64)).abs() <= 3
+    assert one.scores is not None
+    assert one.scores.recall_at_1 == float(right.double().mean())
+
+
+def test_seqslam_s_pixels_need_frames_and_a_sequence(model: DejaVu) -> None:
+    assert "seqslam" not in contenders(nn.Flatten())
+    features = ArrayTraverse(route(0)), ArrayTraverse(route(1))
+    report = compare(*features, model=model, sequence=SequenceMatcher(5)).report
+    assert "seqslam" not in report.contenders
+    assert list(report.contenders["uncompressed"].sequences) == [1, 5, 11, 21]
+    tiny = template_model(nn.Flatten())
+    few = compare(pictures(1, 7), pictures(2, 7), "0", tiny, sequence=PlaceFilter())
+    assert "seqslam" not in few.report.contenders

@@ -9,7 +9,7 @@ import torch
 from helpers import refused, template_model
 from torch import Tensor
 
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, SequenceMatcher
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.experiments.compare import Comparison, compare
@@ -48,6 +48,7 @@ def test_the_curve_is_in_the_report(report: dict[str, Any]) -> None:
     for budget, one in zip((1, 2.5, 5, 10), storage["interpolated"], strict=False):
         assert one["route_bytes_per_place"] <= budget
     assert storage["map"][0]["auc"] > storage["null"][0]["auc"]
+    assert "sequences" not in storage["map"][0]
     assert all(ratio > 1 for ratio in storage["null_over_map"])
 
 
@@ -58,6 +59,20 @@ def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, rep
     assert ours.route_bytes_per_place == report["route_bytes_per_place"]
     assert null.auc == pytest.approx(report["null"]["auc"], abs=0.05)  # coded to 2.0, not to the map's own
     assert between.route_bytes_per_place * PLACES == report["interpolated"]["route_bytes"]
+
+
+def test_each_budget_is_evaluated_at_every_length() -> None:
+    model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
+    pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
+    found = compare(*pair, model=model, tolerance=2, sequence=SequenceMatcher(5))
+    storage = found.report.as_json()["storage"]
+    for key in ("map", "null", "interpolated"):
+        for one in storage[key]:
+            assert list(one["sequences"]) == ["1", "5", "11", "21"]
+            assert one["sequences"]["5"] == {name: one[name] for name in ("auc", "recall_at_1")}
+    (own,) = storage_curve(found.run, [2.0])["map"]
+    assert own.as_json()["sequences"] == found.report.as_json()["sequences"]
+    assert "sequences" in found.pictures
 
 
 def test_noise_as_smooth_as_the_route_costs_what_repetition_saves(report: dict[str, Any]) -> None:

@@ -1,0 +1,57 @@
+"""The pixels of small frames as features, as SeqSLAM compares them."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from dejavu_torch.features.preprocess import FLAT, check_frames
+from dejavu_torch.resize import resize_frames
+from dejavu_torch.types import InputError
+
+
+class PatchPixels(nn.Module):
+    """Pixels of frames made small, each patch with mean 0 and standard deviation 1.
+
+    Args:
+        size: (height, width) in pixels; smaller frames keep theirs, but for what is no whole patch.
+        patch: side in pixels of the square patches, which lie side by side.
+
+    Shape: (B,C,H,W) -> (B, C x height x width).
+
+    Convention: the standard deviation is at least 1/255, as in `normalise_patches`.
+
+    Source: Milford and Wyeth, SeqSLAM, ICRA 2012.
+
+    Raises:
+        InputError: a size that holds no patch; forward: frames that are not (B,C,H,W) float, or hold none.
+
+    Example:
+        >>> import torch
+        >>> PatchPixels()(torch.rand(2, 1, 100, 60)).shape  # 32 x 56
+        torch.Size([2, 1792])
+    """
+
+    def __init__(self, size: tuple[int, int] = (32, 64), patch: int = 8) -> None:
+        super().__init__()
+        if patch < 2 or min(size) < patch:
+            raise InputError(f"patches of {patch} pixels in frames of {size}; expected at least 2, and one")
+        self.size, self.patch = size, patch
+
+    def forward(self, frames: Tensor) -> Tensor:
+        check_frames(frames)
+        side = self.patch
+        height, width = (
+            min(own, most) // side * side for own, most in zip(frames.shape[-2:], self.size, strict=True)
+        )
+        if not height or not width:
+            seen = f"frames of {frames.shape[-2]} x {frames.shape[-1]} pixels"
+            raise InputError(f"{seen}; expected at least one patch, {side} x {side}")
+        small = resize_frames(frames, (height, width))
+        patches = small.unflatten(-1, (-1, side)).unflatten(-3, (-1, side))  # (B,C,rows,side,columns,side)
+        centred = patches - patches.mean((-3, -1), keepdim=True)
+        deviation = centred.square().mean((-3, -1), keepdim=True).clamp(min=FLAT**2).sqrt()
+        pixels: Tensor = (centred / deviation).flatten(1)
+        return pixels
+
+    def extra_repr(self) -> str:
+        return f"size={self.size}, patch={self.patch}"

@@ -1,0 +1,124 @@
+"""What is made of the scores of queries, which pass by once: their places, and those by other sequences."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.recognition.candidates import Candidates, best_candidates
+from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import Match, SequenceModel
+
+LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
+AT_ONCE = 2**20  # scores summed at a time: they stay in the processor's cache
+
+
+class Found(NamedTuple):
+    """Places of queries.
+
+    candidates: (Q,k), the best places of each. sequences: by T, (Q,) the best by a sequence of T queries.
+    """
+
+    candidates: Candidates
+    sequences: Mapping[int, Match] = MappingProxyType({})
+
+    def match(self, threshold: float | None = None) -> Match:
+        """The first candidate of each query, accepted as by `best_match`."""
+        return Candidates(*(column[:, :1] for column in self.candidates)).as_match(threshold)
+
+    def moved(self, place: Callable[[Tensor], Tensor]) -> Found:
+        """The same with other numbers of the places; -1, where none is found, must stay."""
+        return Found(
+            self.candidates._replace(index=place(self.candidates.index)),
+            {length: match._replace(index=place(match.index)) for length, match in self.sequences.items()},
+        )
+
+
+class Matching(NamedTuple):
+    """How queries are matched.
+
+    sequence: scores consecutive queries together; None takes each by itself.
+    lengths: each T that is matched beside that by a `SequenceMatcher`, at the speeds of `sequence` if that is
+        one; only where there is a sequence.
+    ranks: candidates of a query. apart: places, any two of them differ by more.
+    """
+
+    sequence: SequenceModel | None = None
+    lengths: tuple[int, ...] = ()
+    ranks: int = 1
+    apart: int = 0
+
+    def found(self, batches: Iterable[Tensor]) -> Found:
+        """What is found by scores (B,N) of single queries, batches one behind the other.
+
+        Memory holds a batch of scores, whatever the number of queries.
+        """
+        return joined(self.stream(batches))
+
+    @torch.no_grad()
+    def stream(self, batches: Iterable[Tensor]) -> Iterator[Found]:
+        """As `found`, a part of the queries at a time, on the CPU and without gradients."""
+        parts: Iterable[tuple[Tensor, dict[int, Tensor]]] = ((scores, {}) for scores in batches)
+        if self.sequence is not None:
+            small = (part for scores in batches for part in scores.split(max(1, AT_ONCE // scores.shape[1])))
+            parts = _beside(self.sequence, small, sorted(self.lengths))
+        for scores, sums in parts:
+            candidates = best_candidates(scores, self.ranks, self.apart)
+            yield Found(
+                Candidates(*(column.cpu() for column in candidates)),
+                {
+                    length: Match(*(column.cpu() for column in best_match(part)))
+                    for length, part in sums.items()
+                },
+            )
+
+
+def joined(parts: Iterable[Found]) -> Found:
+    """What was found of all queries, from what was found of some at a time."""
+    candidates, sequences = zip(*parts, strict=True)
+    together = {
+        length: Match(*map(torch.cat, zip(*(part[length] for part in sequences), strict=True)))
+        for length in sequences[0]
+    }
+    return Found(Candidates(*map(torch.cat, zip(*candidates, strict=True))), together)
+
+
+def _beside(
+    sequence: SequenceModel, batches: Iterable[Tensor], lengths: list[int]
+) -> Iterator[tuple[Tensor, dict[int, Tensor]]]:
+    """The scores that a sequence model makes of batches, and beside them for each T those of a sum."""
+    own = sequence if isinstance(sequence, SequenceMatcher) else None
+    if not lengths:
+        yield from ((scores, {}) for scores in sequence.stream(batches))
+    elif own is not None:  # all out of one pass
+        every = sorted({own.length, *lengths})
+        for sums in own.stream_sums(batches, every):
+            found = dict(zip(every, sums, strict=True))
+            yield found[own.length], {length: found[length] for length in lengths}
+    else:
+        single, again = itertools.tee(batches)  # in step: one batch is held
+        beside = SequenceMatcher(lengths[-1]).stream_sums(again, lengths)
+        for scores, sums in zip(sequence.stream(single), beside, strict=True):
+            yield scores, dict(zip(lengths, sums, strict=True))
+
+
+SINGLE = Matching()  # each query by itself
+
+
+def lengths_beside(sequence: SequenceModel | None, queries: int, places: int) -> tuple[int, ...]:
+    """The T to set beside a sequence, its own among them, that so many queries and places have room for.
+
+    Example:
+        >>> lengths_beside(SequenceMatcher(7), queries=100, places=12)
+        (1, 5, 7, 11)
+    """
+    if sequence is None:
+        return ()
+    own = {sequence.length} if isinstance(sequence, SequenceMatcher) else set()
+    return tuple(length for length in sorted({*LENGTHS, *own}) if length <= min(queries, places))

@@ -1,0 +1,45 @@
+"""Pixels of small frames, normalised in patches side by side."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import refused
+
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.resize import resize_frames
+
+
+def test_equals_a_literal_loop() -> None:
+    frames = torch.rand(2, 1, 9, 12, dtype=torch.float64)
+    found = PatchPixels(size=(8, 12), patch=4)(frames).view(2, 8, 12)
+    small = resize_frames(frames, (8, 12))[:, 0]
+    for image, pixels in zip(small, found, strict=True):
+        for top in range(0, 8, 4):
+            for left in range(0, 12, 4):
+                patch = image[top : top + 4, left : left + 4]
+                expected = (patch - patch.mean()) / patch.std(correction=0)
+                assert torch.allclose(pixels[top : top + 4, left : left + 4], expected)
+
+
+def test_light_and_contrast_of_a_patch_change_nothing() -> None:
+    frames = torch.rand(1, 1, 32, 64)
+    other = frames.clone()
+    other[..., 8:16, 24:32] = 0.3 + 0.5 * other[..., 8:16, 24:32]
+    assert torch.allclose(PatchPixels()(frames), PatchPixels()(other), atol=1e-4)
+    flat = PatchPixels()(torch.full((1, 1, 32, 64), 0.7))
+    assert flat.abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("shape", "pixels"), [((480, 640), 32 * 64), ((64, 64), 32 * 64), ((30, 24), 24 * 24), ((8, 15), 8 * 8)]
+)
+def test_frames_are_made_small_and_small_ones_stay(shape: tuple[int, int], pixels: int) -> None:
+    assert PatchPixels()(torch.rand(1, 1, *shape)).shape == (1, pixels)
+
+
+def test_what_holds_no_patch_is_refused() -> None:
+    with refused("7 x 40", "8 x 8"):
+        PatchPixels()(torch.rand(1, 1, 7, 40))
+    with refused("patches of 9", "(8, 64)"):
+        PatchPixels((8, 64), 9)
