@@ -229,8 +229,8 @@ def diagonal(
     for part in range(top, bottom):
         with torch.no_grad():
             row = scores(queries[part : part + 1]).float().cpu()
-        seen.append(row[:, left:right])
-        scaled.append(_scaled(row)[:, left:right])
+        seen.append(row[:, left:right].clone())  # a view would keep the whole row
+        scaled.append(_scaled(row)[:, left:right].clone())
     cells = matcher.trajectory(torch.cat(seen)[: query - top + 1], place - left)
     values = torch.cat(scaled)
     return Diagonal(
@@ -342,7 +342,7 @@ def posterior_image(
             posterior = model.posterior(scores(queries[done : done + at_once]), before)
         before, places = posterior[-1], posterior.shape[1] - 1
         width, at_once = -(-places // cells), max(1, SCORES_AT_ONCE // places)
-        off.append(posterior[:, -1].float().cpu())
+        off.append(posterior[:, -1].float().cpu().clone())  # a view would keep all of them
         padded = torch.nn.functional.pad(posterior[:, :-1].float().cpu(), (0, -places % width))
         rows = padded.unflatten(1, (-1, width)).amax(2)
         values = values if done else values.new_zeros(len(values), rows.shape[1])
