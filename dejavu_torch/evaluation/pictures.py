@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from textwrap import fill
 from typing import Any, NamedTuple
@@ -27,10 +27,13 @@ from dejavu_torch.evaluation.feature_plots import (
 from dejavu_torch.evaluation.map_plots import plot_activations, plot_answers, plot_chunks, plot_layers
 from dejavu_torch.evaluation.match_plots import (
     Row,
+    diagonal,
     example_matches,
     plot_coverage,
+    plot_posterior,
     plot_rows,
     plot_score_matrix,
+    posterior_image,
     score_matrix,
 )
 from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
@@ -49,7 +52,9 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.matching import SINGLE, Matching
+from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, SequenceModel, Traverse
 
@@ -120,13 +125,14 @@ def draw_pictures(
         contenders: by key, ours under `map`. storage: likewise, each at several sizes.
 
     Returns:
-        Of pairs, coverage, scores, pr, auc, storage, sequences, ground, velocity, then of a template map
-        chunks, spectrogram, templates, features and activations, of a spectral one spectrum and components,
+        Of pairs, coverage, scores, posterior, pr, auc, storage, sequences, ground, velocity, then of a template
+        map chunks, spectrogram, templates, features and activations, of a spectral one spectrum and components,
         those that can be drawn, in this order.
     """
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
-    pictures |= draw_scores(run) | draw_curves(contenders, f"{run.tolerance} {run.unit}")
+    pictures |= draw_scores(run) | draw_posterior(run)
+    pictures |= draw_curves(contenders, f"{run.tolerance} {run.unit}")
     pictures |= draw_storage(contenders, storage or {}, f"{run.tolerance} {run.unit}")
     coded = (storage or {}).get("map", ())
     pictures |= draw_sequences(contenders, coded, run.model.map.places, f"{run.tolerance} {run.unit}")
@@ -203,26 +209,61 @@ def draw_coverage(
 
 
 def draw_scores(run: Localization) -> dict[str, Picture]:
-    """The score matrix; nothing where the map has no layers."""
-    model = run.model
-    matrix = score_matrix(
-        lambda queries: model.map.scores(queries.to(model.map.positions.device)), run.query_features
-    )
+    """The score matrix, and on it what a sequence adds up; nothing where the map has no layers."""
+    scores, features, found = scores_of(run), run.query_features, (run.match.index >= 0).nonzero()[:, 0]
+    matrix = score_matrix(scores, features)
     if matrix is None:
         return {}
+    example, text = None, ""
+    if run.sequence is not None:
+        text = " Of single queries; the matches are of sequences."
+    if isinstance(run.sequence, SequenceMatcher) and len(found):
+        query = int(found[(found - len(features) // 2).abs().argmin()])
+        example = diagonal(scores, features, run.sequence, query, int(run.match.index[query]))
+        text += (
+            f" Below, enlarged, an example: for the query of frame {run.query_frames[query]} and the place "
+            f"reported for it, the {len(example.query)} cells of which the sequence takes the mean."
+        )
     shares = []
-    if len(matrix.query) < len(run.query_features):
+    if len(matrix.query) < len(features):
         shares.append(f"{len(matrix.query)} of the queries")
     if matrix.block > 1:
         shares.append(f"of {matrix.block} neighbouring places the one that fits best")
     return {
         "scores": Picture(
-            plot_score_matrix(matrix, run.scored, run.truth, run.borders, run.query_frames),
+            plot_score_matrix(matrix, run.scored, run.truth, run.borders, run.query_frames, example),
             "how well each place fits each query",
             "Dark: the place fits the query about as well as its best one does. What repeats shows as lines "
             "beside the right places."
-            + ("" if run.sequence is None else " Of single queries; the matches are of sequences.")
-            + (f" Drawn: {'; '.join(shares)}." if shares else ""),
+            + text
+            + (f" Drawn{' above' * (example is not None)}: {'; '.join(shares)}." if shares else ""),
+        )
+    }
+
+
+def scores_of(run: Localization) -> Callable[[Tensor], Tensor]:
+    """Scores of single queries by the map, of features that may lie elsewhere."""
+    route = run.model.map
+    return lambda queries: route.scores(queries.to(route.positions.device))
+
+
+def draw_posterior(run: Localization) -> dict[str, Picture]:
+    """What a filter believes behind each query; nothing without one."""
+    if not isinstance(run.sequence, PlaceFilter):
+        return {}
+    image = posterior_image(scores_of(run), run.query_features, run.sequence)
+    known = "" if run.truth is None else " Circles are around some of the right places; grey: none is right."
+    share = ""
+    if max(image.blocks) > 1:
+        queries, places = image.blocks
+        share = f" A pixel shows the most probable of {queries} queries and {places} places."
+    return {
+        "posterior": Picture(
+            plot_posterior(image, run.truth, run.borders, run.query_frames),
+            "where the filter takes the camera to be",
+            "The probability of each place, from a query and all before it. Below, that of being off the map."
+            + known
+            + share,
         )
     }
 

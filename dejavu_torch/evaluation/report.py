@@ -20,7 +20,7 @@ PICTURES = (
     *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "sequences"),
     *("ground", "velocity", "chunks"),
     *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
-    *("spectrum", "components"),
+    *("spectrum", "components", "posterior"),
 )
 LATE = 0.1  # recall at which a curve starts late
 HEADING = 11  # letters of a line of a heading

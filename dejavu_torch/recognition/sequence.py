@@ -110,6 +110,20 @@ class SequenceMatcher(SequenceModel):
             rows = scores if before is None else torch.cat([before, scores])
             before = _last(rows, lengths[-1] - 1)
 
+    def trajectory(self, scores: Tensor, place: int) -> Tensor:
+        """The cells of which the last query's score of a place is the mean.
+
+        Args:
+            place: one whose score is finite.
+
+        Shape: (Q,N) -> (C,2) query and place of each of at most T cells, the latest query first.
+        """
+        means = [float(SequenceMatcher(self.length, (v,))(scores)[-1, place]) for v in self.speeds]
+        back = torch.tensor(self.shifts[means.index(min(means))][: len(scores)])
+        cells = torch.stack([len(scores) - 1 - torch.arange(len(back)), place - back], 1)
+        cells = cells[(cells[:, 1] >= 0) & (cells[:, 1] < scores.shape[1])]
+        return cells[scores.cpu()[cells[:, 0], cells[:, 1]].isfinite()]
+
     def check(self, queries: int, places: int) -> None:
         """See `SequenceModel`: say where there are fewer queries than T; refuse fewer places."""
         if self.length > places:

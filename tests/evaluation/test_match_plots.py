@@ -6,13 +6,18 @@ import pytest
 import torch
 from drawn import matched, render, texts
 
+from dejavu_torch import PlaceFilter, SequenceMatcher
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
+    PosteriorImage,
     Row,
+    diagonal,
     example_matches,
     plot_coverage,
+    plot_posterior,
     plot_rows,
     plot_score_matrix,
+    posterior_image,
     score_matrix,
 )
 from dejavu_torch.types import GroundTruth, Match
@@ -201,3 +206,88 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
         assert first.get_ydata().tolist() == [0, 30, 4, 35]
         assert second.get_ydata()[3] == 31
         assert {"query (frame)", "place (frame)"} <= set(texts(figure))
+
+
+def test_the_cells_that_a_sequence_adds_up_are_drawn_on_the_scores_around_them() -> None:
+    scores, place = torch.rand(60, 50), 30
+    for k in range(5):  # the query is 2 places further on with each
+        scores[40 - k, place - 2 * k] = -1.0
+    matcher = SequenceMatcher(5, speeds=(1, 2))
+    example = diagonal(
+        lambda rows: scores[rows[:, 0].long()], torch.arange(60.0)[:, None], matcher, 40, place
+    )
+    assert example.query.tolist() == [40, 39, 38, 37, 36]
+    assert example.place.tolist() == [30, 28, 26, 24, 22]
+    (top, left), (height, width) = example.first, example.values.shape
+    assert (top, left, height, width) == (31, 17, 15, 19)
+    least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
+    scaled = ((scores - least) / (median - least)).clamp(max=1)
+    assert torch.allclose(example.values, scaled[31:46, 17:36])
+
+    matrix = score_matrix(lambda rows: scores[: len(rows)], torch.rand(60, 2))
+    assert matrix is not None
+    borders, queries = torch.arange(0, 102, 2), torch.arange(0, 180, 3)  # convention 11
+    figure, (above, below) = plot_score_matrix(
+        matrix, matched(*[place] * 60), None, borders, queries, example
+    )
+    (line,) = [line for line in below.lines if line.get_label() == "added up"]
+    assert list(zip(*line.get_data(), strict=True)) == [
+        (3 * query, 2 * place) for query, place in zip(example.query, example.place, strict=True)
+    ]
+    assert below.images[0].get_array().shape == (19, 15)
+    assert (below.get_xlim(), below.get_ylim()) == ((92.5, 137.5), (33.5, 71.5))
+    (frame,) = above.patches
+    assert (frame.get_xy(), frame.get_width(), frame.get_height()) == ((93, 34), 45, 38)
+    assert {"added up", "reported place", "query (frame)"} <= set(texts(figure))
+
+
+def test_what_a_sequence_adds_up_may_reach_off_the_map_and_before_the_first_query() -> None:
+    scores = torch.rand(4, 12)
+    scores[:, 9:] = torch.inf  # nothing covers the last places
+    matcher = SequenceMatcher(6, speeds=(1, -1))
+    example = diagonal(lambda rows: scores[rows[:, 0].long()], torch.arange(4.0)[:, None], matcher, 2, 1)
+    assert example.first == (0, 0)
+    assert example.values.shape == (4, 12)
+    assert example.values[:, 9:].isnan().all()
+    mean = scores[example.query, example.place].mean()
+    assert torch.isclose(mean, matcher(scores[:3])[-1, 1])
+
+
+def test_a_posterior_is_pooled_as_it_comes(monkeypatch: pytest.MonkeyPatch, largest_tensor: type) -> None:
+    scores, model = torch.rand(130, 75), PlaceFilter()
+    with torch.no_grad():
+        posterior = model.posterior(scores)
+    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 450)
+    features = torch.arange(130.0)[:, None]
+    with largest_tensor() as seen:
+        image = posterior_image(lambda rows: scores[rows[:, 0].long()], features, model, cells=40)
+    assert seen.numel <= 38 * 33  # queries by places of the image
+    assert image.blocks == (4, 2)
+    for row, queries in zip(image.values, posterior[:, :-1].split(4), strict=True):
+        for value, places in zip(row, queries.split(2, 1), strict=True):
+            assert value == places.max()
+    assert torch.equal(image.off, posterior[:, -1])
+
+
+def test_a_posterior_is_drawn_with_some_right_places_and_where_there_is_none() -> None:
+    values = torch.tensor([[1.0, 0.0], [0.5, 0.25], [1e-9, 1e-3]])
+    off = torch.tensor([0.0, 0.1, 0.25, 0.9, 0.9, 1.0])
+    image = PosteriorImage(values, off, (2, 3))
+    truth = as_ground_truth(torch.tensor([[0, -1], [2, 4], [3, -1], [4, -1], [-1, -1], [-1, -1]]))
+    borders, queries = torch.arange(0, 12, 2), torch.arange(0, 18, 3)  # convention 11
+    figure, (axis, below) = plot_posterior(image, truth, borders, queries)
+    assert torch.equal(torch.as_tensor(axis.images[0].get_array()), values.T.clamp(min=1e-6))
+    assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 15.5), (-0.5, 9.5))
+    marked = [(x, y) for line in axis.lines for x, y in zip(*line.get_data(), strict=True) if float(y) == y]
+    assert marked == [(0, 0), (3, 4), (6, 6), (9, 8), (3, 8)]
+    assert all(line.get_markerfacecolor() == "none" for line in axis.lines)  # what is below is seen
+    (curve,) = below.lines
+    assert curve.get_xdata().tolist() == queries.tolist()
+    assert curve.get_ydata().tolist() == off.tolist()
+    (nowhere,) = below.collections
+    assert nowhere.get_datalim(below.transData).intervalx.tolist() == [12, 15]
+    assert {"query (frame)", "place (frame)", "off the map", "around right places"} <= set(texts(figure))
+    plain, (axis, below) = plot_posterior(image, None, borders, queries)
+    assert not axis.lines
+    assert not below.collections
+    render(plain)

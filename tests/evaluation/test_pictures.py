@@ -10,7 +10,16 @@ from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, DejaVu, Match, Preprocess, SlidingWindow, SpectrogramAnalysis
+from dejavu_torch import (
+    HOG,
+    DejaVu,
+    Match,
+    PlaceFilter,
+    Preprocess,
+    SequenceMatcher,
+    SlidingWindow,
+    SpectrogramAnalysis,
+)
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
@@ -27,6 +36,8 @@ from dejavu_torch.evaluation.pictures import (
 )
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import PICTURES
+from dejavu_torch.recognition.matching import Matching
+from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.types import FrequencyLayer, GroundTruth
 
 ALL = [
@@ -189,6 +200,42 @@ def test_the_score_matrix_is_the_map_s() -> None:
     assert torch.equal(best, run.match.index)
 
 
+def sequenced(run: Localization, model: SequenceModel) -> Localization:
+    """The same, with the queries matched together."""
+    match = run.model.localize(run.query_features, sequence=model)
+    return run._replace(matching=Matching(model), match=match)
+
+
+def test_a_sequence_shows_what_it_adds_up() -> None:
+    run = sequenced(localized(short(), frames(0), frames(1), same_places()), SequenceMatcher(5))
+    run.match.index[58:63] = -1  # the example is the nearest to the middle that is reported
+    pictures = draw_pictures(run, {})
+    assert "posterior" not in pictures
+    assert "frame 57" in pictures["scores"].caption
+    assert "5 cells" in pictures["scores"].caption
+    line, place = pictures["scores"].plot[1][1].lines[-1], int(run.match.index[57])
+    assert line.get_xdata().tolist() == list(range(57, 52, -1))
+    assert line.get_ydata().tolist() == list(range(place, place - 5, -1))
+    run.match.index.fill_(-1)
+    assert "cells" not in draw_pictures(run, {})["scores"].caption
+
+
+def test_a_filter_shows_its_posterior() -> None:
+    model = PlaceFilter()
+    run = sequenced(localized(short(), frames(0), frames(1), same_places()), model)
+    pictures = draw_pictures(run, {})
+    assert list(pictures)[2:4] == ["scores", "posterior"]
+    assert "cells" not in pictures["scores"].caption
+    with torch.no_grad():
+        posterior = model.posterior(run.model.map.scores(run.query_features))
+    axis, below = pictures["posterior"].plot[1]
+    drawn = torch.as_tensor(axis.images[0].get_array())
+    assert torch.allclose(drawn, posterior[:, :-1].T.clamp(min=1e-6))
+    assert torch.allclose(torch.as_tensor(below.lines[0].get_ydata()), posterior[:, -1])
+    assert "Circles" in pictures["posterior"].caption
+    assert "Circles" not in draw_pictures(run._replace(truth=None), {})["posterior"].caption
+
+
 def test_the_paper_s_own_pictures() -> None:
     run = localized(short(), frames(0), frames(1), same_places())
     assert list(paper_pictures(run)) == ["frames", "autocorrelogram", "layers"]
@@ -287,6 +334,9 @@ def test_convention_11_every_axis_along_a_resampled_route_counts_frames(resample
     assert sorted(asked) == run.query.frame.tolist()
     assert axes["coverage"].get_ylim()[1] == axes["chunks"].get_xlim()[1] == frames
     assert axes["scores"].get_ylim() == (-0.5, frames - 0.5)
+    filtered = draw_pictures(sequenced(run, PlaceFilter()), {})["posterior"].plot[1][0]
+    assert filtered.get_ylim() == (-0.5, frames - 0.5)
+    assert filtered.get_xlim() == axes["scores"].get_xlim()
     assert axes["spectrogram"][1].get_xlim() == (0, frames)
     middle, end = run.model.map.frame_of(torch.tensor([50, 100])).tolist()  # of chunks of 50 places
     borders = [line.get_xdata()[0] for line in axes["chunks"].lines]

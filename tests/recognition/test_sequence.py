@@ -57,6 +57,18 @@ def test_batches_do_not_matter(rows: list[list[float]], length: int, speeds: lis
     assert torch.equal(torch.cat(list(matcher.stream(scores.split(size)))), matcher(scores))
 
 
+@given(TABLE, st.integers(1, 12), SPEEDS)
+def test_a_score_is_the_mean_of_its_trajectory(
+    rows: list[list[float]], length: int, speeds: list[float]
+) -> None:
+    matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows, dtype=torch.float64)
+    for place, score in enumerate(matcher(scores)[-1].tolist()):
+        if math.isfinite(score):
+            query, passed = matcher.trajectory(scores, place).T
+            assert (int(query[0]), int(passed[0])) == (len(scores) - 1, place)
+            assert float(scores[query, passed].mean()) == pytest.approx(score)
+
+
 def test_later_queries_change_nothing() -> None:
     scores = torch.rand(20, 30)
     matcher = SequenceMatcher(7, [1.0, 0.8])
