@@ -125,9 +125,9 @@ def draw_pictures(
         contenders: by key, ours under `map`. storage: likewise, each at several sizes.
 
     Returns:
-        Of pairs, coverage, scores, posterior, pr, auc, storage, sequences, ground, velocity, then of a template
-        map chunks, spectrogram, templates, features and activations, of a spectral one spectrum and components,
-        those that can be drawn, in this order.
+        Of pairs, coverage, scores, posterior, pr, auc, storage, sequences, ground, velocity, then of a
+        template map chunks, spectrogram, templates, features and activations, of a spectral one spectrum and
+        components, those that can be drawn, in this order.
     """
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
