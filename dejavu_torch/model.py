@@ -425,6 +425,8 @@ class DejaVu(nn.Module):
         Args:
             order: as of `localize_descriptors`.
         """
+        if matching.sequence is not None:
+            matching.sequence.check(None, self.map.places)
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         parts = (part for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence

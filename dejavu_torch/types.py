@@ -214,11 +214,14 @@ class SequenceModel(nn.Module, ABC):
         return self.stream(map(route.scores, batches))
 
     @abstractmethod
-    def check(self, queries: int, places: int) -> None:
+    def check(self, queries: int | None, places: int) -> None:
         """Refuse, or warn of, a number of queries or places that it makes no sense for.
 
+        Args:
+            queries: None where it is not known.
+
         Raises:
-            InputError: naming both.
+            InputError: naming what does not fit.
         """
 
     def threshold_of(self, threshold: float | None) -> float | None:

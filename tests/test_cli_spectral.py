@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import math
 import re
 from pathlib import Path
 
@@ -323,14 +325,20 @@ def test_a_damaged_map_is_refused(
     assert not (tmp_path / "m.csv").exists()
 
 
-def test_a_sequence_is_of_the_map_and_of_all_beside_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def noisy(tmp_path: Path) -> tuple[Path, Path]:
+    """Two traverses of which single frames are hard to find."""
     noise = np.random.default_rng(0)
     walk = noise.normal(size=(200, 8)).cumsum(0)
     for name in ("one", "two"):
         np.save(tmp_path / f"{name}.npy", (walk + 3 * noise.normal(size=(200, 8))).astype(np.float32))
-    one, two = tmp_path / "one.npy", tmp_path / "two.npy"
+    return tmp_path / "one.npy", tmp_path / "two.npy"
+
+
+def test_a_sequence_is_of_the_map_and_of_all_beside_it(
+    noisy: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, two = noisy
     reports = {}
     for length in (1, 9):
         run("compare", one, two, "--tolerance", 1, "--sequence", length, "--out", tmp_path / f"{length}")
@@ -351,6 +359,70 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(
     matches = tmp_path / "matches.csv"
     run("localize", tmp_path / "9" / "map.safetensors", two, "--sequence", 9, "--out", matches)
     assert matches.read_text() == (tmp_path / "9" / "matches.csv").read_text()
+
+
+def test_a_filter_is_of_the_map_and_of_all_beside_it(
+    noisy: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, two = noisy
+    out = tmp_path / "out"
+    run("compare", one, two, "--filter", "--out", out)
+    report = report_of(out)
+    assert (report["filter"], report["sequence"]) == (True, 1)
+    assert report["auc"] > report["sequences"]["1"]["auc"]
+    assert "a filter over all queries" in (out / "index.html").read_text()
+    assert (out / "posterior.png").exists()
+    for key in ("uncompressed", "null"):
+        assert report[key]["auc"] != report[key]["sequences"]["1"]["auc"]
+
+    matches, route = tmp_path / "matches.csv", out / "map.safetensors"
+    run("localize", route, two, "--filter", "--out", matches)
+    assert matches.read_text() == (out / "matches.csv").read_text()
+    rows = list(csv.DictReader(matches.open(newline="")))
+    assert {row["accepted"] for row in rows} == {"0", "1"}
+    assert all((float(row["score"]) < math.log(2)) == (row["accepted"] == "1") for row in rows)
+    run("localize", route, two, "--filter", "--threshold", 100, "--top", 2, "--out", matches)
+    rows = list(csv.DictReader(matches.open(newline="")))
+    assert len(rows) == 400
+    assert {row["accepted"] for row in rows} == {"1"}
+    capsys.readouterr()
+
+
+def test_a_sequence_takes_the_best_of_several_speeds(noisy: tuple[Path, Path], tmp_path: Path) -> None:
+    one, two = noisy
+    half = tmp_path / "half.npy"
+    np.save(half, np.load(two)[::2])
+    run("learn", one, "--map", tmp_path / "m.safetensors")
+    right = {}
+    for speeds in ("[1]", "[2]", "[1,2]"):
+        out = tmp_path / "matches.csv"
+        words = ("--sequence", 9, "--speeds", speeds, "--out", out)
+        run("localize", tmp_path / "m.safetensors", half, *words)
+        found = [int(row["place"]) for row in csv.DictReader(out.open(newline=""))]
+        right[speeds] = sum(abs(place - 2 * i) <= 1 for i, place in enumerate(found))
+    assert right["[2]"] > right["[1,2]"] > right["[1]"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--sequence", "9", "--filter"], ["--sequence 9 and --filter", "one or the other"]),
+        (["--speeds", "[2]"], ["--speeds [2.0]", "--sequence"]),
+        (["--sequence", "9", "--speeds", "[]"], ["speeds are []"]),
+        (["--sequence", "9", "--speeds", "[1,500]"], ["speed of 500", "200 places"]),
+        (["--sequence", "300"], ["300 queries", "200 places"]),
+    ],
+)
+def test_bad_sequences_are_refused(
+    words: list[str],
+    told: list[str],
+    noisy: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    error = fails(capsys, "compare", *noisy, *words, "--out", tmp_path / "out")
+    assert all(text in error for text in told)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_sequence_of_no_queries_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

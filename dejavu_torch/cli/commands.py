@@ -110,6 +110,7 @@ def run_localize(
     corners: list[list[float]] | None = None,
     as_is: bool = False,
     sequence: int = 1,
+    speeds: list[float] | None = None,
     filter: bool = False,
     features: nn.Module | None = None,
 ) -> None:
@@ -124,6 +125,7 @@ def run_localize(
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         as_is: take the frames as they are, though the map's are resampled
         sequence: queries that are matched together, one place after another
+        speeds: of a sequence, such as '[.8,1,1.25]' places a query, of which the best counts; 1 if not given
         filter: drive a probability for every place along, and for being off the map, at any speed; a match
             is accepted where it is more likely than not
         features: class of the map's features, if not ours
@@ -145,9 +147,9 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, progress=True)
         _print_steps(query)
-    matcher = _sequence_of(sequence, filter, APART, threshold)
+    matcher = _sequence_of(sequence, speeds, filter, APART, threshold)
     if matcher is not None:
-        matcher.check(sequence if query.length is None else query.length, model.map.places)
+        matcher.check(query.length, model.map.places)
     threshold = model.threshold_of(matcher)
     matches = model.matches(query, "localizing", matcher)
     if top is not None:
@@ -177,6 +179,7 @@ def run_compare(
     second_truth: str | None = None,
     map: Path | None = None,
     sequence: int = 1,
+    speeds: list[float] | None = None,
     filter: bool = False,
     top: int | None = None,
     model: DejaVu,
@@ -198,13 +201,14 @@ def run_compare(
         second_truth: which places it shows, as --truth
         map: evaluate this map of the reference as it is, and learn none
         sequence: queries that are matched together, one place after another
+        speeds: as of `dejavu localize`
         filter: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
 
-    matcher = _sequence_of(sequence, filter, tolerance, model.threshold)
+    matcher = _sequence_of(sequence, speeds, filter, tolerance, model.threshold)
     if map is not None:
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
@@ -360,15 +364,19 @@ def _check_report_folder(out: Path, *sources: str | None) -> None:
     check_output_folder(out)
 
 
-def _sequence_of(length: int, filter: bool, within: int, threshold: float | None) -> SequenceModel | None:
+def _sequence_of(
+    length: int, speeds: list[float] | None, filter: bool, within: int, threshold: float | None
+) -> SequenceModel | None:
     """What scores queries together: the filter, or a sum over so many; none for one.
 
     Args:
         within, threshold: of the filter, which keeps its own where that is None.
     """
-    matcher = SequenceMatcher(length)
+    matcher = SequenceMatcher(length, (1.0,) if speeds is None else speeds)
     if filter and length > 1:
         raise InputError(f"--sequence {length} and --filter; expected one or the other")
+    if speeds is not None and length == 1:
+        raise InputError(f"--speeds {speeds} are of no sequence; expected --sequence T with them")
     if filter:
         chosen = PlaceFilter(within=within)
         chosen.threshold = chosen.threshold if threshold is None else threshold

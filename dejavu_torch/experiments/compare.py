@@ -120,6 +120,8 @@ def compare(
     with timed(seconds, "localize"):
         query = model.resample(query, getattr(reference, "step", None), progress)
     check_candidates(top, tolerance, reference.length)  # before the long work
+    if sequence is not None and reference.length is not None:
+        sequence.check(None, reference.length)
     find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
     lengths_known = reference.length is not None and query.length is not None
     known = find_truth() if lengths_known else None  # one that does not fit is refused before the long work

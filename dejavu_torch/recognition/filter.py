@@ -257,7 +257,7 @@ class PlaceFilter(SequenceModel):
         score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1).log()
         return score.masked_fill(~scores.isfinite(), math.inf)
 
-    def check(self, queries: int, places: int) -> None:
+    def check(self, queries: int | None, places: int) -> None:
         """See `SequenceModel`: refuse moves that leave the map at once."""
         furthest = len(self.move_logits) - 1
         if furthest >= places:

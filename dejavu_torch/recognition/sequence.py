@@ -124,13 +124,21 @@ class SequenceMatcher(SequenceModel):
         cells = cells[(cells[:, 1] >= 0) & (cells[:, 1] < scores.shape[1])]
         return cells[scores.cpu()[cells[:, 0], cells[:, 1]].isfinite()]
 
-    def check(self, queries: int, places: int) -> None:
-        """See `SequenceModel`: say where there are fewer queries than T; refuse fewer places."""
+    def check(self, queries: int | None, places: int) -> None:
+        """See `SequenceModel`: say where there are fewer queries than T; refuse fewer places, and a speed
+        that leaves the map at once.
+        """
         if self.length > places:
             raise InputError(
                 f"a sequence of {self.length} queries on a map of {places} places; expected at most as many"
             )
-        if self.length > queries:
+        beyond = [speed for speed in self.speeds if abs(speed) >= places]
+        if beyond and self.length > 1:
+            raise InputError(
+                f"a speed of {beyond[0]:g} places a query on a map of {places} places; expected speeds "
+                "that do not leave it at once"
+            )
+        if queries is not None and self.length > queries:
             log.warning("a sequence of %d queries, but there are %d: all of them count", self.length, queries)
 
     def extra_repr(self) -> str:

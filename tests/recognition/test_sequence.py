@@ -125,6 +125,10 @@ def test_a_sequence_longer_than_the_queries_is_told_once(caplog: pytest.LogCaptu
     SequenceMatcher(11).check(11, 11)
     with refused("a sequence of 11 queries on a map of 10 places"):
         SequenceMatcher(11).check(20, 10)
+    with refused("a sequence of 41 queries on a map of 40 places"):
+        model.learn(route(0)[:40]).localize(route(1), sequence=SequenceMatcher(41))
+    with refused("a speed of -10 places a query on a map of 10 places"):
+        SequenceMatcher(3, [1, -10]).check(None, 10)
 
 
 def test_convention_2_a_place_that_nothing_covers_is_not_reported() -> None:
