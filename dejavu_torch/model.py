@@ -356,6 +356,8 @@ class DejaVu(nn.Module):
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
+        if sequence is not None:
+            sequence.check(as_traverse(queries).length, self.map.places)
         threshold = self.threshold_of(sequence)
         for part in self._found(self._checked(queries, progress), Matching(sequence)):
             yield part.match(threshold)
@@ -398,6 +400,8 @@ class DejaVu(nn.Module):
         """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
         check_candidates(k, apart, self.map.places)
+        if sequence is not None:
+            sequence.check(as_traverse(queries).length, self.map.places)
         matching = Matching(sequence, ranks=k, apart=apart)
         for part in self._found(self._checked(queries, progress), matching):
             yield part.candidates

@@ -175,7 +175,7 @@ class GroundTruth(NamedTuple):
 
 
 class Scorer(Protocol):
-    """What scores places: of a map, what a `SequenceModel` needs."""
+    """The part of a map that a `SequenceModel` uses."""
 
     places: int
 
@@ -195,10 +195,10 @@ class SequenceModel(nn.Module, ABC):
 
     @property
     def shifts(self) -> tuple[tuple[int, ...], ...]:
-        """Where scores are the best mean along trajectories: how far back each lies, as maps may use it.
+        """The trajectories, of a model whose score is the best mean along some: a map may add them up itself.
 
-        Of each trajectory the places 0, 1, .., T - 1 queries before the latest; () where they are no means,
-        as of a subclass that scores otherwise.
+        Of each trajectory, how many places it lies behind its end 0, 1, .., T - 1 queries before the latest.
+        () for a model that scores otherwise.
         """
         return ()
 

@@ -381,6 +381,10 @@ def test_a_filter_is_of_the_map_and_of_all_beside_it(
     rows = list(csv.DictReader(matches.open(newline="")))
     assert {row["accepted"] for row in rows} == {"0", "1"}
     assert all((float(row["score"]) < math.log(2)) == (row["accepted"] == "1") for row in rows)
+    assert report["threshold"] == pytest.approx(math.log(2))
+    run("compare", one, two, "--filter", "--threshold", 0.1, "--out", out)
+    assert report_of(out)["threshold"] == 0.1
+    assert DejaVu.load(route).threshold is None  # it is none of single queries
     run("localize", route, two, "--filter", "--threshold", 100, "--top", 2, "--out", matches)
     rows = list(csv.DictReader(matches.open(newline="")))
     assert len(rows) == 400
@@ -408,8 +412,11 @@ def test_a_sequence_takes_the_best_of_several_speeds(noisy: tuple[Path, Path], t
     [
         (["--sequence", "9", "--filter"], ["--sequence 9 and --filter", "one or the other"]),
         (["--speeds", "[2]"], ["--speeds [2.0]", "--sequence"]),
+        (["--moves", "[1]"], ["--moves [1.0]", "--filter"]),
+        (["--filter", "--moves", "[1,1]"], ["moves are [1.0, 1.0]", "add up to 1"]),
+        (["--filter", "--tolerance", "-1"], ["tolerance is -1"]),
         (["--sequence", "9", "--speeds", "[]"], ["speeds are []"]),
-        (["--sequence", "9", "--speeds", "[1,500]"], ["speed of 500", "200 places"]),
+        (["--sequence", "9", "--speeds", "[1,500]"], ["9 queries at 500 places a query", "200 places"]),
         (["--sequence", "300"], ["300 queries", "200 places"]),
     ],
 )

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
+from dejavu_torch import DejaVu, ImposedPeriods, PlaceFilter, TemplateMapper
 from dejavu_torch.cli import commands, train
 from dejavu_torch.cli.parser import UsageError, command_parser, without_whitening_map
 from dejavu_torch.cli.presets import with_configs
@@ -21,6 +21,7 @@ README = (ROOT / "README.md").read_text()
 TRAINING = (ROOT / "docs" / "training.md").read_text()
 ROUTES = (ROOT / "docs" / "real_routes.md").read_text()
 SPECTRAL = (ROOT / "docs" / "spectral_maps.md").read_text()
+SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 OPTIONS = [
     option
@@ -84,7 +85,9 @@ def understand(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", [README, TRAINING, ROUTES, SPECTRAL], ids=["README", "training", "real_routes", "spectral_maps"]
+    "text",
+    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES],
+    ids=["README", "training", "real_routes", "spectral_maps", "sequences"],
 )
 def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
@@ -165,3 +168,18 @@ def test_ci_calls_the_readmes_test_command() -> None:
     assert commands[0] in (ROOT / "CONTRIBUTING.md").read_text()
     for linter in ("ruff check .", "ruff format --check .", "mypy"):
         assert f"python -m {linter}" in ci
+
+
+def test_a_filter_is_learned_as_the_documentation_shows() -> None:
+    (shown,) = re.findall(r"```python\n(.*?)```", SEQUENCES, re.DOTALL)
+    quick = (("DejaVu()", 'DejaVu(whitening="none")'), ("max_epochs=30", "max_epochs=2"), ("=240", "=60"))
+    for slow, fast in quick:
+        assert slow in shown
+        shown = shown.replace(slow, fast)
+    space: dict[str, Any] = {}
+    exec(shown, space)
+    learned, fresh = space["learn"].filter, PlaceFilter()
+    near, scores = space["near"], space["scores"]
+    right = [float((one.posterior(scores)[:, :-1] * near).sum(1).log().mean()) for one in (fresh, learned)]
+    assert right[1] > right[0]
+    assert (space["match"].index - torch.arange(60)).abs().median() <= 5

@@ -112,6 +112,7 @@ def run_localize(
     sequence: int = 1,
     speeds: list[float] | None = None,
     filter: bool = False,
+    moves: list[float] | None = None,
     features: nn.Module | None = None,
 ) -> None:
     """Find the frames of a source on a map.
@@ -126,8 +127,10 @@ def run_localize(
         as_is: take the frames as they are, though the map's are resampled
         sequence: queries that are matched together, one place after another
         speeds: of a sequence, such as '[.8,1,1.25]' places a query, of which the best counts; 1 if not given
-        filter: drive a probability for every place along, and for being off the map, at any speed; a match
-            is accepted where it is more likely than not
+        filter: the most probable place given all queries so far, at varying speed, or off the map; scores and
+            --threshold are -log probability, and what is more likely than not is accepted
+        moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
+            if not given
         features: class of the map's features, if not ours
     """
     check_output_file(out)
@@ -147,9 +150,9 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, progress=True)
         _print_steps(query)
-    matcher = _sequence_of(sequence, speeds, filter, APART, threshold)
+    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
     if matcher is not None:
-        matcher.check(query.length, model.map.places)
+        matcher.check(None, model.map.places)
     threshold = model.threshold_of(matcher)
     matches = model.matches(query, "localizing", matcher)
     if top is not None:
@@ -181,6 +184,7 @@ def run_compare(
     sequence: int = 1,
     speeds: list[float] | None = None,
     filter: bool = False,
+    moves: list[float] | None = None,
     top: int | None = None,
     model: DejaVu,
     command: str,
@@ -203,12 +207,15 @@ def run_compare(
         sequence: queries that are matched together, one place after another
         speeds: as of `dejavu localize`
         filter: as of `dejavu localize`
+        moves: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
 
-    matcher = _sequence_of(sequence, speeds, filter, tolerance, model.threshold)
+    matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
+    if filter:
+        model.threshold = None  # of distances: that of the filter is none for the map to keep
     if map is not None:
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
@@ -315,7 +322,7 @@ def run_bench(what: str = "matcher", *, out: Path) -> None:
     """Time this package beside what a user would pick instead.
 
     Args:
-        what: matcher (HOG, L1 distances)
+        what: matcher (HOG, L1 distances, sequences, filters)
         out: folder for bench.json and bench.png
     """
     from dejavu_torch.evaluation.report import text_table
@@ -365,7 +372,12 @@ def _check_report_folder(out: Path, *sources: str | None) -> None:
 
 
 def _sequence_of(
-    length: int, speeds: list[float] | None, filter: bool, within: int, threshold: float | None
+    length: int,
+    speeds: list[float] | None,
+    filter: bool,
+    moves: list[float] | None,
+    within: int,
+    threshold: float | None,
 ) -> SequenceModel | None:
     """What scores queries together: the filter, or a sum over so many; none for one.
 
@@ -376,9 +388,11 @@ def _sequence_of(
     if filter and length > 1:
         raise InputError(f"--sequence {length} and --filter; expected one or the other")
     if speeds is not None and length == 1:
-        raise InputError(f"--speeds {speeds} are of no sequence; expected --sequence T with them")
+        raise InputError(f"--speeds {speeds} without --sequence; expected --sequence T with them")
+    if moves is not None and not filter:
+        raise InputError(f"--moves {moves} without --filter; expected both")
     if filter:
-        chosen = PlaceFilter(within=within)
+        chosen = PlaceFilter(within=within) if moves is None else PlaceFilter(moves, within=within)
         chosen.threshold = chosen.threshold if threshold is None else threshold
         return chosen
     return None if length == 1 else matcher

@@ -375,7 +375,7 @@ def plot_posterior(
         right, some = _right_frames(truth, borders), slice(None, None, -(-len(queries) // MARKS))
         style = {"color": RIGHT, "markersize": 5, "markerfacecolor": "none", "clip_on": False}
         axis.plot(queries[some], right[some], "o", **style)
-        figure.legend(axis.lines[:1], ["around right places"], loc="outside lower left", frameon=False)
+        figure.legend(axis.lines[:1], ["right place"], loc="outside lower left", frameon=False)
         nowhere = truth.judged & right.isnan().all(1)
         if nowhere.any():
             below.fill_between(queries, 0, 1, where=nowhere.numpy(), step="mid", color=GREY, linewidth=0)

@@ -101,6 +101,10 @@ def sequence_table(report: Report) -> list[list[str]]:
     for one in shown.values():
         areas = (one.sequences.get(length) for length in lengths)
         rows.append([one.name, *("" if scores is None else f"{scores.auc:.3f}" for scores in areas)])
+    for size in report.facts.get("storage", {}).get("map", ()) if shown else ():
+        found = [size["sequences"][f"{length}"]["auc"] for length in lengths]
+        name = f"the map in {size['route_bytes_per_place']:.3g} route bytes per place"
+        rows.append([name, *(f"{area:.3f}" for area in found)])
     return rows if shown else []
 
 
@@ -183,7 +187,9 @@ def summary(report: Report) -> str:
         both = f"of the reference and {query} of the query" if query else "of the reference"
         lines.append(f"{reference} frames {both} were resampled to even steps of {step:.4g} pixels of ground")
     if facts.get("sequence", 1) > 1:
-        lines.append(f"Each was matched together with the {facts['sequence'] - 1} before it (--sequence)")
+        speeds = facts.get("speeds") or [1.0]
+        at = "" if speeds == [1.0] else f" at {' or '.join(f'{speed:g}' for speed in speeds)} places a query"
+        lines.append(f"Each was matched together with the {facts['sequence'] - 1} before it{at} (--sequence)")
     if facts.get("filter"):
         lines.append("Each was matched by a filter over all queries before it (--filter)")
     if facts.get("unknown"):

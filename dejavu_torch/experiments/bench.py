@@ -262,8 +262,9 @@ def _filter_case(case: str, route: Tensor, noise: Tensor, repeats: int) -> list[
     queries = (route[first : first + len(noise)] + noise).split(16)
 
     def drive(every: int) -> Tensor:
-        scores = spectral.sequences(queries, PlaceFilter(search_every=every))
-        return torch.cat([(-part).exp() for part in scores])
+        with torch.no_grad():
+            scores = spectral.sequences(queries, PlaceFilter(search_every=every))
+            return torch.cat([(-part).exp() for part in scores])
 
     beside = Program("dejavu (all places)", torch.get_num_threads(), lambda: partial(drive, 1))
     return benchmark(case, [*_ours(partial(drive, 50)), beside], repeats)

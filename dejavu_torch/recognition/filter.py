@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.types import InputError, Scorer, SequenceModel
 
+IMPOSSIBLE = 1e-30  # a probability that gradients still bear
 LIKELY = 0.99  # of all probability has to lie in a stretch of places for these to be scored alone
 UNLIKELY = 1e-4  # of all probability: a place with less ends such a stretch
 
@@ -30,47 +31,52 @@ def moments_of(scores: Tensor) -> Moments:
     count = known.sum(1, keepdim=True).clamp(min=1)
     mean = torch.where(known, scores, 0).sum(1, keepdim=True) / count
     variance = torch.where(known, mean - scores, 0).square().sum(1, keepdim=True) / count
-    tells = variance > torch.finfo(scores.dtype).eps ** 2 * mean.square()
+    most = scores.masked_fill(~known, -math.inf).amax(1, keepdim=True)
+    tells = (most > scores.amin(1, keepdim=True)) & (variance > 0)
     return Moments(mean, torch.where(tells, variance, 1).sqrt(), tells)
 
 
 class PlaceFilter(SequenceModel):
     """Where the latest query is, from all queries so far: the forward algorithm of a hidden Markov model.
 
-    Its states are the N places and one more, off the map. From one query to the next the camera moves on by 0
-    to V places, jumps to any place, leaves the map or enters it anywhere; driving off its end leaves it too.
+    Its states are the N places and one more, off the map. From one query to the next the camera moves forward
+    by 0 to V places, jumps to any place, leaves the map or enters it anywhere; driving off its end leaves it
+    too.
     A place scored z standard deviations below the mean of a query's scores has the likelihood
     exp(sharpness z), being off the map exp(sharpness off_map).
 
     Args:
-        moves: probabilities of moving by 0, 1, .., V places; they add up to 1.
+        moves: probabilities of moving by 0, 1, .., V places from one query to the next; they add up to 1.
+            What is faster than V places a query is lost, or found again by jumps.
         jump: probability of being anywhere on the map next, whatever the place before.
         leave: probability of leaving the map. enter: of entering it, from off the map.
         sharpness: nats for a standard deviation. Consecutive frames are alike, so that they tell less than
             as many independent ones.
         off_map: standard deviations; a place that stands out less than this speaks for being off the map.
-        within: places; neighbours up to here count for a place's score, in proportion to how near they are,
-            as next to the right place is nearly right.
-        threshold: accept a match whose score is below; the default is what is more likely than not, None
-            accepts every match.
-        search_every: score all places for every so many queries, and where the last posterior has no single
-            stretch of places that is likely; in between only that stretch is scored, as far as the map can
-            score a stretch alone: a spectral map by its chunks.
+        within: places; the score of a place counts its neighbours up to here, the less the further away,
+            since what is nearly right counts as right.
+        threshold: accept a match whose score is below; the default accepts what is more likely than not,
+            None every match.
+        search_every: queries from one search of all places to the next. In between `follow`, and so
+            `DejaVu.localize`, scores only the stretch of places that is likely, as far as the map can score a
+            stretch alone: a spectral map by its chunks, a template map by its layers. Where no stretch holds
+            nearly all of the probability, all places are searched. Probabilities then differ by up to about
+            0.01 from those of a filter that always searches, and a jump is noticed at the next search.
 
     Shape: scores (Q,N), the posterior (N+1,) of the query before them or None -> (Q,N), -log of a
         probability in nats, lower is better.
 
     Convention: only earlier queries are used. exp(-score) is at most the probability that the right place
         lies within `within` places. A place that nothing covers scores +inf; a query that scores all places
-        alike says nothing. Gradients reach the scores, and all settings but `within` and `threshold`, which
-        are parameters: `posterior` is what to train.
+        alike says nothing. The settings from `moves` to `off_map` are parameters: gradients of `forward` and
+        `posterior` reach them, and the scores. `stream` carries no gradient from batch to batch.
 
     Source: a filter with an off-map state is that of Xu, Fischer and Milford (RA-L 2021); the likelihood is
         ours.
 
     Raises:
         InputError: probabilities out of range or that do not add up, other settings out of range; forward:
-            scores that are no (Q,N), or a posterior of another number of places.
+            scores that are no (Q,N), or a posterior that is none or of another number of places.
 
     Example:
         >>> scores = torch.tensor([[0.0, 5, 5, 5, 5, 5], [5, 0, 5, 5, 0, 5], [5, 5, 0, 5, 5, 5]])
@@ -91,24 +97,26 @@ class PlaceFilter(SequenceModel):
         search_every: int = 1,
     ) -> None:
         super().__init__()
+        moves = tuple(float(move) for move in moves)
         rates = {"jump": jump, "leave": leave, "enter": enter}
         if any(not 0 <= rate <= 1 for rate in rates.values()) or jump + leave > 1:
             seen = ", ".join(f"{name} {rate}" for name, rate in rates.items())
             raise InputError(f"{seen}; expected probabilities, jump and leave at most 1 together")
         if not moves or not all(move >= 0 for move in moves) or not abs(sum(moves) - 1) < 1e-6:
-            raise InputError(f"the moves are {list(moves)}; expected probabilities that add up to 1")
-        if not 0 < sharpness < math.inf or not math.isfinite(off_map) or within < 0:
+            raise InputError(f"the moves are {[*moves]}; expected probabilities that add up to 1")
+        if not 0 < sharpness < math.inf or not math.isfinite(off_map):
             raise InputError(
-                f"sharpness {sharpness}, off_map {off_map}, within {within}; expected finite numbers, a "
-                "sharpness above 0 and at least 0 places"
+                f"sharpness {sharpness}, off_map {off_map}; expected finite numbers, the sharpness above 0"
             )
-        if search_every < 1:
-            raise InputError(f"search_every is {search_every}; expected at least 1 query")
-        stay = max(0.0, 1 - jump - leave)
-        self.move_logits = nn.Parameter(torch.tensor(moves).log())
-        self.rate_logits = nn.Parameter(torch.tensor([stay, jump, leave]).log())
-        self.enter_logit = nn.Parameter(torch.tensor(enter).logit())
-        self.log_sharpness = nn.Parameter(torch.tensor(sharpness).log())
+        for name, value, least in (("within", within, 0), ("search_every", search_every, 1)):
+            if not isinstance(value, int) or value < least:
+                raise InputError(f"{name} is {value}; expected a whole number, at least {least}")
+        if threshold is not None and math.isnan(threshold):
+            raise InputError("the threshold is NaN; expected a number, or None")
+        self.move_logits = nn.Parameter(_logits(*moves))
+        self.rate_logits = nn.Parameter(_logits(1 - jump - leave, jump, leave))
+        self.enter_logit = nn.Parameter(_logits(enter)[0] - _logits(1 - enter)[0])
+        self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness)).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map)))
         self.within, self.threshold, self.search_every = within, threshold, search_every
 
@@ -128,7 +136,7 @@ class PlaceFilter(SequenceModel):
                 f"a posterior {tuple(before.shape)} of another map, of {places} places; expected "
                 f"({places + 1},)"
             )
-        belief = None if before is None else _with_rest(before.to(scores))
+        belief = None if before is None else _with_rest(_checked(before).to(scores))
         rows = []
         for likelihood in self.evidence(scores, moments_of(scores)):
             belief = self._updated(self._expected(belief, 0, places).to(scores), likelihood)
@@ -137,7 +145,7 @@ class PlaceFilter(SequenceModel):
 
     def predicted(self, posterior: Tensor) -> Tensor:
         """What the motion makes of a posterior, ahead of the next query: (N+1,) -> (N+1,)."""
-        return _without_rest(self._expected(_with_rest(posterior), 0, len(posterior) - 1))
+        return _without_rest(self._expected(_with_rest(_checked(posterior)), 0, len(posterior) - 1))
 
     def evidence(self, scores: Tensor, moments: Moments) -> Tensor:
         """Likelihoods of each query up to a factor, the greatest of each row 1.
@@ -159,13 +167,12 @@ class PlaceFilter(SequenceModel):
     def _expected(self, belief: Tensor | None, start: int, places: int) -> Tensor:
         """The belief ahead of the next query.
 
-        A belief (W+2,) holds the probability of the places [start, start + W), that of all others, between
-        which it makes no difference, and that of being off the map. What lies ahead of the W places and can
-        be driven to joins them.
+        A belief (W+2,) holds the probability of each of the places [start, start + W), that of all others
+        together, and that of being off the map. The result has up to V more places, as far as one can drive.
         """
         leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
         if belief is None:  # off the map or on it, as many as leave and enter, and there anywhere
-            off = leave / (leave + enter).clamp(min=1e-30)
+            off = (leave / (leave + enter)).clamp(max=0.5)
             return torch.cat([((1 - off) / places).expand(places), off.new_zeros(1), off[None]])
         moves, stay = self.move_logits.to(belief).softmax(0), self.rate_logits.to(belief).softmax(0)[0]
         jump, leave, enter = self.rate_logits.to(belief).softmax(0)[1], leave.to(belief), enter.to(belief)
@@ -184,50 +191,55 @@ class PlaceFilter(SequenceModel):
         """Bayes' rule; where what is likely was impossible, what was expected stands."""
         joint = expected * likelihood
         total = joint.sum()
-        return torch.where(total > 0, joint / torch.where(total > 0, total, 1), expected)
+        return torch.where(total > IMPOSSIBLE, joint / torch.where(total > IMPOSSIBLE, total, 1), expected)
 
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
         """See `SequenceModel`; between two batches one posterior is kept."""
         before = None
         for scores in batches:
             posterior = self.posterior(scores, before)
-            before = posterior[-1] if len(posterior) else before
+            before = posterior[-1].detach() if len(posterior) else before
             yield self._scores(posterior[:, :-1], scores)
 
     def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
         """See `SequenceModel`; between two searches only the stretch that is likely is scored and driven on.
 
         All other places then count as if they scored as the mean, and mean and spread are those of the last
-        search: probabilities differ in the third digit or so, see `dejavu bench`.
+        search.
         """
         if self.search_every == 1:
             yield from super().follow(batches, route)
-            return
+        else:
+            yield from self._near(batches, route)
+
+    @torch.no_grad()
+    def _near(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
+        """As `follow`, without gradients."""
         places, start, since = route.places, 0, 0
         belief: Tensor | None = None
-        moments: Moments | None = None
+        search: tuple[Moments, Tensor] | None = None  # of the last: moments, and which places are covered
         for queries in batches:
             found = []
-            for query in queries.split(1):
-                near = None if belief is None or since == self.search_every else self._likely(belief)
-                if belief is None or moments is None or near is None:
+            for query in queries.split(1) if len(queries) else ():
+                near = None if belief is None or since >= self.search_every else self._likely(belief)
+                if belief is None or search is None or near is None:
                     belief = belief if belief is None else _spread(belief, start, places)
-                    start, since, scores = 0, 0, route.scores(query)
-                    moments = moments_of(scores)
+                    start, scores = 0, route.scores(query)
                     expected = self._expected(belief, start, places).to(scores)
+                    moments, covered = moments_of(scores), scores.isfinite()
+                    if moments.tells:  # a query that tells nothing is no search
+                        search, since = (moments, covered), 0
                 else:
-                    rest = belief[:-2].sum() - belief[near.start : near.stop].sum()
-                    on, others = (
-                        belief[near.start : near.stop],
-                        belief[-2:] + rest * belief.new_tensor([1, 0]),
-                    )
-                    start += near.start
-                    expected = self._expected(torch.cat([on, others]), start, places)
+                    belief, start = _narrowed(belief, near), start + near.start
+                    expected = self._expected(belief, start, places)
                     scores = route.scores_between(query, start, start + len(expected) - 2)
+                    moments, covered = search
                 since += 1
                 belief = self._updated(expected, self.evidence(scores, moments)[0])
-                found.append(self._row(belief, start, scores, places))
-            yield torch.cat(found)
+                row = self._row(belief, start, scores, places)
+                found.append(row.masked_fill(~covered, math.inf))
+            if found:
+                yield torch.cat(found)
 
     def _row(self, belief: Tensor, start: int, scores: Tensor, places: int) -> Tensor:
         """As `_scores`, of all places: (W+2,) and (1,W) -> (1,N)."""
@@ -242,7 +254,7 @@ class PlaceFilter(SequenceModel):
 
     def _likely(self, belief: Tensor) -> range | None:
         """The stretch of a belief's places that hold most of it; None where it is not where the camera is."""
-        on = belief[:-2].detach()
+        on = belief[:-2]
         (likely,) = (on > UNLIKELY).nonzero(as_tuple=True)
         if not len(likely):
             return None
@@ -278,6 +290,22 @@ class PlaceFilter(SequenceModel):
         )
 
 
+def _logits(*probabilities: float) -> Tensor:
+    """Logarithms whose gradients are finite where a probability is 0."""
+    return torch.tensor(probabilities).clamp(min=IMPOSSIBLE).log()
+
+
+def _checked(posterior: Tensor) -> Tensor:
+    """A posterior that was handed in."""
+    valid = posterior.ndim == 1 and len(posterior) > 1 and bool((posterior >= 0).all())
+    if not valid or abs(float(posterior.detach().sum()) - 1) > 1e-3:
+        raise InputError(
+            f"a posterior {tuple(posterior.shape)} that adds up to {float(posterior.detach().sum()):.4g}; "
+            "expected probabilities (N+1,) that add up to 1"
+        )
+    return posterior
+
+
 def _with_rest(posterior: Tensor) -> Tensor:
     """A posterior (N+1,) as a belief of all places: there are no others."""
     return torch.cat([posterior[:-1], posterior.new_zeros(1), posterior[-1:]])
@@ -293,3 +321,10 @@ def _spread(belief: Tensor, start: int, places: int) -> Tensor:
     on = (belief[-2] / max(1, others)).repeat(places)
     on[start : start + len(belief) - 2] = belief[:-2]
     return torch.cat([on, belief.new_zeros(1), belief[-1:]])
+
+
+def _narrowed(belief: Tensor, near: range) -> Tensor:
+    """A belief of some of its places; the others join those that are not told apart."""
+    on, rest = belief[near.start : near.stop], belief[-2:].clone()
+    rest[0] += belief[:-2].sum() - on.sum()
+    return torch.cat([on, rest])

@@ -49,9 +49,12 @@ class SequenceMatcher(SequenceModel):
         super().__init__()
         if not isinstance(length, int) or length < 1:
             raise InputError(f"a sequence of {length} queries; expected a whole number, at least 1")
-        if not len(speeds) or not all(math.isfinite(speed) for speed in speeds):
-            raise InputError(f"the speeds are {list(speeds)}; expected finite numbers of places a query")
-        self.length, self.speeds = length, tuple(float(speed) for speed in speeds)
+        given = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
+        if not given or not all(map(math.isfinite, given)):
+            raise InputError(
+                f"the speeds are {speeds}; expected finite numbers of places a query, at least one"
+            )
+        self.length, self.speeds = length, given
 
     @property
     def shifts(self) -> tuple[tuple[int, ...], ...]:
@@ -106,6 +109,8 @@ class SequenceMatcher(SequenceModel):
         """`sums` of batches (B,N) that come one behind the other; the longest T - 1 rows are kept."""
         before = None
         for scores in batches:
+            if not len(scores):
+                continue
             yield list(self.sums(scores, lengths, before))
             rows = scores if before is None else torch.cat([before, scores])
             before = _last(rows, lengths[-1] - 1)
@@ -125,19 +130,13 @@ class SequenceMatcher(SequenceModel):
         return cells[scores.cpu()[cells[:, 0], cells[:, 1]].isfinite()]
 
     def check(self, queries: int | None, places: int) -> None:
-        """See `SequenceModel`: say where there are fewer queries than T; refuse fewer places, and a speed
-        that leaves the map at once.
-        """
-        if self.length > places:
-            raise InputError(
-                f"a sequence of {self.length} queries on a map of {places} places; expected at most as many"
-            )
-        beyond = [speed for speed in self.speeds if abs(speed) >= places]
-        if beyond and self.length > 1:
-            raise InputError(
-                f"a speed of {beyond[0]:g} places a query on a map of {places} places; expected speeds "
-                "that do not leave it at once"
-            )
+        """See `SequenceModel`: warn of fewer queries than T; refuse trajectories longer than the map."""
+        for speed, shifts in zip(self.speeds, self.shifts, strict=True):
+            if abs(shifts[-1]) >= places:
+                raise InputError(
+                    f"a sequence of {self.length} queries at {speed:g} places a query on a map of {places} "
+                    "places; expected a shorter one, or speeds that do not leave the map"
+                )
         if queries is not None and self.length > queries:
             log.warning("a sequence of %d queries, but there are %d: all of them count", self.length, queries)
 

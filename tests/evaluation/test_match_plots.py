@@ -286,7 +286,7 @@ def test_a_posterior_is_drawn_with_some_right_places_and_where_there_is_none() -
     assert curve.get_ydata().tolist() == off.tolist()
     (nowhere,) = below.collections
     assert nowhere.get_datalim(below.transData).intervalx.tolist() == [12, 15]
-    assert {"query (frame)", "place (frame)", "off the map", "around right places"} <= set(texts(figure))
+    assert {"query (frame)", "place (frame)", "off the map", "right place"} <= set(texts(figure))
     plain, (axis, below) = plot_posterior(image, None, borders, queries)
     assert not axis.lines
     assert not below.collections

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
+from dejavu_torch.types import SequenceModel
 
 
 @torch.no_grad()
@@ -22,7 +23,7 @@ def literal(filter_: PlaceFilter, scores: list[list[float]]) -> list[list[float]
     moves = filter_.move_logits.softmax(0).tolist()
     stay, jump, leave = filter_.rate_logits.softmax(0).tolist()
     enter, sharpness = float(filter_.enter_logit.sigmoid()), float(filter_.log_sharpness.exp())
-    off_share = leave / (leave + enter) if leave + enter else 0.0
+    off_share = min(0.5, leave / (leave + enter))
     belief = [(1 - off_share) / places] * places + [off_share]
     found = []
     for t, row in enumerate(scores):
@@ -178,23 +179,65 @@ def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
     assert torch.allclose(again.score, found.score, rtol=1e-3)
 
 
+@pytest.mark.parametrize("value", [0.1, 0.7, 3.3, 123.456])
+def test_a_dark_frame_says_nothing_whatever_its_score(value: float) -> None:
+    filter_ = PlaceFilter()
+    for places in (300, 1003):
+        start = filter_.posterior(torch.full((1, places), value))[0].detach()
+        assert start[-1] == pytest.approx(0.001 / 0.011, abs=1e-3)
+
+
+@pytest.mark.parametrize("impossible", ["jump", "leave", "enter"])
+def test_gradients_are_finite_where_something_is_impossible(impossible: str) -> None:
+    filter_ = PlaceFilter(**{impossible: 0.0}, sharpness=2.2)  # type: ignore[arg-type]
+    scores = standing_out(400, [0, 150, 300, -1, 20]).requires_grad_()
+    filter_(scores).sum().backward()
+    gradients = [scores.grad, *(one.grad for one in filter_.parameters())]
+    assert all(one is not None and bool(one.isfinite().all()) for one in gradients)
+
+
+def test_who_never_enters_may_have_begun_on_the_map() -> None:
+    shown = [*range(50, 90)]
+    found = PlaceFilter(enter=0)(standing_out(200, shown)).argmin(1)
+    assert torch.equal(found[20:], torch.tensor(shown[20:]))
+
+
+def test_no_graph_grows_from_batch_to_batch() -> None:
+    scores = standing_out(50, [*range(40)])
+    filter_ = PlaceFilter()
+    *_, last = filter_.stream(scores.split(4))
+    through = [
+        torch.autograd.grad(part.sum(), filter_.log_sharpness) for part in (last, filter_(scores)[-4:])
+    ]
+    assert through[0] != through[1]
+    *_, last = PlaceFilter(search_every=10).follow(scores.split(4), Watched(50))
+    assert not last.requires_grad
+
+
 @pytest.mark.parametrize(
     ("make", "told"),
     [
         (lambda: PlaceFilter(moves=()), ["moves are []", "add up to 1"]),
         (lambda: PlaceFilter(moves=(0.5, 0.6)), ["moves are [0.5, 0.6]", "add up to 1"]),
         (lambda: PlaceFilter(moves=(1.5, -0.5)), ["moves are [1.5, -0.5]"]),
-        (lambda: PlaceFilter(moves=(math.nan, 1)), ["moves are [nan, 1]"]),
+        (lambda: PlaceFilter(moves=(math.nan, 1)), ["moves are [nan, 1.0]"]),
         (lambda: PlaceFilter(jump=0.7, leave=0.5), ["jump 0.7, leave 0.5", "at most 1"]),
         (lambda: PlaceFilter(enter=-0.1), ["enter -0.1"]),
         (lambda: PlaceFilter(jump=math.nan), ["jump nan"]),
         (lambda: PlaceFilter(sharpness=0), ["sharpness 0", "above 0"]),
         (lambda: PlaceFilter(off_map=math.inf), ["off_map inf"]),
-        (lambda: PlaceFilter(within=-1), ["within -1"]),
+        (lambda: PlaceFilter(within=-1), ["within is -1", "at least 0"]),
         (lambda: PlaceFilter(search_every=0), ["search_every is 0", "at least 1"]),
         (lambda: PlaceFilter()(torch.rand(4)), ["(4,)", "(Q,N)"]),
         (lambda: PlaceFilter()(torch.zeros(3, 4, dtype=torch.int64)), ["torch.int64", "floats"]),
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.rand(6)), ["posterior (6,)", "(5,)"]),
+        (lambda: PlaceFilter()(torch.rand(2, 4), -torch.ones(5)), ["adds up to -5", "to 1"]),
+        (lambda: PlaceFilter()(torch.rand(2, 4), torch.ones(5)), ["adds up to 5", "to 1"]),
+        (lambda: PlaceFilter()(torch.rand(2, 4), torch.full((5,), math.nan)), ["adds up to nan"]),
+        (lambda: PlaceFilter().predicted(torch.ones(1)), ["posterior (1,)"]),
+        (lambda: PlaceFilter(within=2.5), ["within is 2.5", "whole"]),  # type: ignore[arg-type]
+        (lambda: PlaceFilter(search_every=2.5), ["search_every is 2.5"]),  # type: ignore[arg-type]
+        (lambda: PlaceFilter(threshold=math.nan), ["threshold is NaN"]),
         (lambda: PlaceFilter().check(10, 2), ["up to 2 places on a map of 2"]),
     ],
 )
@@ -243,3 +286,29 @@ def test_who_is_lost_is_searched_for_everywhere() -> None:
     for _ in PlaceFilter(search_every=50).follow([standing_out(200, [-1] * 30)], route):
         pass
     assert route.scored > 0.9 * 30 * 200
+
+
+def test_a_search_that_says_nothing_is_made_again() -> None:
+    """A dark frame just where all places are searched."""
+    shown = [100] * 60
+    scores = standing_out(300, shown)
+    scores[torch.arange(60), torch.tensor(shown)] -= 4
+    scores[20] = 0.7
+    found = torch.cat(list(PlaceFilter(search_every=20).follow([scores], Watched(300)))).argmin(1)
+    assert ((found - 100).abs()[5:] <= 2).all()
+
+
+def test_convention_2_a_place_that_nothing_covers_is_not_reported_by_a_filter() -> None:
+    scores = standing_out(300, [*range(20, 80)])
+    scores[:, 200:220] = math.inf
+    for filter_ in (PlaceFilter(), PlaceFilter(search_every=20)):
+        found = torch.cat(list(filter_.follow(scores.split(7), Watched(300))))
+        assert torch.equal(found.isinf(), scores.isinf())
+
+
+@pytest.mark.parametrize("model", [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3)])
+def test_an_empty_batch_changes_nothing(model: SequenceModel) -> None:
+    scores = standing_out(50, [*range(12)])
+    parts = [scores[:5], scores[:0], scores[5:]]
+    found = torch.cat(list(model.follow(parts, Watched(50))))
+    assert torch.allclose(found, torch.cat(list(model.follow([scores], Watched(50)))), rtol=1e-4)

@@ -123,12 +123,13 @@ def test_a_sequence_longer_than_the_queries_is_told_once(caplog: pytest.LogCaptu
     told = [line for line in caplog.messages if "sequence" in line]
     assert told == ["a sequence of 11 queries, but there are 6: all of them count"]
     SequenceMatcher(11).check(11, 11)
-    with refused("a sequence of 11 queries on a map of 10 places"):
+    with refused("a sequence of 11 queries at 1 places a query on a map of 10 places"):
         SequenceMatcher(11).check(20, 10)
-    with refused("a sequence of 41 queries on a map of 40 places"):
+    with refused("a sequence of 41 queries at 1 places a query on a map of 40 places"):
         model.learn(route(0)[:40]).localize(route(1), sequence=SequenceMatcher(41))
-    with refused("a speed of -10 places a query on a map of 10 places"):
-        SequenceMatcher(3, [1, -10]).check(None, 10)
+    with refused("a sequence of 3 queries at -5 places a query on a map of 10 places"):
+        SequenceMatcher(3, [1, -5]).check(None, 10)
+    SequenceMatcher(11, [0]).check(None, 1)
 
 
 def test_convention_2_a_place_that_nothing_covers_is_not_reported() -> None:
