@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jinja2
 
 from dejavu_torch.data.files import whole_file
-from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct
+from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
 
 PICTURES = (
@@ -95,17 +95,15 @@ def sequence_table(report: Report) -> list[list[str]]:
 
     No rows where single queries are matched.
     """
-    shown = {key: one for key, one in report.shown().items() if one.sequences}
-    lengths = sorted({length for one in shown.values() for length in one.sequences})
+    found = {one.name: sequences_as_json(one.sequences) for one in report.shown().values() if one.sequences}
+    for size in report.facts.get("storage", {}).get("map", ()) if found else ():
+        found[f"the map in {size['route_bytes_per_place']:.3g} route bytes per place"] = size["sequences"]
+    lengths = sorted({int(length) for one in found.values() for length in one})
     rows = [["AUC", *(f"T = {length}" for length in lengths)]]
-    for one in shown.values():
-        areas = (one.sequences.get(length) for length in lengths)
-        rows.append([one.name, *("" if scores is None else f"{scores.auc:.3f}" for scores in areas)])
-    for size in report.facts.get("storage", {}).get("map", ()) if shown else ():
-        found = [size["sequences"][f"{length}"]["auc"] for length in lengths]
-        name = f"the map in {size['route_bytes_per_place']:.3g} route bytes per place"
-        rows.append([name, *(f"{area:.3f}" for area in found)])
-    return rows if shown else []
+    for name, one in found.items():
+        areas = (one.get(f"{length}") for length in lengths)
+        rows.append([name, *("" if scores is None else f"{scores['auc']:.3f}" for scores in areas)])
+    return rows if found else []
 
 
 def is_late(contender: Contender) -> bool:
@@ -246,7 +244,10 @@ def write_report(
         notes=[summary(report)],
         rows=score_table(report),
         sequence_rows=sequence_table(report),
-        sequence_colours=[colour_of(key) for key, one in report.shown().items() if one.sequences],
+        sequence_colours=[
+            *(colour_of(key) for key, one in report.shown().items() if one.sequences),
+            *(colour_of("map") for _ in facts.get("storage", {}).get("map", ())),
+        ],
         every_row=score_table(report, every=True),
         contenders=report.contenders,
         facts=facts,
