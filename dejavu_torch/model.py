@@ -28,6 +28,7 @@ from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import check_queries, feature_batches, features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
+from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import AugmentedTraverse, Views
 from dejavu_torch.features.whitening import Whitening
@@ -50,6 +51,7 @@ MANY_FEATURES = 50_000  # per frame: worth a word
 CLASSES: tuple[type[nn.Module], ...] = (
     Preprocess,
     HOG,
+    PatchPixels,
     SmallCNN,
     Embedding,
     Whitening,

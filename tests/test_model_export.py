@@ -23,6 +23,7 @@ from dejavu_torch import (
     Whitening,
 )
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.types import FrequencyLayer, Plan
 
 BATCHES = (1, 8, 100)
@@ -36,6 +37,7 @@ UNCOVERED = [*range(25, 30), *range(50, 60)]
 BACKBONES: dict[str, Callable[[], nn.Module]] = {
     "HOG": HOG,
     "HOG resized": lambda: HOG(resize=(24, 16), bins="linear", gradient="sobel"),
+    "PatchPixels": lambda: PatchPixels((16, 24)),
     "SmallCNN": lambda: SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4),
     "Embedding": lambda: Embedding(nn.Conv2d(3, 4, 3), dimension=8, resize=(16, 16), grid=2, cell=4),
 }

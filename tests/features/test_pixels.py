@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from helpers import refused
 
+from dejavu_torch import DejaVu, Preprocess, Whitening
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.resize import resize_frames
 
@@ -43,3 +46,12 @@ def test_what_holds_no_patch_is_refused() -> None:
         PatchPixels()(torch.rand(1, 1, 7, 40))
     with refused("patches of 9", "(8, 64)"):
         PatchPixels((8, 64), 9)
+
+
+def test_a_map_file_names_them(tmp_path: Path) -> None:
+    frames = torch.rand(40, 3, 16, 24, generator=torch.Generator().manual_seed(0))
+    model = DejaVu(PatchPixels(), Whitening(views=2), preprocess=Preprocess("grey")).learn(frames)
+    model.save(tmp_path / "map.safetensors")
+    loaded = DejaVu.load(tmp_path / "map.safetensors")
+    assert torch.equal(loaded(frames), model.eval()(frames))
+    assert torch.equal(loaded.localize(frames).index, torch.arange(40))
