@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 import torch
@@ -12,6 +13,9 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError, Traverse
+
+if TYPE_CHECKING:
+    from av.video.codeccontext import VideoCodecContext
 
 DECODERS = {"libx264": "h264", "libx265": "hevc"}
 BATCH = 64
@@ -42,7 +46,7 @@ class CodedVideo(IndexedTraverse):
         scale = min(1.0, longest / max(height, width))
         # even numbers, of which colours take half
         small = tuple(max(8, 2 * round(side * scale / 2)) for side in (height, width))
-        encoder, decoder = av.CodecContext.create(codec, "w"), av.CodecContext.create(DECODERS[codec], "r")
+        encoder, decoder = _context(codec, "w"), _context(DECODERS[codec], "r")
         encoder.height, encoder.width = small
         encoder.pix_fmt, encoder.time_base, encoder.framerate = "yuv420p", Fraction(1, 25), Fraction(25)
         encoder.options = {"crf": str(crf), "preset": "slow", "g": str(WITHOUT_END)}
@@ -64,6 +68,12 @@ class CodedVideo(IndexedTraverse):
 
     def read(self, frames: range) -> Tensor:
         return resize_frames(self.frames.read(frames), self.size)
+
+
+def _context(codec: str, mode: Literal["r", "w"]) -> VideoCodecContext:
+    from av import CodecContext
+
+    return cast("VideoCodecContext", CodecContext.create(codec, mode))
 
 
 def _pixels(batch: Tensor, size: tuple[int, ...]) -> np.ndarray:

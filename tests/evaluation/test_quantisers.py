@@ -89,8 +89,8 @@ def test_a_rotation_helps_where_numbers_go_together() -> None:
 
 def test_codebooks_in_int8_and_descriptors_that_are_padded() -> None:
     pytest.importorskip("faiss")
-    places = route(numbers=13)
-    quantisers = [ProductQuantiser(places, 4, rotated=True, int8=int8) for int8 in (False, True)]
+    places, other = route(numbers=13), normalize(torch.randn(2000, 13), dim=1)
+    quantisers = [ProductQuantiser(other, 4, rotated=True, int8=int8) for int8 in (False, True)]
     assert [quantiser.width for quantiser in quantisers] == [16, 16]
     backs = [quantiser(places) for quantiser in quantisers]
     assert backs[0].shape == places.shape
