@@ -445,7 +445,7 @@ def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float
     }
 
 
-def storage_tables(rows: Sequence[Row], at: float = 3.2) -> Iterator[tuple[str, list[list[str]]]]:
+def storage_tables(rows: Sequence[Row], at: float = 1.6) -> Iterator[tuple[str, list[list[str]]]]:
     """For each route: a heading and rows of text, the best area of each family in so many bytes per place.
 
     A second table has the bytes per place that each family needs for our area at `at` bytes, by T.

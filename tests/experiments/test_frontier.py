@@ -16,6 +16,7 @@ from torch import Tensor
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments import frontier
 from dejavu_torch.experiments.frontier import (
     Contender,
@@ -185,7 +186,7 @@ def test_equal_areas() -> None:
 
 def test_the_tables() -> None:
     rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8)]
-    (title, best), (_, equal) = storage_tables([*rows, Row("case", "none", "none", skipped="absent")])
+    (title, best), (_, equal) = storage_tables([*rows, Row("case", "none", "none", skipped="absent")], at=3.2)
     assert title == "case"
     assert best[1:] == [
         ["dejavu", "0.500", "0.500", "0.750", "0.750", "0.750"],
@@ -218,6 +219,16 @@ def test_rows_are_written_as_they_finish(
     assert min(row.ratio_to_ours or 0 for row in rows if row.family == "dejavu") == 1
     assert (tmp_path / "out" / "bench.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["bench.json", "bench.png"]
+
+
+def test_a_line_for_each_family_and_ours_the_thickest() -> None:
+    fronts = {"dejavu": [(0.5, 0.6), (2.0, 0.9999)], "null": [(1.0, 0.0)], "of a user": [(1.0, 0.5)]}
+    figure, axes = plot_frontiers({"one": fronts, "two": {"dejavu": [(1.0, 0.5)]}})
+    assert [axis.get_title("left") for axis in axes] == ["one", "two"]
+    assert all(axis.get_xscale() == "log" for axis in axes)
+    widths = {line.get_label(): line.get_linewidth() for line in axes[0].lines}
+    assert max(widths, key=lambda name: widths[name]) == "dejavu"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(fronts)
 
 
 def test_a_map_that_is_given_is_set_beside(
