@@ -254,12 +254,12 @@ def plot_frontiers(cases: Mapping[str, Mapping[str, Sequence[tuple[float, float]
             axis.plot(sizes, drawn, marker="o", markersize=5 if ours else 3, label=name, **style)
         axis.set_xscale("log")
         axis.set_xlim(0.25, 700)
-        ticks = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500]
+        ticks = [0.5, 1, 2, 5, 10, 20, 50, 200]
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
         axis.set_yscale("logit")
-        areas = [LOWEST, 0.1, 0.5, 0.9, 0.99, HIGHEST]
-        axis.set_yticks(areas, [f"{area:g}" for area in areas])
+        levels = [LOWEST, 0.1, 0.5, 0.9, 0.99, HIGHEST]
+        axis.set_yticks(levels, [f"{level:g}" for level in levels])
         axis.minorticks_off()
         axis.set(ylim=(0.8 * LOWEST, 1 - 0.8 * (1 - HIGHEST)), ylabel="area under the PR curve")
         axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
