@@ -6,7 +6,7 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -318,16 +318,39 @@ def run_reproduce(
     print(f"right within {tolerance} places; next: open {out / 'index.html'}")
 
 
-def run_bench(what: str = "matcher", *, out: Path) -> None:
-    """Time this package beside what a user would pick instead.
+def run_bench(
+    what: str = "matcher",
+    sources: Sequence[str] = (),
+    *,
+    out: Path,
+    map: Path | None = None,
+    codebooks: str | None = None,
+    places: Sequence[int] = (),
+) -> None:
+    """Set this package beside what a user would pick instead: its speed, or its accuracy over bytes.
 
     Args:
-        what: matcher (HOG, L1 distances, sequences, filters)
+        what: matcher (time of HOG, L1 distances, sequences, filters) or storage (accuracy over bytes)
+        sources: of storage, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
+        map: of storage, a map of the REFERENCE to set beside the others
+        codebooks: of storage, another route, to train codebooks of product quantisers on that count nothing
+        places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench
+    from dejavu_torch.experiments import bench, frontier
 
+    if what == "storage":
+        model = None if map is None else DejaVu.load(map)
+        found = frontier.run_storage(out, sources, places, codebooks, model, progress=True)
+        for title, table in frontier.storage_tables(found):
+            print(*[title] * bool(title), text_table(table), "", sep="\n")
+        for line in frontier.skipped_lines(found):
+            print(line)
+        print(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
+        return
+    if what in bench.BENCHES and (sources or places or map or codebooks):
+        raise InputError(f"bench {what} takes no sources, maps, codebooks or places; bench storage does")
     rows = bench.run_bench(what, out)
     print(text_table(bench.bench_table(rows)))
     if any("No module" in (row.skipped or "") for row in rows):

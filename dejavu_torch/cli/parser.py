@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
@@ -103,7 +103,8 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
 
     Args:
         function: its positional parameters are positional arguments, optional ones where they have a default,
-            its keyword-only ones are options, and `Args:` of its docstring has their help.
+            its keyword-only ones are options, and `Args:` of its docstring has their help. Those annotated
+            `Sequence` take any number of words.
     """
     text = docstring_parser.parse(inspect.getdoc(function) or "")
     helps = {one.arg_name: one.description for one in text.params}
@@ -118,6 +119,8 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
         settings: dict[str, Any] = {"help": helps[key]}
         if parameter.annotation is bool:
             settings["action"] = "store_true"
+        elif get_origin(parameter.annotation) is Sequence:
+            settings |= {"type": get_args(parameter.annotation)[0], "nargs": "*", "default": list(default)}
         else:
             settings["type"] = parameter.annotation
             if default is not parameter.empty:

@@ -218,13 +218,28 @@ def interpolated(descriptors: Tensor, route_bytes: float) -> tuple[Tensor, int, 
     frames, dimension = descriptors.shape
     fair = (k for k in range(1, frames) if (-(-(frames - 1) // k) + 1) * dimension <= route_bytes)
     k = next(fair, max(1, frames - 1))
-    keys = descriptors[torch.arange(0, frames + k - 1, k).clamp(max=frames - 1)]
+    keys = descriptors[keyframes(frames, k)]
+    return between_keyframes(keys, frames, k), k, len(keys)
+
+
+def keyframes(frames: int, k: int) -> Tensor:
+    """Every k-th of so many frames, and the last.
+
+    Example:
+        >>> keyframes(10, 4)
+        tensor([0, 4, 8, 9])
+    """
+    return torch.arange(0, frames + k - 1, k).clamp(max=frames - 1)
+
+
+def between_keyframes(keys: Tensor, frames: int, k: int) -> Tensor:
+    """Descriptors of all frames on straight lines between those of `keyframes`. Shape: (n,K) -> (N,K)."""
     position = torch.arange(frames, device=keys.device)
     low = (position // k).clamp(max=len(keys) - 1)
     high = (low + 1).clamp(max=len(keys) - 1)
     width = ((high * k).clamp(max=frames - 1) - low * k).clamp(min=1)
     share = ((position - low * k) / width)[:, None].to(keys)
-    return torch.lerp(keys[low], keys[high], share), k, len(keys)
+    return torch.lerp(keys[low], keys[high], share)
 
 
 def hog_baselines(

@@ -16,6 +16,18 @@ _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
 LOWEST, HIGHEST = 0.01, 0.999  # areas, where more and less is drawn as this
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
+FAMILIES = {  # of `plot_frontiers`: colour and line
+    "dejavu": (_OURS, "-"),
+    "dejavu, given": ("#00406b", "-"),
+    "null": (COLOURS["null"], ":"),
+    "frames": (COLOURS["stride"], "-"),
+    "interpolated": (COLOURS["interpolated"], "-"),
+    "PCA": ("#10b248", "-"),
+    "binary": ("#785567", "-"),
+    "PQ, codebooks of another route": ("#c21f0a", "-"),
+    "PQ, own codebooks": ("#f28e6b", "--"),
+    "video": (COLOURS["paper"], "-"),
+}
 
 
 class Stored(NamedTuple):
@@ -219,4 +231,40 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
         axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
         axis.set(xlim=(0, 1.15 * max(ratios.values())), ylim=(len(ratios) - 0.6, -0.8), yticks=[])
     axes[-1, 0].set_xlabel("time over that of our fastest; less is better")
+    return figure, axes[:, 0]
+
+
+def plot_frontiers(cases: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]) -> Plot:
+    """The best area of each family of stores over route bytes per place, a panel for each route.
+
+    Convention: areas below `LOWEST` and above `HIGHEST` are drawn as these.
+
+    Args:
+        cases: at least one: case -> family -> bytes per place and area, ascending.
+    """
+    names = list(dict.fromkeys(name for families in cases.values() for name in families))
+    figure, axes = canvas(3.0 * len(cases) + 1.1 * LINE * len(names), len(cases), squeeze=False)
+    for axis, (case, families) in zip(axes[:, 0], cases.items(), strict=True):
+        for name, points in reversed(list(families.items())):  # ours, the first, on top
+            colour, line = FAMILIES.get(name, (GREY, "-"))
+            ours = name.startswith("dejavu")
+            style = {"color": colour, "linestyle": line, "linewidth": 3 if ours else 1.4}
+            sizes, areas = zip(*points, strict=True)
+            drawn = [min(max(area, LOWEST), HIGHEST) for area in areas]
+            axis.plot(sizes, drawn, marker="o", markersize=5 if ours else 3, label=name, **style)
+        axis.set_xscale("log")
+        axis.set_xlim(0.25, 700)
+        ticks = [0.5, 1, 2, 5, 10, 20, 50, 200]
+        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.minorticks_off()
+        axis.set_yscale("logit")
+        levels = [LOWEST, 0.1, 0.5, 0.9, 0.99, HIGHEST]
+        axis.set_yticks(levels, [f"{level:g}" for level in levels])
+        axis.minorticks_off()
+        axis.set(ylim=(0.8 * LOWEST, 1 - 0.8 * (1 - HIGHEST)), ylabel="area under the PR curve")
+        axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
+        axis.grid(alpha=0.25)
+    axes[-1, 0].set_xlabel("route bytes per place")
+    lines = {text: h for a in axes[:, 0] for h, text in zip(*a.get_legend_handles_labels(), strict=True)}
+    figure.legend([lines[name] for name in names], names, loc="outside lower left", frameon=False, fontsize=9)
     return figure, axes[:, 0]

@@ -111,7 +111,7 @@ def compare(
     reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
     check_candidates(top, tolerance)
-    features = _check_sizes(model, reference, query)
+    features = check_sizes(model, reference, query)
     seconds: dict[str, float] = defaultdict(float)
     has_map = model.map.places > 0
     work = "describe" if has_map else "learn"
@@ -205,7 +205,7 @@ def _check_arguments(
         check_ground_truth(truth, interpolate)
 
 
-def _check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
+def check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
     """How many features a frame gives; refuse, before the long work, traverses that do not give as many."""
     counts = [next(feature_batches(traverse, model.pipeline, 1)).shape[1] for traverse in (reference, query)]
     if counts[0] != counts[1]:

@@ -1,0 +1,484 @@
+"""Accuracy over bytes: the map beside what else would keep the same descriptors (`dejavu bench storage`)."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import dejavu_torch
+from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
+from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.baselines import as_int8, every, nearest_frames
+from dejavu_torch.evaluation.coded_video import CodedVideo
+from dejavu_torch.evaluation.contenders import evaluate_each, sequences_as_json
+from dejavu_torch.evaluation.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
+from dejavu_torch.evaluation.score_plots import plot_frontiers
+from dejavu_torch.experiments.compare import check_sizes
+from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.resampling import ground_truth_of
+from dejavu_torch.recognition.matching import LENGTHS, Found, Matching, lengths_beside
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import GroundTruth, InputError, Traverse
+
+BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
+SHOWN = (1.0, 1.6, 3.2, 5.0, 10.0)  # of the table
+NEAR = 1.02  # a budget is met by what takes at most so much of it
+SPACED = (1, 2, 3, 4, 5, 8, 10)  # k of every k-th frame as it is
+BETWEEN = (8, 10, 16, 25, 40, 64, 100)  # and with straight lines between
+COMPONENTS = (1, 2, 3, 5, 8, 10, 16)
+CODE_BYTES, CODE_SPACED = (4, 8, 16, 32), (2, 3, 4, 5, 8)
+BIT_SPACED = (1, 2, 4, 5, 8, 16)
+QUALITIES = (24, 32, 40, 51)  # crf
+BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames, 0 the whole route
+TOLERANCE = 5
+OURS, NULL = "dejavu", "null"
+
+
+class Row(NamedTuple):
+    """What one contender is recognised at on one route, and what it takes; None where it is not known.
+
+    family: of contenders that make one front. seconds: to store the route and match all queries.
+    ratio_to_ours: seconds over those of our fastest. bytes: of all, with the whitening; those that do not
+    grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
+    together. skipped: why there are no figures.
+    """
+
+    case: str
+    contender: str
+    family: str
+    seconds: float | None = None
+    peak_bytes: int | None = None
+    bytes: int | None = None
+    fixed_bytes: int | None = None
+    route_bytes: int | None = None
+    route_bytes_per_place: float | None = None
+    recall_at_1: float | None = None
+    auc: float | None = None
+    sequences: Mapping[str, Mapping[str, float]] | None = None
+    ratio_to_ours: float | None = None
+    skipped: str | None = None
+
+    def auc_of(self, length: int) -> float | None:
+        """The area of sequences of T queries."""
+        return (self.sequences or {}).get(str(length), {}).get("auc")
+
+
+class Route(NamedTuple):
+    """A route described: places (N,K) and queries (Q,K), whitened alike.
+
+    reference: the frames of the places. fixed: bytes of the whitening, which every contender needs.
+    """
+
+    name: str
+    model: DejaVu
+    reference: Traverse
+    query: Traverse
+    places: Tensor
+    queries: Tensor
+    truth: GroundTruth
+    fixed: int
+
+
+class Contender(NamedTuple):
+    """A way to store a route's descriptors. keep: stores them; what it raises says why it cannot."""
+
+    name: str
+    family: str
+    keep: Callable[[], Kept]
+
+
+def bench_storage(
+    sources: Sequence[str] = (),
+    places: Sequence[int] = (),
+    codebooks: str | None = None,
+    given: DejaVu | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Iterator[Row]:
+    """Accuracy over bytes of all contenders on all routes, a row at a time.
+
+    Args:
+        sources: REFERENCE QUERY, any number of pairs; none are the built-in routes.
+        places: frames of `sim:aerial`, in place of 3072 and 10000.
+        codebooks: another route of frames of the same size, on which codebooks of product quantisers are
+            trained that then count nothing. The built-in routes have seed 1 of the same simulator.
+        given: a model with a map of the one pair's reference, set beside the others.
+        seed: of the whitening and the null. progress: show progress bars on a terminal.
+
+    Raises:
+        InputError: sources that are no pairs or do not fit each other, and what the sources raise.
+    """
+    for name, reference, query, other in _routes(sources, places, codebooks, given):
+        route = described(name, reference, query, seed, progress)
+        contenders = list(contenders_of(route, other, seed))
+        for contender in tqdm(contenders, name, disable=None if progress else True, leave=False):
+            yield judged(route, contender)
+        if given is not None:
+            yield _judged_map(route, given)
+
+
+def _routes(
+    sources: Sequence[str], places: Sequence[int], codebooks: str | None, given: DejaVu | None
+) -> list[tuple[str, Traverse, Traverse, Traverse | None]]:
+    """Name, reference, query and the route of the free codebooks of each route; all refused early."""
+    if len(sources) % 2:
+        raise InputError(f"bench storage got {len(sources)} sources; expected pairs, REFERENCE QUERY ...")
+    if given is not None and len(sources) != 2:
+        raise InputError(f"a map is of one route, and there are {len(sources)} sources; expected one pair")
+    if sources and places:
+        raise InputError("--places are of the built-in sim:aerial; expected none beside sources")
+    if places and min(places) < 2:
+        raise InputError(f"--places {' '.join(map(str, places))}; expected at least 2 each")
+    if sources:
+        other = None if codebooks is None else open_source(codebooks)
+        pairs = zip(sources[::2], sources[1::2], strict=True)
+        return [(_name(a, b), open_source(a), open_source(b), other) for a, b in pairs]
+    if codebooks is not None:
+        raise InputError("--codebooks are of pairs of sources; the built-in routes have seed 1 of their own")
+    found = []
+    for kind, sizes in (BUILT_IN | ({"aerial": tuple(places)} if places else {})).items():
+        for size in sizes:
+            address = f"sim:{kind}?" + (f"frames={size}&" if size else "")
+            own = [open_source(f"{address}seed={s}&traverse={t}") for s, t in ((0, 0), (0, 1), (1, 0))]
+            found.append((f"sim:{kind}, {own[0].length} places", *own))
+    return found  # type: ignore[return-value]  # mypy sees no triple
+
+
+def _name(reference: str, query: str) -> str:
+    return f"{reference} and {query}"
+
+
+def described(
+    name: str, reference: Traverse, query: Traverse, seed: int = 0, progress: bool = False
+) -> Route:
+    """A route's whitened descriptors, as `DejaVu` with its defaults makes them.
+
+    Raises:
+        InputError: frames that differ in size, or nothing that says which places are right.
+    """
+    model = DejaVu()
+    assert model.whitening is not None  # of the defaults
+    model.whitening.seed = seed
+    check_sizes(model, reference, query)
+    places = model.describe_reference(reference, None, "describing" if progress else None)
+    queries = model.extract_all(query, "describing the query" if progress else None)
+    truth = ground_truth_of(None, reference, query, len(places), len(queries))
+    if truth is None:
+        raise InputError(
+            f"{reference.name} has {len(places)} frames and {query.name} {len(queries)}; expected as many, "
+            "frame i being place i"
+        )
+    fixed = sum(buffer.nbytes for buffer in model.whitening.buffers())
+    return Route(name, model, reference, query, places.float(), queries.float(), truth, fixed)
+
+
+def contenders_of(route: Route, other: Traverse | None, seed: int = 0) -> Iterator[Contender]:
+    """All that is set side by side on a route, ours first.
+
+    Args:
+        other: the route of the free codebooks; None leaves them out, and says so.
+    """
+    places, numbers = route.places, route.places.shape[1]
+    for budget in BUDGETS:
+        yield Contender(f"dejavu {budget:g}", OURS, partial(spectral, places, budget))
+    for budget in BUDGETS:
+        yield Contender(f"null {budget:g}", NULL, partial(spectral, places, budget, seed))
+    for k in SPACED:
+        name = "whole database" if k == 1 else every(k, "frame")
+        yield Contender(f"{name}, float", "frames", partial(every_kth, places, k, 4 * numbers))
+        yield Contender(f"{name}, int8", "frames", partial(every_kth, places, k, numbers, as_int8))
+    for k in BETWEEN:
+        keep = partial(every_kth, places, k, numbers, as_int8, between=True)
+        yield Contender(f"{every(k, 'frame')}, int8, interpolated", "interpolated", keep)
+    for count in COMPONENTS:
+        yield Contender(f"PCA, {count} numbers, int8", "PCA", partial(principal, places, count))
+    for k in BIT_SPACED:
+        keep = partial(every_kth, places, k, -(-numbers // 8), signs)
+        yield Contender(f"signs of {every(k, 'frame')}", "binary", keep)
+    yield from _product_quantisers(route, other)
+    for codec in ("libx264", "libx265"):
+        for crf in QUALITIES:
+            yield Contender(f"{codec[3:]}, crf {crf}", "video", partial(_video, route, codec, crf))
+
+
+def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Contender]:
+    """PQ and OPQ, by codebooks of another route, which count nothing, and by the route's own, which do."""
+
+    @cache
+    def elsewhere() -> Tensor:
+        if other is None:
+            raise InputError("no other route to train codebooks on; expected --codebooks SOURCE")
+        check_sizes(route.model, route.reference, other)
+        return route.model.extract_all(other).float()
+
+    @cache  # one training for all strides
+    def quantiser(m: int, rotated: bool, own: bool) -> ProductQuantiser:
+        return ProductQuantiser(route.places if own else elsewhere(), m, rotated, int8=own)
+
+    def keep(k: int, m: int, rotated: bool, own: bool, between: bool) -> Kept:
+        code = quantiser(m, rotated, own)
+        return every_kth(route.places, k, m, code, between, code.bytes if own else 0)
+
+    for own, rotated, m in ((o, r, m) for o in (False, True) for r in (False, True) for m in CODE_BYTES):
+        family = "PQ, own codebooks" if own else "PQ, codebooks of another route"
+        for k, between in ((k, b) for k in CODE_SPACED for b in (False, True)):
+            name = f"{'O' * rotated}PQ, {m} bytes of {every(k, 'frame')}"
+            name += f"{', interpolated' * between}{', own codebooks' * own}"
+            yield Contender(name, family, partial(keep, k, m, rotated, own, between))
+
+
+def _video(route: Route, codec: str, crf: int) -> Kept:
+    coded = CodedVideo(route.reference, codec, crf)
+    return Kept(route.model.extract_all(coded).float(), coded.bytes)
+
+
+def judged(route: Route, contender: Contender) -> Row:
+    """Store a route, match all queries, and score them."""
+    row = Row(route.name, contender.name, contender.family)
+    began = time.perf_counter()
+    try:
+        kept = contender.keep()
+    except InputError as error:
+        return row._replace(skipped=str(error))
+    except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
+        return row._replace(skipped=f"{type(error).__name__}: {' '.join(str(error).split())}"[:200])
+    matching = _matching(len(route.places), len(route.queries))
+    found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", matching=matching)
+    seconds = time.perf_counter() - began
+    return _scored(row, route, found, seconds, kept.route, kept.fixed + route.fixed)
+
+
+def _matching(places: int, queries: int) -> Matching:
+    """Single queries, and beside them sequences of each T that there is room for."""
+    longest = max(length for length in LENGTHS if length <= places)
+    sequence = SequenceMatcher(longest)
+    return Matching(sequence, lengths_beside(sequence, queries, places))
+
+
+def _scored(row: Row, route: Route, found: Found, seconds: float, size: int, fixed: int) -> Row:
+    scores = evaluate_each(found.sequences, route.truth, TOLERANCE)
+    return row._replace(
+        seconds=seconds,
+        bytes=size + fixed,
+        fixed_bytes=fixed,
+        route_bytes=size,
+        route_bytes_per_place=size / len(route.places),
+        recall_at_1=scores[1].recall_at_1,
+        auc=scores[1].auc,
+        sequences=sequences_as_json(scores),
+    )
+
+
+def _judged_map(route: Route, model: DejaVu) -> Row:
+    """A map that was given, on descriptors of its own."""
+    if model.map.places != len(route.places):
+        raise InputError(
+            f"the map holds {model.map.places} places and {route.reference.name} {len(route.places)}; "
+            "expected the reference that it was made of"
+        )
+    began = time.perf_counter()
+    found = model.found(model.extract_all(route.query), _matching(len(route.places), len(route.queries)))
+    summary, seconds = model.summary(), time.perf_counter() - began
+    row = Row(route.name, "dejavu, the map that was given", "dejavu, given")
+    moved = found.moved(model.map.scored)
+    return _scored(row, route, moved, seconds, summary.route_bytes, summary.fixed_bytes)
+
+
+class Point(NamedTuple):
+    """An area that is reached with so many route bytes per place."""
+
+    size: float
+    auc: float
+
+
+def front(rows: Sequence[Row], length: int = 1) -> list[Point]:
+    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries.
+
+    Example:
+        >>> sizes = {2.0: 0.7, 1.0: 0.5, 4.0: 0.6}
+        >>> rows = [Row("", "", "", route_bytes_per_place=size, sequences={"1": {"auc": auc}})
+        ...         for size, auc in sizes.items()]
+        >>> [tuple(point) for point in front(rows)]
+        [(1.0, 0.5), (2.0, 0.7)]
+    """
+    best: list[Point] = []
+    points = (Point(row.route_bytes_per_place or 0, row.auc_of(length) or 0) for row in rows if _ran(row))
+    for point in sorted(points, key=lambda point: (point.size, -point.auc)):
+        if not best or point.auc > best[-1].auc:
+            best.append(point)
+    return best
+
+
+def bytes_for(auc: float, points: Sequence[Point]) -> float | None:
+    """Bytes per place at which a front reaches an area, on straight lines over the logarithm of bytes.
+
+    None where it never does. Where its smallest point does, that point's, which it may need less than.
+
+    Example:
+        >>> bytes_for(0.6, [Point(1.0, 0.5), Point(4.0, 0.7)])
+        2.0
+    """
+    for i, after in enumerate(points):
+        if after.auc >= auc:
+            if i == 0 or after.size <= 0:
+                return after.size
+            before = points[i - 1]
+            share = (auc - before.auc) / (after.auc - before.auc)
+            return math.exp((1 - share) * math.log(before.size) + share * math.log(after.size))
+    return None
+
+
+def _ran(row: Row) -> bool:
+    return row.skipped is None
+
+
+def _families(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if _ran(row):
+            found.setdefault(row.family, []).append(row)
+    return found
+
+
+def _cases(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row.case, []).append(row)
+    return found
+
+
+def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """For each of our rows and T, the bytes per place that each family needs for the same area.
+
+    Returns:
+        Entries of bench.json: case, T, auc and route_bytes_per_place of ours, `bytes_per_place` by family,
+        None where it never gets there, and `null_over_ours`.
+    """
+    found = []
+    for case, own in _cases(rows).items():
+        families = _families(own)
+        for length in LENGTHS:
+            fronts = {name: front(some, length) for name, some in families.items() if name != OURS}
+            for row in families.get(OURS, ()):
+                auc, size = row.auc_of(length), row.route_bytes_per_place
+                if auc is None or size is None:
+                    continue
+                needed = {name: bytes_for(auc, points) for name, points in fronts.items()}
+                null = needed.get(NULL)
+                found.append(
+                    {
+                        "case": case,
+                        "T": length,
+                        "auc": auc,
+                        "route_bytes_per_place": size,
+                        "bytes_per_place": needed,
+                        "null_over_ours": None if null is None else null / size,
+                    }
+                )
+    return found
+
+
+def run_storage(
+    out: Path,
+    sources: Sequence[str] = (),
+    places: Sequence[int] = (),
+    codebooks: str | None = None,
+    given: DejaVu | None = None,
+    progress: bool = False,
+) -> list[Row]:
+    """`bench_storage`, written into a folder as rows are finished: bench.json, and bench.png at the end.
+
+    Raises:
+        InputError: as `bench_storage`, or a folder that cannot be made or written in.
+    """
+    check_output_folder(out)
+    rows: list[Row] = []
+    for row in bench_storage(sources, places, codebooks, given, progress=progress):
+        if not rows:
+            make_output_folder(out)  # what fails before leaves none
+        rows = _with_ratios([*rows, row])
+        write_rows(out, rows)
+    figure, _ = plot_frontiers(pictured(rows))
+    with whole_file(out / "bench.png") as temporary:
+        figure.savefig(temporary)
+    return rows
+
+
+def _with_ratios(rows: Sequence[Row]) -> list[Row]:
+    fastest = {
+        case: min((row.seconds for row in own if row.family == OURS and row.seconds), default=None)
+        for case, own in _cases(rows).items()
+    }
+    return [
+        row._replace(ratio_to_ours=row.seconds / ours) if row.seconds and (ours := fastest[row.case]) else row
+        for row in rows
+    ]
+
+
+def write_rows(folder: Path, rows: Sequence[Row]) -> None:
+    """Write bench.json into a folder that exists, whole or not at all."""
+    facts = {
+        "rows": [row._asdict() for row in rows],
+        "equal_auc": equal_areas(rows),
+        "tolerance": TOLERANCE,
+        "threads": torch.get_num_threads(),
+        "version": dejavu_torch.__version__,
+    }
+    with whole_file(folder / "bench.json") as temporary:
+        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float]]]]:
+    """The front of each family on each route, as `plot_frontiers` takes them."""
+    return {
+        case: {name: [(p.size, p.auc) for p in front(some)] for name, some in _families(own).items()}
+        for case, own in _cases(rows).items()
+    }
+
+
+def storage_tables(rows: Sequence[Row], at: float = 1.6) -> Iterator[tuple[str, list[list[str]]]]:
+    """For each route: a heading and rows of text, the best area of each family in so many bytes per place.
+
+    A second table has the bytes per place that each family needs for our area at `at` bytes, by T.
+    """
+    equal = equal_areas(rows)
+    for case, own in _cases(rows).items():
+        families = _families(own)
+        table = [["AUC, route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
+        for name, some in families.items():
+            fits = ([r.auc or 0 for r in some if (r.route_bytes_per_place or 0) <= NEAR * b] for b in SHOWN)
+            table.append([name, *(f"{max(areas):.3f}" if areas else "" for areas in fits)])
+        yield case, table
+        near = [one for one in equal if one["case"] == case and one["route_bytes_per_place"] <= NEAR * at]
+        chosen = {
+            length: max(mine, key=lambda one: float(one["route_bytes_per_place"]))
+            for length in LENGTHS
+            if (mine := [one for one in near if one["T"] == length])
+        }
+        if chosen:
+            table = [["bytes per place for our AUC:", *(f"T = {length}" for length in chosen)]]
+            table.append([OURS, *(f"{one['route_bytes_per_place']:.2f}" for one in chosen.values())])
+            for name in families:
+                if name != OURS:
+                    sizes = (one["bytes_per_place"][name] for one in chosen.values())
+                    table.append([name, *("never" if size is None else f"{size:.2f}" for size in sizes)])
+            yield "", table
+
+
+def skipped_lines(rows: Sequence[Row]) -> list[str]:
+    """Why rows were skipped, one line for each reason."""
+    reasons: dict[tuple[str, str], int] = {}
+    for row in rows:
+        if row.skipped:
+            key = row.case, row.skipped
+            reasons[key] = reasons.get(key, 0) + 1
+    return [f"{case}: {count} skipped: {reason}" for (case, reason), count in reasons.items()]

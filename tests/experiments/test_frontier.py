@@ -1,0 +1,305 @@
+"""`dejavu bench storage`: which contenders, what is scored, what is written, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, run
+from helpers import refused
+from torch import Tensor
+
+from dejavu_torch import DejaVu
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.evaluation.score_plots import plot_frontiers
+from dejavu_torch.experiments import frontier
+from dejavu_torch.experiments.frontier import (
+    Contender,
+    Point,
+    Row,
+    bench_storage,
+    bytes_for,
+    contenders_of,
+    described,
+    equal_areas,
+    front,
+    judged,
+    run_storage,
+    skipped_lines,
+    storage_tables,
+)
+
+PLACES, NUMBERS = 300, 24
+
+
+def series(seed: int) -> Tensor:
+    """Smooth numbers, the same for all seeds, and noise of this one."""
+    profile, noise = (torch.Generator().manual_seed(one) for one in (7, seed))
+    walk = torch.randn(PLACES, NUMBERS, generator=profile).cumsum(0)
+    return walk + torch.randn(PLACES, NUMBERS, generator=noise)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    folder = tmp_path_factory.mktemp("pair")
+    for name, seed in (("a", 0), ("b", 1)):
+        np.save(folder / f"{name}.npy", series(seed).numpy())
+    return str(folder / "a.npy"), str(folder / "b.npy")
+
+
+@pytest.fixture(scope="module")
+def rows(pair: tuple[str, str]) -> list[Row]:
+    return list(bench_storage(pair))
+
+
+def test_all_families_are_there(rows: list[Row]) -> None:
+    pytest.importorskip("faiss")
+    ran = {row.family for row in rows if row.skipped is None}
+    assert ran == {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
+    assert [row.contender for row in rows[:2]] == ["dejavu 0.5", "dejavu 1"]
+    assert all("PQ" in row.contender for row in rows if "PQ" in row.family)
+    assert len({row.contender for row in rows}) == len(rows)
+
+
+def test_what_is_skipped_says_why(rows: list[Row]) -> None:
+    pytest.importorskip("faiss")
+    free = [row for row in rows if row.family == "PQ, codebooks of another route"]
+    assert {row.skipped for row in free} == {
+        "no other route to train codebooks on; expected --codebooks SOURCE"
+    }
+    assert free[0].auc is free[0].bytes is None
+    video = [row.skipped or "" for row in rows if row.family == "video"]
+    assert video
+    assert all("ready features" in reason for reason in video)
+    assert any("--codebooks" in line for line in skipped_lines(rows))
+
+
+def test_all_bytes_are_counted_fixed_and_growing_apart(rows: list[Row]) -> None:
+    found = {row.contender: row for row in rows}
+    whole, ours = found["whole database, float"], found["dejavu 5"]
+    columns = NUMBERS + 1  # ready features: a constant number behind them
+    assert whole.route_bytes == PLACES * columns * 4
+    assert whole.fixed_bytes == ours.fixed_bytes
+    assert whole.fixed_bytes is not None
+    assert whole.fixed_bytes >= NUMBERS * NUMBERS  # the whitening
+    assert whole.bytes == whole.route_bytes + whole.fixed_bytes
+    assert ours.route_bytes_per_place == pytest.approx(5, rel=0.02)
+    pca = found["PCA, 3 numbers, int8"]
+    assert (pca.route_bytes, pca.fixed_bytes) > (3 * PLACES - 1, whole.fixed_bytes)
+    assert found["signs of every frame"].route_bytes == PLACES * 4  # of 25 bits
+
+
+def test_codebooks_count_where_they_are_of_the_route(pair: tuple[str, str], rows: list[Row]) -> None:
+    pytest.importorskip("faiss")
+    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
+    free = {one.name: one for one in contenders_of(route, ArrayTraverse(series(5)))}
+    row = judged(route, free["PQ, 4 bytes of every 3rd frame"])
+    assert (row.route_bytes, row.skipped) == (100 * 4, None)
+    own = {row.contender: row for row in rows}["PQ, 4 bytes of every 3rd frame, own codebooks"]
+    assert own.route_bytes == 100 * 4 + 256 * 28  # 25 numbers, padded
+    own = {row.contender: row for row in rows}["OPQ, 4 bytes of every 3rd frame, own codebooks"]
+    assert own.route_bytes == 100 * 4 + 256 * 28 + 28 * 28
+
+
+def test_more_bytes_recognise_more_and_the_whole_database_most(rows: list[Row]) -> None:
+    found = {row.contender: row for row in rows}
+    areas = [found[name].auc or 0 for name in ("dejavu 0.5", "dejavu 2.5", "whole database, float")]
+    assert areas == sorted(areas)
+    assert areas[0] < areas[-1]
+    assert found["dejavu 1"].auc > found["null 1"].auc  # type: ignore[operator]
+    row = found["dejavu 1"]
+    assert row.sequences is not None
+    assert list(row.sequences) == ["1", "5", "11", "21"]
+    assert row.sequences["1"] == {"auc": row.auc, "recall_at_1": row.recall_at_1}
+
+
+def test_the_map_is_scored_as_compare_scores_it(rows: list[Row]) -> None:
+    model = DejaVu(mapper=SpectralMapper(1.0)).learn(series(0))
+    right = (model.localize(series(1)).index - torch.arange(PLACES)).abs() <= 5
+    found = {row.contender: row for row in rows}["dejavu 1"]
+    assert found.recall_at_1 == pytest.approx(float(right.float().mean()), abs=0.01)
+
+
+def test_a_budget_below_the_least_and_too_few_places_are_rows() -> None:
+    pytest.importorskip("faiss")
+    route = described("short", *(ArrayTraverse(series(seed)[:40]) for seed in (0, 1)))
+    rows = [judged(route, one) for one in contenders_of(route, None)]
+    found = {row.contender: row.skipped or "" for row in rows}
+    assert "route_bytes_per_place is 0.5; expected more than" in found["dejavu 0.5"]
+    assert "40 places" in found["PQ, 4 bytes of every 2nd frame, own codebooks"]
+
+
+def test_without_faiss_its_rows_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
+    quantisers = [one for one in contenders_of(route, None) if one.family == "PQ, own codebooks"]
+    skipped = judged(route, quantisers[0]).skipped
+    assert skipped is not None
+    assert "faiss" in skipped
+
+
+def test_a_codec_that_is_not_there_is_a_row() -> None:
+    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
+
+    def missing() -> None:
+        import av
+
+        av.CodecContext.create("libx999", "w")
+
+    row = judged(route, Contender("x999", "video", missing))  # type: ignore[arg-type]
+    assert row.skipped is not None
+    assert "libx999" in row.skipped
+
+
+def of(size: float, auc: float, family: str = "other") -> Row:
+    sequences = {"1": {"auc": auc, "recall_at_1": auc}}
+    return Row(
+        "case", f"{family} {size}", family, 1.0, auc=auc, route_bytes_per_place=size, sequences=sequences
+    )
+
+
+def test_a_front_is_what_nothing_smaller_reaches() -> None:
+    points = front([of(4, 0.6), of(1, 0.2), of(2, 0.6), of(3, 0.5), of(8, 0.9), of(2, 0.4)])
+    assert [tuple(point) for point in points] == [(1, 0.2), (2, 0.6), (8, 0.9)]
+
+
+def test_bytes_for_an_area() -> None:
+    points = [Point(1, 0.2), Point(2, 0.6), Point(8, 0.9)]
+    assert bytes_for(0.6, points) == pytest.approx(2)
+    assert bytes_for(0.75, points) == pytest.approx(4)
+    assert bytes_for(0.1, points) == 1
+    assert bytes_for(0.95, points) is None
+    assert bytes_for(0.5, []) is None
+
+
+def test_equal_areas() -> None:
+    (entry,) = equal_areas([of(1, 0.75, "dejavu"), of(2, 0.6, "null"), of(8, 0.9, "null"), of(3, 0.7)])
+    assert (entry["T"], entry["auc"], entry["route_bytes_per_place"]) == (1, 0.75, 1)
+    assert entry["bytes_per_place"] == {"null": pytest.approx(4), "other": None}
+    assert entry["null_over_ours"] == pytest.approx(4)
+
+
+def test_the_tables() -> None:
+    rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8)]
+    (title, best), (_, equal) = storage_tables([*rows, Row("case", "none", "none", skipped="absent")], at=3.2)
+    assert title == "case"
+    assert best[1:] == [
+        ["dejavu", "0.500", "0.500", "0.750", "0.750", "0.750"],
+        ["other", "0.400", "0.400", "0.400", "0.400", "0.800"],
+    ]
+    assert [row[1] for row in equal] == ["T = 1", "3.20", f"{bytes_for(0.75, front(rows[2:])):.2f}"]
+    assert skipped_lines([Row("case", "none", "none", skipped="absent")]) == ["case: 1 skipped: absent"]
+
+
+def test_rows_are_written_as_they_finish(
+    pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("dejavu 5", "dejavu 10", "null 5")
+    seen, out = [], tmp_path / "out"
+
+    def some(*arguments: object) -> list[Contender]:
+        return [one for one in contenders_of(*arguments) if one.name in names]  # type: ignore[arg-type]
+
+    def watched(*arguments: object) -> Row:
+        seen.append(len(json.loads((out / "bench.json").read_text())["rows"]) if out.exists() else 0)
+        return judged(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(frontier, "contenders_of", some)
+    monkeypatch.setattr(frontier, "judged", watched)
+    rows = run_storage(out, pair)
+    assert seen == [0, 1, 2]
+    written = json.loads((tmp_path / "out" / "bench.json").read_text())
+    assert [Row(**row) for row in written["rows"]] == rows
+    assert {entry["T"] for entry in written["equal_auc"]} == {1, 5, 11, 21}
+    assert min(row.ratio_to_ours or 0 for row in rows if row.family == "dejavu") == 1
+    assert (tmp_path / "out" / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["bench.json", "bench.png"]
+
+
+def test_a_line_for_each_family_and_ours_the_thickest() -> None:
+    fronts = {"dejavu": [(0.5, 0.6), (2.0, 0.9999)], "null": [(1.0, 0.0)], "of a user": [(1.0, 0.5)]}
+    figure, axes = plot_frontiers({"one": fronts, "two": {"dejavu": [(1.0, 0.5)]}})
+    assert [axis.get_title("left") for axis in axes] == ["one", "two"]
+    assert all(axis.get_xscale() == "log" for axis in axes)
+    widths = {line.get_label(): line.get_linewidth() for line in axes[0].lines}
+    assert max(widths, key=lambda name: widths[name]) == "dejavu"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(fronts)
+
+
+def test_a_map_that_is_given_is_set_beside(
+    pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("learn", pair[0], "--map", tmp_path / "map.safetensors")
+    few = (1.0, 5.0)
+    for name in ("SPACED", "BETWEEN", "COMPONENTS", "CODE_BYTES", "BIT_SPACED", "QUALITIES"):
+        monkeypatch.setattr(frontier, name, ())
+    monkeypatch.setattr(frontier, "BUDGETS", few)
+    run("bench", "storage", *pair, "--map", tmp_path / "map.safetensors", "--out", tmp_path / "out")
+    written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    found = {row["contender"]: row for row in written}
+    given, ours = found["dejavu, the map that was given"], found["dejavu 5"]
+    assert given["auc"] == pytest.approx(ours["auc"], abs=0.02)
+    assert given["route_bytes"] == pytest.approx(ours["route_bytes"], rel=0.03)
+    assert "null" in capsys.readouterr().out
+    np.save(tmp_path / "short.npy", series(0)[:200].numpy())
+    words = (tmp_path / "short.npy", tmp_path / "short.npy", "--map", tmp_path / "map.safetensors")
+    assert "300 places" in fails(capsys, "bench", "storage", *words, "--out", tmp_path / "out")
+
+
+def test_built_in_routes() -> None:
+    names = [name for name, *_ in frontier._routes((), (64, 300), None, None)]
+    assert names[:2] == ["sim:aerial, 64 places", "sim:aerial, 300 places"]
+    assert [name.partition(",")[0] for name in names[2:]] == ["sim:outdoor", "sim:underground"]
+    *_, reference, query, other = frontier._routes((), (64,), None, None)[0]
+    assert "seed=0&traverse=0" in reference.name
+    assert "seed=0&traverse=1" in query.name
+    assert other is not None
+    assert "seed=1" in other.name
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["A"], ["1 sources", "pairs"]),
+        (["A", "B", "--places", "64", "300"], ["--places", "sim:aerial"]),
+        (["--places", "1"], ["--places 1", "at least 2"]),
+        (["--codebooks", "A"], ["--codebooks", "pairs"]),
+        (["A", "nowhere"], ["nowhere", "expected"]),
+        (["A", "SHORT"], ["300 frames", "200", "as many"]),
+        (["A", "NARROW"], ["24 features", "9"]),
+    ],
+)
+def test_what_is_refused(
+    words: list[str],
+    named: list[str],
+    pair: tuple[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    np.save(tmp_path / "short.npy", series(1)[:200].numpy())
+    np.save(tmp_path / "narrow.npy", series(1)[:, :9].numpy())
+    known = {
+        "A": pair[0],
+        "B": pair[1],
+        "SHORT": str(tmp_path / "short.npy"),
+        "NARROW": str(tmp_path / "narrow.npy"),
+    }
+    chosen = [known.get(word, word) for word in words]
+    error = fails(capsys, "bench", "storage", *chosen, "--out", tmp_path / "out")
+    assert [word for word in named if word not in error] == [], error
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_matcher_takes_no_sources(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = fails(capsys, "bench", "matcher", "sim:aerial", "--out", tmp_path / "out")
+    assert "storage" in error
+
+
+def test_a_map_is_of_one_route() -> None:
+    with refused("0 sources", "one pair"):
+        list(bench_storage(given=DejaVu()))
