@@ -358,10 +358,8 @@ class DejaVu(nn.Module):
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
-        if sequence is not None:
-            sequence.check(as_traverse(queries).length, self.map.places)
         threshold = self.threshold_of(sequence)
-        for part in self._found(self._checked(queries, progress), Matching(sequence)):
+        for part in self._found(self._checked(queries, progress, sequence), Matching(sequence)):
             yield part.match(threshold)
 
     def candidates(
@@ -402,15 +400,17 @@ class DejaVu(nn.Module):
         """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
         check_candidates(k, apart, self.map.places)
-        if sequence is not None:
-            sequence.check(as_traverse(queries).length, self.map.places)
         matching = Matching(sequence, ranks=k, apart=apart)
-        for part in self._found(self._checked(queries, progress), matching):
+        for part in self._found(self._checked(queries, progress, sequence), matching):
             yield part.candidates
 
-    def _checked(self, queries: Traverse | Tensor, progress: str | None) -> Iterator[Tensor]:
+    def _checked(
+        self, queries: Traverse | Tensor, progress: str | None, sequence: SequenceModel | None
+    ) -> Iterator[Tensor]:
         """Descriptors of queries that fit the map, in batches; resampled as the map's places are."""
         queries = as_traverse(queries)
+        if sequence is not None:
+            sequence.check(queries.length, self.map.places)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress is not None)
         shape = queries.frame_shape

@@ -97,9 +97,9 @@ class LayerSums:
 
 
 def _near_cuts(segments: Sequence[Segment], reach: int) -> Iterator[Segment]:
-    """The places up to so far from a cut.
+    """The stretches of places within `reach` of a cut, in order.
 
-    Put side by side, they are neighbours wherever a trajectory from less far runs: those in between are here.
+    A trajectory of a place near a cut does not leave them, so that they can be matched side by side.
     """
     for segment in segments:
         start, stop, _ = segment

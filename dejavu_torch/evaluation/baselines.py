@@ -85,7 +85,9 @@ def nearest_frames(
         disable=None if progress else True,
         leave=False,
     )
-    scores = (phase_distances(batch.to(stored.device), stored, metric)[:, before] for batch in batches)
+    scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
+    if k > 1:
+        scores = (part[:, before] for part in scores)
     return matching.found(scores).moved(lambda frame: torch.where(frame >= 0, frame // k * k, -1))
 
 

@@ -31,6 +31,7 @@ from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
+from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
 from dejavu_torch.experiments.storage import noise_over_map, storage_curve
 from dejavu_torch.features.extract import feature_batches
@@ -157,11 +158,8 @@ def compare(
     for key, (name, other) in (others or {}).items():
         if known is not None:
             contenders[key] = _learned_beside(run, name, other)
-    storage, noise = None, {}
-    if isinstance(model.map, SpectralMap) and contenders["map"].scores is not None:
-        storage = storage_curve(run, seed=seed, progress=progress)
-        if model.map.chunk == "route":
-            noise = {"noise_over_map": noise_over_map(model.map, places, seed)}
+    scored = contenders["map"].scores is not None
+    storage, noise = _at_other_sizes(run, seed, progress) if scored else (None, {})
     pictures = draw_pictures(run, contenders, storage)
     carried = all(source_of(one).place is not None for one in (reference, query))
     facts = {
@@ -281,6 +279,18 @@ def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
     """Another model that learns the run's reference."""
     found = other.learn(run.reference).found(other.extract_all(run.query), run.matching)
     return _contend(run, name, found, other)
+
+
+def _at_other_sizes(
+    run: Localization, seed: int, progress: bool
+) -> tuple[dict[str, list[Stored]] | None, dict[str, float]]:
+    """The storage curve of a spectral map, and what report.json holds of its smoothness."""
+    route = run.model.map
+    if not isinstance(route, SpectralMap):
+        return None, {}
+    storage = storage_curve(run, seed=seed, progress=progress)
+    whole = route.chunk == "route"
+    return storage, {"noise_over_map": noise_over_map(route, run.reference_features, seed)} if whole else {}
 
 
 def _is_plain_hog(model: DejaVu) -> bool:

@@ -22,6 +22,7 @@ from dejavu_torch.evaluation.coded_video import CodedVideo
 from dejavu_torch.evaluation.contenders import evaluate_each, sequences_as_json
 from dejavu_torch.evaluation.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.evaluation.score_plots import plot_frontiers
+from dejavu_torch.experiments.bench import peak_memory
 from dejavu_torch.experiments.compare import check_sizes
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
@@ -47,6 +48,7 @@ class Row(NamedTuple):
     """What one contender is recognised at on one route, and what it takes; None where it is not known.
 
     family: of contenders that make one front. seconds: to store the route and match all queries.
+    peak_bytes: most memory held meanwhile beyond what was held before.
     ratio_to_ours: seconds over those of our fastest. bytes: of all, with the whitening; those that do not
     grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
     together. skipped: why there are no figures.
@@ -244,16 +246,26 @@ def _video(route: Route, codec: str, crf: int) -> Kept:
 def judged(route: Route, contender: Contender) -> Row:
     """Store a route, match all queries, and score them."""
     row = Row(route.name, contender.name, contender.family)
+    matching = _matching(len(route.places), len(route.queries))
+    done: list[tuple[Kept, Found]] = []
+
+    def work() -> Tensor:
+        kept = contender.keep()
+        store = kept.descriptors, route.queries, kept.apart, "cosine"
+        done.append((kept, nearest_frames(*store, matching=matching)))
+        return kept.descriptors
+
     began = time.perf_counter()
     try:
-        kept = contender.keep()
+        peak = peak_memory(work)
+        if not done:  # a system that tells nothing of memory
+            work()
     except InputError as error:
         return row._replace(skipped=str(error))
     except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
         return row._replace(skipped=f"{type(error).__name__}: {' '.join(str(error).split())}"[:200])
-    matching = _matching(len(route.places), len(route.queries))
-    found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", matching=matching)
-    seconds = time.perf_counter() - began
+    seconds, (kept, found) = time.perf_counter() - began, done[0]
+    row = row._replace(peak_bytes=peak)
     return _scored(row, route, found, seconds, kept.route, kept.fixed + route.fixed)
 
 

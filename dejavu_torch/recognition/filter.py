@@ -40,14 +40,13 @@ class PlaceFilter(SequenceModel):
     """Where the latest query is, from all queries so far: the forward algorithm of a hidden Markov model.
 
     Its states are the N places and one more, off the map. From one query to the next the camera moves forward
-    by 0 to V places, jumps to any place, leaves the map or enters it anywhere; driving off its end leaves it
-    too.
+    by 0 to V places, jumps to any place, leaves the map or enters it anywhere; driving off its end leaves it.
     A place scored z standard deviations below the mean of a query's scores has the likelihood
     exp(sharpness z), being off the map exp(sharpness off_map).
 
     Args:
         moves: probabilities of moving by 0, 1, .., V places from one query to the next; they add up to 1.
-            What is faster than V places a query is lost, or found again by jumps.
+            A camera that is faster is lost until a jump finds it again.
         jump: probability of being anywhere on the map next, whatever the place before.
         leave: probability of leaving the map. enter: of entering it, from off the map.
         sharpness: nats for a standard deviation. Consecutive frames are alike, so that they tell less than
@@ -61,7 +60,7 @@ class PlaceFilter(SequenceModel):
             `DejaVu.localize`, scores only the stretch of places that is likely, as far as the map can score a
             stretch alone: a spectral map by its chunks, a template map by its layers. Where no stretch holds
             nearly all of the probability, all places are searched. Probabilities then differ by up to about
-            0.01 from those of a filter that always searches, and a jump is noticed at the next search.
+            0.02 from those of a filter that always searches, and a jump is noticed at the next search.
 
     Shape: scores (Q,N), the posterior (N+1,) of the query before them or None -> (Q,N), -log of a
         probability in nats, lower is better.
@@ -71,8 +70,8 @@ class PlaceFilter(SequenceModel):
         alike says nothing. The settings from `moves` to `off_map` are parameters: gradients of `forward` and
         `posterior` reach them, and the scores. `stream` carries no gradient from batch to batch.
 
-    Source: a filter with an off-map state is that of Xu, Fischer and Milford (RA-L 2021); the likelihood is
-        ours.
+    Source: an off-map state is in the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021);
+        motion model and likelihood are ours.
 
     Raises:
         InputError: probabilities out of range or that do not add up, other settings out of range; forward:
@@ -202,7 +201,7 @@ class PlaceFilter(SequenceModel):
             yield self._scores(posterior[:, :-1], scores)
 
     def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
-        """See `SequenceModel`; between two searches only the stretch that is likely is scored and driven on.
+        """See `SequenceModel`; between two searches only the places of a likely stretch are scored.
 
         All other places then count as if they scored as the mean, and mean and spread are those of the last
         search.

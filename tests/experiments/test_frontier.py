@@ -18,6 +18,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments import frontier
+from dejavu_torch.experiments.bench import MEMORY
 from dejavu_torch.experiments.frontier import (
     Contender,
     Point,
@@ -303,3 +304,14 @@ def test_the_matcher_takes_no_sources(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_a_map_is_of_one_route() -> None:
     with refused("0 sources", "one pair"):
         list(bench_storage(given=DejaVu()))
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_memory_is_measured_where_the_system_tells(told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not told:
+        monkeypatch.setattr(frontier, "peak_memory", lambda run: None)
+    route = described("route", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
+    whole = next(one for one in contenders_of(route, None) if one.name == "whole database, float")
+    row = judged(route, whole)
+    assert row.auc is not None
+    assert (row.peak_bytes is None) != (told and MEMORY.exists())
