@@ -456,7 +456,7 @@ def print_map(model: DejaVu) -> None:
     print(summary)
     whitening = model.whitening
     if whitening is not None:
-        numbers = " to ".join(str(count) for count in whitening.projection.shape)
+        numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))
         print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
         print(f"this route needs about {model.map.needed:.2g} bytes per place")

@@ -36,6 +36,7 @@ STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
     "occlusion": 0.4,
     "noise": 0.03,
 }
+BITS = (4, 8, 16)  # that a number of the projection may take
 ROUNDING = 1e-7  # of the largest variance: what lies below it is none
 
 
@@ -133,7 +134,7 @@ class Whitening(nn.Module):
         most_views: copies in all.
         strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
         seed: of the copies.
-        bits: of each number of the projection, 8 or 16.
+        bits: of each number of the projection: 4, two to a byte, 8 or 16.
 
     Shape: (B,D) -> (B,K).
 
@@ -168,7 +169,7 @@ class Whitening(nn.Module):
         most_views: int = 20000,
         strengths: Mapping[str, Any] | None = None,
         seed: int = 0,
-        bits: int = 8,
+        bits: int = 4,
     ) -> None:
         super().__init__()
         least = min(1 if count is None else count for count in (numbers, views, most_views))
@@ -177,10 +178,10 @@ class Whitening(nn.Module):
                 f"Whitening got numbers={numbers}, components={components}, views={views}, "
                 f"most_views={most_views}; expected at least 1 each, and no more numbers than components"
             )
-        if not (shrinkage is None or 0 < shrinkage <= 1) or bits not in (8, 16):
+        if not (shrinkage is None or 0 < shrinkage <= 1) or bits not in BITS:
             raise InputError(
                 f"Whitening got shrinkage={shrinkage}, bits={bits}; expected a shrinkage above 0 and at most "
-                "1, 8 or 16 bits"
+                f"1, {', '.join(map(str, BITS))} bits"
             )
         if not isinstance(strengths, Mapping | None):
             raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
@@ -188,10 +189,18 @@ class Whitening(nn.Module):
         self.most_views, self.seed, self.bits = most_views, seed, bits
         self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # learned elsewhere: it serves this route as it is
-        self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), in units of `scale`
+        self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), as `stored`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
         self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
         self.register_buffer("length", torch.zeros(0))  # (1,), the constant number; (0,): to length 1
+
+    @property
+    def whole(self) -> Tensor:
+        """(D,K): the projection in units of `scale`."""
+        if self.projection.dtype != torch.uint8:
+            return self.projection
+        halves = torch.cat([self.projection & 15, self.projection >> 4], 1)
+        return halves[:, : self.scale.shape[0]].to(torch.int8) - 8
 
     @property
     def learned(self) -> bool:
@@ -209,7 +218,7 @@ class Whitening(nn.Module):
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
-            whitened = (exact @ self.projection.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
+            whitened = (exact @ self.whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
                 return torch.cat([whitened, self.length.to(whitened).expand(len(whitened), 1)], 1)
             return nn.functional.normalize(whitened, dim=1)
@@ -270,7 +279,7 @@ class Whitening(nn.Module):
         largest = 2 ** (self.bits - 1) - 1
         self.scale = projection.abs().amax(0) / largest
         whole = (projection / self.scale).round()
-        self.projection = whole.to(torch.int8 if self.bits == 8 else torch.int16)
+        self.projection = stored(whole, self.bits)
         self.offset = (mean @ whole) * self.scale
         self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
 
@@ -288,16 +297,30 @@ class Whitening(nn.Module):
         return ", ".join(f"{name}={getattr(self, name)}" for name in shown)
 
 
+def stored(whole: Tensor, bits: int) -> Tensor:
+    """Whole numbers of so many bits as a buffer holds them.
+
+    Shape: (D,K) -> (D,K) int8 or int16; of 4 bits (D,ceil(K/2)) uint8, the first half of the columns in the
+        low bits and the others in the high ones, 8 added to each.
+    """
+    if bits > 4:
+        return whole.to(torch.int8 if bits == 8 else torch.int16)
+    low, high = nn.functional.pad(whole + 8, (0, whole.shape[1] % 2)).to(torch.uint8).chunk(2, 1)
+    return low | high << 4
+
+
 def _check_buffers(projection: Tensor, scale: Tensor, offset: Tensor, length: Tensor) -> None:
     """Refuse what is no projection and its scale."""
     seen = [tuple(tensor.shape) for tensor in (projection, scale, offset, length)]
-    numbers = seen[0][1:]
-    whole = projection.dtype in (torch.int8, torch.int16) and seen[1:3] == [numbers] * 2
+    columns = seen[1]
+    if projection.dtype == torch.uint8:  # two numbers to a byte
+        columns = tuple((count + 1) // 2 for count in seen[1])
+    whole = projection.dtype in (torch.uint8, torch.int8, torch.int16) and seen[2] == seen[1]
     finite = all(bool(tensor.isfinite().all()) for tensor in (scale, offset, length))
-    if len(seen[0]) != 2 or not whole or not finite or seen[3] not in ((0,), (1,)):
+    if len(seen[0]) != 2 or seen[0][1:] != columns or not whole or not finite or seen[3] not in ((0,), (1,)):
         raise InputError(
             f"the whitening has a projection, scale, offset and length of {seen}; expected finite (D,K), "
-            "(K,), (K,), and one number or none"
+            "two numbers to a byte in uint8, (K,), (K,), and one number or none"
         )
 
 

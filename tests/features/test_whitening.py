@@ -140,7 +140,7 @@ def found(whitening: Whitening, views: Tensor, places: Tensor) -> float:
     return float((similar.argmax(1) == torch.arange(len(places))).float().mean())
 
 
-@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("bits", [4, 8, 16])
 def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
     places, views = route()
     plain, whitening = Whitening(bits=bits), Whitening(numbers=10, bits=bits)
@@ -150,7 +150,20 @@ def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
     )
     assert found(whitening, views[300:], places[300:]) > 0.95 > 0.5 > found(plain, views[300:], places[300:])
     torch.testing.assert_close(whitening(views).norm(dim=1), torch.ones(600))
-    assert whitening.projection.dtype == (torch.int8 if bits == 8 else torch.int16)
+    assert whitening.projection.nbytes == 40 * 10 * bits // 8
+
+
+@pytest.mark.parametrize("numbers", [1, 2, 7, 10])
+def test_numbers_of_four_bits_come_back_from_their_bytes(numbers: int) -> None:
+    whole = torch.randint(-7, 8, (30, numbers), generator=torch.Generator().manual_seed(numbers))
+    projection = whole * torch.linspace(0.5, 2, numbers)  # each column holds its largest number
+    projection[0] = 7 * torch.linspace(0.5, 2, numbers)
+    whole[0] = 7
+    whitening = Whitening(bits=4)
+    whitening._store(torch.zeros(30), projection, None)
+    assert torch.equal(whitening.whole, whole.to(torch.int8))
+    torch.testing.assert_close(whitening.scale, torch.linspace(0.5, 2, numbers))
+    assert whitening.projection.nbytes == 30 * math.ceil(numbers / 2)
 
 
 def test_without_views_components_keep_their_variances() -> None:
@@ -197,9 +210,11 @@ def test_short_routes_are_looked_at_more_often() -> None:
     assert Whitening(views=2).copies(60, 1764) == 2
 
 
-def test_a_state_of_any_size_is_loaded() -> None:
+@pytest.mark.parametrize("bits", [4, 8, 16])
+@pytest.mark.parametrize("numbers", [5, 8])
+def test_a_state_of_any_size_is_loaded(bits: int, numbers: int) -> None:
     places, views = route()
-    one, other = Whitening(), Whitening()
+    one, other = Whitening(numbers, bits=bits), Whitening()
     one.learn(places, [(views, torch.arange(600))])
     other.learn(places[:, :9])
     other.load_state_dict(one.state_dict())
@@ -237,7 +252,7 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
         ({"numbers": 500}, ("numbers=500", "components=400")),
         ({"views": 0}, ("views=0",)),
         ({"shrinkage": 0.0}, ("shrinkage=0.0", "above 0")),
-        ({"bits": 4}, ("bits=4", "8 or 16")),
+        ({"bits": 6}, ("bits=6", "4, 8, 16")),
     ],
 )
 def test_whitening_settings_out_of_range(settings: dict[str, float], words: tuple[str, ...]) -> None:
@@ -265,13 +280,15 @@ def test_a_route_that_cannot_be_whitened() -> None:
         Whitening(strengths="all")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("bits", [4, 8])
 @pytest.mark.parametrize("name", ["projection", "scale", "offset", "length"])
-def test_a_state_that_does_not_fit_is_refused(name: str) -> None:
+def test_a_state_that_does_not_fit_is_refused(name: str, bits: int) -> None:
     places, views = route()
-    whitening, other = Whitening(numbers=4), Whitening()
+    whitening, other = Whitening(numbers=4, bits=bits), Whitening()
     whitening.learn(places, [(views, torch.arange(600))])
     state = whitening.state_dict()
-    state[name] = torch.ones(3) if name == "length" else state[name][..., :3]
-    with refused("(K,)", "(40, 3)" if name == "projection" else "(40, 4)"):
+    columns = bits // 2
+    state[name] = torch.ones(3) if name == "length" else state[name][..., : columns - 1]
+    with refused("(K,)", f"(40, {columns - 1})" if name == "projection" else f"(40, {columns})"):
         other.load_state_dict(state)
     assert not other.learned
