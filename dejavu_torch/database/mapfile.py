@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.data.files import whole_file
 from dejavu_torch.types import InputError
 
-FORMAT = 5
+FORMAT = 6
 NAME = "dejavu_torch-map"
 EXPECTED = "a map file, as DejaVu.save writes"
 
