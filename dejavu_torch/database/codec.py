@@ -144,8 +144,8 @@ def _decisions(levels: Ints) -> list[tuple[Ints, Ints, Ints]]:
             parts.append((SIGN + 1 + before[kept], negative[kept].astype(int), order + 8))
         for bit in range(n):
             ends = length == n + 1
-            ends_here = np.full(int(ends.sum()), BITS + n * 8 + bit)
-            parts.append((ends_here, size[ends] >> bit & 1, order[ends] + 16 - bit))
+            context = np.full(int(ends.sum()), BITS + n * 8 + bit)
+            parts.append((context, size[ends] >> bit & 1, order[ends] + 16 - bit))
     return parts
 
 
