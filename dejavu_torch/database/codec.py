@@ -127,7 +127,9 @@ def _decisions(levels: Ints) -> list[tuple[Ints, Ints, Ints]]:
     filled = np.flatnonzero(levels.any(1))
     rows, columns = int(filled[-1]) + 1 if len(filled) else 0, levels.shape[1]
     places = np.arange(min(rows + 1, len(levels)))
-    parts = [(np.full(len(places), END), (places == rows).astype(int), places * columns * 32)]
+    last = (places == rows).astype(np.int8)
+    parts: list[tuple[Ints, Ints, Ints]]
+    parts = [(np.full(len(places), END, np.int16), last, places * columns * 32)]
     if not rows:
         return parts
     sizes = np.abs(levels[:rows].astype(np.int16))
@@ -136,15 +138,15 @@ def _decisions(levels: Ints) -> list[tuple[Ints, Ints, Ints]]:
     negative, length = levels[:rows].ravel() < 0, _lengths()[size]
     before = np.sign(np.concatenate([np.zeros((2, columns), np.int8), levels[:rows]])[:rows]).ravel()
     for n in range(8):
-        parts.append((LENGTH + n * NEAR + near, (length > n).astype(int), order + n))
+        parts.append((LENGTH + n * NEAR + near, (length > n).astype(np.int8), order + n))
         kept = length > n
         size, near, order = size[kept], near[kept], order[kept]
         length = length[kept]
         if not n:
-            parts.append((SIGN + 1 + before[kept], negative[kept].astype(int), order + 8))
+            parts.append((SIGN + 1 + before[kept], negative[kept].astype(np.int8), order + 8))
         for bit in range(n):
             ends = length == n + 1
-            context = np.full(int(ends.sum()), BITS + n * 8 + bit)
+            context = np.full(int(ends.sum()), BITS + n * 8 + bit, np.int16)
             parts.append((context, size[ends] >> bit & 1, order[ends] + 16 - bit))
     return parts
 
