@@ -1,32 +1,33 @@
-"""Integer levels as a stream of bytes: most of them are 0, and it holds little more than their entropy."""
+"""Integer levels as a stream of bytes: an arithmetic code that learns, as it goes, from what is near."""
 
 from __future__ import annotations
 
-import lzma
 import math
 import os
 import zlib
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dejavu_torch.types import InputError
 
+Ints = NDArray[np.integer[Any]]
+
 ESCAPE = -128  # stands for a level that int8 does not hold
-WINDOW = 2**26  # bytes that LZMA looks back, both when it packs and when it unpacks
-FILTERS = [
-    {
-        "id": lzma.FILTER_LZMA2,
-        "preset": 9 | lzma.PRESET_EXTREME,
-        "lc": 0,
-        "lp": 0,
-        "pb": 0,
-        "dict_size": WINDOW,
-    }
-]
 LEVEL = 16  # bytes that a level takes while it is decoded
+MOST = 15  # a magnitude counts for no more in what is near
+
+# contexts: of a bit in every row, of signs, of the bits of a magnitude, and of how many bits it has
+END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 8 * 8
+NEAR = 34  # kinds of neighbourhood
+CONTEXTS = LENGTH + 8 * NEAR
+FIRST = (2, 1)  # 0s and 1s of a context before there are any; each one counts 2
+
+SPAN, BYTE = 56, 48  # bits of the coder's interval at first, and at least
 
 
 class Stream(NamedTuple):
@@ -37,22 +38,54 @@ class Stream(NamedTuple):
 
 
 def encode(levels: Tensor) -> Stream:
-    """Compress integer levels: which of them are not 0, their signs, and their magnitudes, with LZMA.
+    """Compress integer levels by an adaptive arithmetic code; whole numbers alone decide its intervals.
 
     Shape: (W,K) int8 -> (n,) uint8.
 
-    Convention: which are not 0 is a bit each, in bytes of eight columns; those of the first eight columns
-        come first, row by row. Most bytes are then one of few, and neighbours are alike.
+    Convention: row by row, first a bit: whether all that is left is 0. Then of each level how many bits its
+        magnitude has, in unary, its sign, and these bits below the first. The probability of a bit is that
+        with which it was 1 in its context: for the unary ones, how large the magnitudes are in the column and
+        its neighbours over the rows before, and in all columns over the last few; for a sign, that of the
+        column two rows before, which is the line of the same kind, cosine or sine.
     """
     whole = levels.detach().cpu().contiguous().numpy()
-    kept = whole != 0
-    values = whole[kept]
-    marks = np.packbits(kept, axis=1).T.tobytes()
-    sizes = (np.abs(values.astype(np.int16)) - 1).astype(np.uint8)
-    plain = marks + np.packbits(values > 0).tobytes() + sizes.tobytes()
-    filters = [{**FILTERS[0], "dict_size": min(max(4096, len(plain)), WINDOW)}]  # the same bytes, sooner
-    packed = lzma.compress(plain, format=lzma.FORMAT_RAW, filters=filters)
-    return Stream(torch.from_numpy(np.frombuffer(packed, np.uint8).copy()), zlib.crc32(whole.tobytes()))
+    contexts, bits, order = (np.concatenate(part) for part in zip(*_decisions(whole), strict=True))
+    order = order.argsort(kind="stable")
+    zeros, ones = [FIRST[0]] * CONTEXTS, [FIRST[1]] * CONTEXTS
+    packed, low, span = bytearray(), 0, 1 << SPAN
+    for context, bit in zip(contexts[order].tolist(), bits[order].tolist(), strict=True):
+        zero, one = zeros[context], ones[context]
+        part = span // (zero + one) * zero
+        if bit:
+            ones[context] = one + 2
+            low, span = low + part, span - part
+        else:
+            zeros[context] = zero + 2
+            span = part
+        while span < 1 << BYTE:
+            low, span = _shift(packed, low), span << 8
+    _shift(packed, low + (1 << BYTE) - 1)  # a number in the interval whose further bytes are 0
+    checksum = zlib.crc32(whole.tobytes())
+    return Stream(torch.from_numpy(np.frombuffer(bytes(packed), np.uint8).copy()), checksum)
+
+
+def coded_bytes(levels: Tensor) -> int:
+    """What `encode` needs, without coding: a byte more at most.
+
+    Shape: (W,K) int8 -> scalar.
+
+    Example:
+        >>> coded_bytes(torch.zeros(500, 20, dtype=torch.int8))
+        1
+    """
+    counts = np.zeros(2 * CONTEXTS, np.int64)
+    for contexts, bits, _ in _decisions(levels.detach().cpu().contiguous().numpy()):
+        counts += np.bincount(2 * contexts + bits, minlength=2 * CONTEXTS)
+    start = torch.tensor(FIRST, dtype=torch.float64) / 2
+    after = torch.from_numpy(counts).view(-1, 2) + start
+    # in whatever order they come, the bits of a context have a probability of gamma functions' quotients
+    nats = after.sum(1).lgamma() - after.lgamma().sum(1) + start.lgamma().sum() - start.sum().lgamma()
+    return int(float(nats.sum()) / math.log(256) + 1.01)
 
 
 def decode(stream: Stream, rows: int, columns: int) -> Tensor:
@@ -61,21 +94,20 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
     Raises:
         InputError: a truncated or altered stream, one of another size, or more than the memory holds.
     """
-    count, problem, whole = rows * columns, "", b""
+    problem = ""
     check_claim(rows, columns)
+    levels = np.zeros((rows, columns), np.int8)
     try:
-        decompressor = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=FILTERS)
-        longest = -(-columns // 8) * rows + -(-count // 8) + count
-        plain = decompressor.decompress(stream.bytes.numpy().tobytes(), longest + 1)
-        whole = _levels(np.frombuffer(plain, np.uint8), rows, columns)
-    except (lzma.LZMAError, MemoryError, OverflowError, ValueError) as error:
+        _decode(stream.bytes.numpy().tobytes(), levels)
+    except (MemoryError, OverflowError, ValueError) as error:
         problem = str(error)
-    if problem or zlib.crc32(whole) != stream.checksum:
-        seen = problem or f"levels of checksum {zlib.crc32(whole)}"
+    if problem or zlib.crc32(levels.tobytes()) != stream.checksum:
+        seen = problem or f"levels of checksum {zlib.crc32(levels.tobytes())}"
         raise InputError(
-            f"the coded lines are truncated or altered: {seen}; expected {count} levels of {stream.checksum}"
+            f"the coded lines are truncated or altered: {seen}; expected {levels.size} levels of "
+            f"{stream.checksum}"
         )
-    return torch.from_numpy(np.frombuffer(whole, np.int8).reshape(rows, columns).copy())
+    return torch.from_numpy(levels)
 
 
 def check_claim(rows: int, columns: int) -> None:
@@ -90,22 +122,137 @@ def check_claim(rows: int, columns: int) -> None:
         )
 
 
-def _levels(plain: np.ndarray, rows: int, columns: int) -> bytes:
-    """What `encode` packed, as int8 row by row; ValueError where there are more or fewer bytes."""
-    marked = -(-columns // 8) * rows
-    marks, rest = np.split(plain, [marked])
-    if len(marks) != marked:
-        raise ValueError(f"{len(marks)} bytes of marks, expected {marked}")
-    kept = np.unpackbits(marks.reshape(-1, rows).T, axis=1, count=columns).astype(bool)
-    number = int(kept.sum())
-    signs, sizes = np.split(rest, [-(-number // 8)])
-    if len(sizes) != number:
-        raise ValueError(f"{len(sizes)} magnitudes of {number} levels")
-    positive = np.unpackbits(signs, count=number).astype(bool)
-    magnitudes = sizes.astype(np.int16) + 1
-    levels = np.zeros((rows, columns), np.int8)
-    levels[kept] = np.where(positive, magnitudes, -magnitudes)
-    return levels.tobytes()
+def _decisions(levels: Ints) -> list[tuple[Ints, Ints, Ints]]:
+    """All bits that `encode` codes: their contexts, what they are, and numbers that sort them."""
+    filled = np.flatnonzero(levels.any(1))
+    rows, columns = int(filled[-1]) + 1 if len(filled) else 0, levels.shape[1]
+    places = np.arange(min(rows + 1, len(levels)))
+    last = (places == rows).astype(np.int8)
+    parts: list[tuple[Ints, Ints, Ints]]
+    parts = [(np.full(len(places), END, np.int16), last, places * columns * 32)]
+    if not rows:
+        return parts
+    sizes = np.abs(levels[:rows].astype(np.int16))
+    near = _near(_summed(sizes), np.arange(rows)).ravel()
+    size, order = sizes.ravel(), np.arange(rows * columns) * 32 + 1
+    negative, length = levels[:rows].ravel() < 0, _lengths()[size]
+    before = np.sign(np.concatenate([np.zeros((2, columns), np.int8), levels[:rows]])[:rows]).ravel()
+    for n in range(8):
+        parts.append((LENGTH + n * NEAR + near, (length > n).astype(np.int8), order + n))
+        kept = length > n
+        size, near, order = size[kept], near[kept], order[kept]
+        length = length[kept]
+        if not n:
+            parts.append((SIGN + 1 + before[kept], negative[kept].astype(np.int8), order + 8))
+        for bit in range(n):
+            ends = length == n + 1
+            context = np.full(int(ends.sum()), BITS + n * 8 + bit, np.int16)
+            parts.append((context, size[ends] >> bit & 1, order[ends] + 16 - bit))
+    return parts
+
+
+def _decode(packed: bytes, levels: Ints) -> None:
+    """Fill in what `encode` packed; ValueError where there are more or fewer bytes."""
+    if not packed:
+        raise ValueError("no bytes")
+    zeros, ones = [FIRST[0]] * CONTEXTS, [FIRST[1]] * CONTEXTS
+    ahead = SPAN // 8
+    padded = packed + bytes(ahead - 1)
+    value, span, read = int.from_bytes(padded[:ahead], "big"), 1 << SPAN, ahead
+
+    def bit(context: int) -> bool:
+        nonlocal value, span, read
+        zero, one = zeros[context], ones[context]
+        part = span // (zero + one) * zero
+        found = value >= part
+        if found:
+            ones[context] = one + 2
+            value, span = value - part, span - part
+        else:
+            zeros[context] = zero + 2
+            span = part
+        while span < 1 << BYTE:
+            if read == len(padded):
+                raise ValueError(f"{len(packed)} bytes are too few")
+            value, span, read = value << 8 | padded[read], span << 8, read + 1
+        return found
+
+    rows, columns = levels.shape
+    signs = [[0] * columns, [0] * columns]  # of the last two rows
+    sums = np.zeros((rows + 1, columns), np.int32)
+    for r in range(rows):
+        if bit(END):
+            break
+        row, before = [0] * columns, signs[r % 2]
+        for f, near in enumerate(_near(sums, np.array([r]))[0].tolist()):
+            context, length = LENGTH + near, 0
+            while length < 8 and bit(context):
+                context, length = context + NEAR, length + 1
+            if length:
+                negative, size = bit(SIGN + 1 + before[f]), 1
+                for n in reversed(range(length - 1)):
+                    size = size << 1 | bit(BITS + (length - 1) * 8 + n)
+                row[f] = -size if negative else size
+        levels[r] = row
+        signs[r % 2] = np.sign(levels[r]).tolist()
+        sums[r + 1] = sums[r] + np.minimum(np.abs(levels[r].astype(np.int16)), MOST)
+    if read != len(padded):
+        raise ValueError(f"{len(packed)} bytes, of which {len(padded) - read} are left over")
+
+
+def _shift(packed: bytearray, low: int) -> int:
+    """Pack the first byte of the interval's lower end, carrying into those before it; what is left of it."""
+    byte, rest = low >> BYTE, low & (1 << BYTE) - 1
+    if byte > 255:
+        last = len(packed) - 1
+        while packed[last] == 255:
+            packed[last] = 0
+            last -= 1
+        packed[last] += 1
+    packed.append(byte & 255)
+    return rest << 8
+
+
+def _summed(sizes: Ints) -> Ints:
+    """(W,K) magnitudes, summed over the rows before: (W+1,K)."""
+    sums = np.zeros((len(sizes) + 1, sizes.shape[1]), np.int32)
+    np.minimum(sizes, MOST).cumsum(0, out=sums[1:])
+    return sums
+
+
+def _near(sums: Ints, rows: Ints) -> Ints:
+    """How large the levels of such rows may be, 0 to `NEAR`, by those of the rows before: (W+1,K) -> (R,K).
+
+    Convention: the column counts twice as much as the row. Its mean is over half as many rows as there
+        are, 16 to 128 of them, so that it reaches as far in octaves everywhere, and the last two count for
+        more; that of the row is over the last 8 or fewer.
+    """
+    reach = np.minimum((rows // 2).clip(16, 128), rows)
+    column = ((sums[rows] - sums[rows - reach]) << 8) // reach.clip(1)[:, None]
+    column += (sums[rows] - sums[np.maximum(rows - 2, 0)]) << 4
+    wide = 2 * column
+    wide[:, 1:] += column[:, :-1]
+    wide[:, :-1] += column[:, 1:]
+    wide[:, 0] += column[:, 0]
+    wide[:, -1] += column[:, -1]
+    reach = np.minimum((rows // 16).clip(2, 8), rows)
+    row = (sums[rows] - sums[rows - reach]).sum(1, dtype=np.int64) << 10
+    row //= reach.clip(1) * sums.shape[1]
+    logarithm = _logarithms()
+    near: Ints = (2 * logarithm[(wide >> 2) + 3] + logarithm[row + 4][:, None]) // 9
+    return near
+
+
+@cache
+def _logarithms() -> Ints:
+    """8 log2 of 0 to 2^14, rounded down; by whole numbers, so that all machines find the same."""
+    return np.array([0, *((n**8).bit_length() - 1 for n in range(1, 2**14 + 1))], np.int16)
+
+
+@cache
+def _lengths() -> Ints:
+    """How many bits the numbers from 0 to 128 have."""
+    return np.array([n.bit_length() for n in range(129)], np.int8)
 
 
 def to_int8(levels: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,28 +267,6 @@ def to_int8(levels: Tensor) -> tuple[Tensor, Tensor]:
 def from_int8(small: Tensor, escapes: Tensor) -> Tensor:
     """The inverse of `to_int8`, (W,K) int32."""
     return small.to(torch.int32).masked_scatter(small == ESCAPE, escapes)
-
-
-def entropy_bytes(levels: Tensor) -> float:
-    """What the levels cost if each is coded by how often its value occurs in its octave of rows.
-
-    Args:
-        levels: whole numbers. Rows r to 2r are one octave.
-
-    Shape: (W,K) -> scalar, in bytes.
-
-    Example:
-        >>> entropy_bytes(torch.tensor([[0, 1], [0, 1]]))
-        0.5
-    """
-    bits, start, rows = 0.0, 0, len(levels)
-    while start < rows:
-        stop = min(rows, max(16, 2 * start))
-        octave = levels[start:stop].flatten().long()
-        counts = (octave - octave.min()).bincount().double()
-        bits -= float(counts.xlogy(counts / counts.sum()).sum()) / math.log(2)
-        start = stop
-    return bits / 8
 
 
 def memory() -> float:

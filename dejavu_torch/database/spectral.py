@@ -7,13 +7,12 @@ import logging
 import math
 from collections.abc import Callable
 from fractions import Fraction
-from functools import partial
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.database.codec import Stream, check_claim, decode, encode, entropy_bytes, from_int8, to_int8
+from dejavu_torch.database.codec import Stream, check_claim, coded_bytes, decode, encode, from_int8, to_int8
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.spectrum import Transform, from_spectrum, period_of, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
@@ -27,8 +26,7 @@ SILENT = 1e-6  # of the map's RMS norm: a place below it has no direction
 FINEST = 64  # steps in an RMS line at most: a finer step changes no score
 STRONGEST = 10  # periods that a summary names
 CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and checksum in the file
-WITHIN = 0.98  # of the budget is near enough
-CODED = 1.04  # bytes that the codec needs for one of entropy, measured
+HALVINGS = 14  # of the steps to choose from, which leaves 0.1 % of a step
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
 LINE_COST = 60  # of a coded line in a query's sum
@@ -407,7 +405,6 @@ class SpectralMapper(Mapper):
         self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
         self.transform, self.metric, self.resolution = transform, metric, resolution
         self.taken = 0  # bytes of the budget, see `beside`
-        self.exact = True  # otherwise the entropy alone tells the step: within a fifth or so, and sooner
 
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
@@ -482,26 +479,9 @@ class SpectralMapper(Mapper):
                 f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
                 f"and at most {4 * numbers}, {numbers} numbers as floats"
             )
-        if not self.exact:
-            return _smallest_step(partial(_fits, lines, width, room / CODED), finest, coarsest)
-        aim, fitting, finer = room, coarsest, finest
-        for _ in range(8):
-            step = _smallest_step(partial(_fits, lines, width, aim), finest, coarsest)
-            size = _coded_bytes(lines, width, lengths, step)
-            if size <= room:
-                fitting = min(fitting, step)
-                if size >= WITHIN * room or step == finest:
-                    return step
-            else:
-                finer = max(finer, step)
-            aim = entropy_bytes(quantise(lines, step, width)) * (1 + WITHIN) / 2 * room / size
-        for _ in range(12):  # the levels' entropy says little
-            step = math.sqrt(finer * fitting)
-            size = _coded_bytes(lines, width, lengths, step)
-            finer, fitting = (finer, step) if size <= room else (step, fitting)
-            if WITHIN * room <= size <= room:
-                break
-        return fitting
+        return _smallest_step(
+            lambda step: _coded_bytes(lines, width, lengths, step) <= room, finest, coarsest
+        )
 
 
 class SpectralCode(nn.Module):
@@ -581,17 +561,12 @@ def _lines(series: Tensor, lengths: list[int], transform: Transform) -> Tensor:
 
 def _coded_bytes(lines: Tensor, width: Tensor | None, lengths: list[int], step: float) -> int:
     small, escapes = to_int8(quantise(lines, step, width))
-    return escapes.nbytes + sum(len(encode(part).bytes) for part in small.split(lengths))
+    return escapes.nbytes + sum(coded_bytes(part) for part in small.split(lengths))
 
 
 def _steps(lines: Tensor) -> tuple[float, float]:
     """The finest step that is worth trying, and one so coarse that no line is left."""
     return float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
-
-
-def _fits(lines: Tensor, width: Tensor | None, size: float, step: float) -> bool:
-    """Whether the levels' entropy is at most so many bytes."""
-    return entropy_bytes(quantise(lines, step, width)) <= size
 
 
 def _held(lines: Tensor, width: Tensor | None, step: float) -> float:
@@ -605,7 +580,7 @@ def _smallest_step(enough: Callable[[float], bool], finest: float, coarsest: flo
     if enough(finest):
         return finest
     low, high = math.log(finest), math.log(coarsest)
-    for _ in range(20):
+    for _ in range(HALVINGS):
         middle = (low + high) / 2
         low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
     return math.exp(high)

@@ -21,7 +21,6 @@ from dejavu_torch.recognition.matching import Found
 from dejavu_torch.types import InputError
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
-SMALL = 2**17  # numbers that are coded soon enough to meet a budget to 2 %
 
 
 def storage_curve(
@@ -99,7 +98,6 @@ def _coded(
 ) -> Iterator[tuple[Found, int]]:
     """What is found on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
     mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric, resolution)
-    mapper.exact = features.numel() < SMALL
     model = with_mapper(run.model, mapper)
     try:
         model.learn_features(features)
