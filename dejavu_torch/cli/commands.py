@@ -325,6 +325,7 @@ def run_bench(
     out: Path,
     map: Path | None = None,
     codebooks: str | None = None,
+    whitening: Path | None = None,
     places: Sequence[int] = (),
 ) -> None:
     """Set this package beside what a user would pick instead: its speed, or its accuracy over bytes.
@@ -335,22 +336,25 @@ def run_bench(
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
         codebooks: of storage, another route, to train codebooks of product quantisers on that count nothing
+        whitening: of storage, a map whose whitening describes all routes; each learns its own if not given
         places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given
     """
     from dejavu_torch.evaluation.report import text_table
     from dejavu_torch.experiments import bench, frontier
 
     if what == "storage":
-        model = None if map is None else DejaVu.load(map)
-        found = frontier.run_storage(out, sources, places, codebooks, model, progress=True)
+        given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
+        found = frontier.run_storage(out, sources, places, codebooks, given, shared, progress=True)
         for title, table in frontier.storage_tables(found):
             print(*[title] * bool(title), text_table(table), "", sep="\n")
         for line in frontier.skipped_lines(found):
             print(line)
         print(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
-    if what in bench.BENCHES and (sources or places or map or codebooks):
-        raise InputError(f"bench {what} takes no sources, maps, codebooks or places; bench storage does")
+    if what in bench.BENCHES and (sources or places or map or codebooks or whitening):
+        raise InputError(
+            f"bench {what} takes no sources, maps, codebooks, whitening or places; bench storage does"
+        )
     rows = bench.run_bench(what, out)
     print(text_table(bench.bench_table(rows)))
     if any("No module" in (row.skipped or "") for row in rows):

@@ -26,7 +26,8 @@ FAMILIES = {  # of `plot_frontiers`: colour and line
     "binary": ("#785567", "-"),
     "PQ, codebooks of another route": ("#c21f0a", "-"),
     "PQ, own codebooks": ("#f28e6b", "--"),
-    "video": (COLOURS["paper"], "-"),
+    "video": ("#56b4e9", "-"),
+    "the paper": (COLOURS["paper"], "-"),
 }
 
 
@@ -234,37 +235,72 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
     return figure, axes[:, 0]
 
 
-def plot_frontiers(cases: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]) -> Plot:
+def plot_frontiers(
+    cases: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]],
+    whitenings: Mapping[str, Sequence[tuple[str, int, float]]] = MappingProxyType({}),
+) -> Plot:
     """The best area of each family of stores over route bytes per place, a panel for each route.
 
     Convention: areas below `LOWEST` and above `HIGHEST` are drawn as these.
 
     Args:
         cases: at least one: case -> family -> bytes per place and area, ascending.
+        whitenings: case -> name, fixed bytes and area of a map by each; a panel below that of the case.
     """
     names = list(dict.fromkeys(name for families in cases.values() for name in families))
-    figure, axes = canvas(3.0 * len(cases) + 1.1 * LINE * len(names), len(cases), squeeze=False)
-    for axis, (case, families) in zip(axes[:, 0], cases.items(), strict=True):
+    panels = [share for case in cases for share in ([1.0, 0.6] if case in whitenings else [1.0])]
+    height = 3.0 * sum(panels) + 1.1 * LINE * len(names)
+    figure, axes = canvas(height, len(panels), squeeze=False, height_ratios=panels)
+    column = iter(axes[:, 0])
+    shown = []
+    for case, families in cases.items():
+        axis = next(column)
+        shown.append(axis)
         for name, points in reversed(list(families.items())):  # ours, the first, on top
             colour, line = FAMILIES.get(name, (GREY, "-"))
             ours = name.startswith("dejavu")
             style = {"color": colour, "linestyle": line, "linewidth": 3 if ours else 1.4}
             sizes, areas = zip(*points, strict=True)
-            drawn = [min(max(area, LOWEST), HIGHEST) for area in areas]
-            axis.plot(sizes, drawn, marker="o", markersize=5 if ours else 3, label=name, **style)
+            axis.plot(sizes, _drawn(areas), marker="o", markersize=5 if ours else 3, label=name, **style)
         axis.set_xscale("log")
         axis.set_xlim(0.25, 700)
         ticks = [0.5, 1, 2, 5, 10, 20, 50, 200]
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
-        axis.set_yscale("logit")
-        levels = [LOWEST, 0.1, 0.5, 0.9, 0.99, HIGHEST]
-        axis.set_yticks(levels, [f"{level:g}" for level in levels])
-        axis.minorticks_off()
-        axis.set(ylim=(0.8 * LOWEST, 1 - 0.8 * (1 - HIGHEST)), ylabel="area under the PR curve")
+        _area_axis(axis)
         axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
-        axis.grid(alpha=0.25)
-    axes[-1, 0].set_xlabel("route bytes per place")
-    lines = {text: h for a in axes[:, 0] for h, text in zip(*a.get_legend_handles_labels(), strict=True)}
+        axis.set_xlabel("route bytes per place")
+        if case in whitenings:
+            _plot_whitenings(next(column), whitenings[case])
+    lines = {text: h for a in shown for h, text in zip(*a.get_legend_handles_labels(), strict=True)}
     figure.legend([lines[name] for name in names], names, loc="outside lower left", frameon=False, fontsize=9)
     return figure, axes[:, 0]
+
+
+def _plot_whitenings(axis: Any, whitenings: Sequence[tuple[str, int, float]]) -> None:
+    """The area of a map by each whitening, with its name and bytes, the largest on top."""
+    ordered = sorted(whitenings, key=lambda one: one[1])
+    areas = [area for _, _, area in ordered]
+    axis.scatter(areas, range(len(ordered)), color=_OURS)
+    for row, (name, size, _) in enumerate(ordered):
+        text = f"{name}, {size / 1000:.0f} kB"
+        axis.text(0.01, row, text, transform=axis.get_yaxis_transform(), va="center", fontsize=9)
+    reach = max(max(areas) - min(areas), 0.01)
+    axis.set_xlim(min(areas) - 1.2 * reach, max(areas) + 0.1 * reach)  # names in the left half
+    axis.locator_params(axis="x", nbins=5)
+    axis.set(ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="area, by whitening and its bytes")
+    axis.grid(alpha=0.25)
+
+
+def _drawn(areas: Sequence[float]) -> list[float]:
+    return [min(max(area, LOWEST), HIGHEST) for area in areas]
+
+
+def _area_axis(axis: Any) -> None:
+    """A logarithmic axis of 1 - area towards 1, and of the area towards 0."""
+    axis.set_yscale("logit")
+    levels = [LOWEST, 0.1, 0.5, 0.9, 0.99, HIGHEST]
+    axis.set_yticks(levels, [f"{level:g}" for level in levels])
+    axis.minorticks_off()
+    axis.set(ylim=(0.8 * LOWEST, 1 - 0.8 * (1 - HIGHEST)), ylabel="area under the PR curve")
+    axis.grid(alpha=0.25)

@@ -322,7 +322,7 @@ def benchmark(case: str, contenders: Sequence[Program], repeats: int) -> list[Ro
     return list(rows.values())
 
 
-def peak_memory(run: Run) -> int | None:
+def peak_memory(run: Callable[[], object]) -> int | None:
     """Most bytes of memory during a run beyond those before it; None where the system has no /proc."""
     if not MEMORY.exists():
         return None

@@ -24,6 +24,8 @@ from dejavu_torch.evaluation.quantisers import Kept, ProductQuantiser, every_kth
 from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments.bench import peak_memory
 from dejavu_torch.experiments.compare import check_sizes
+from dejavu_torch.experiments.reproduce import paper_model
+from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.matching import LENGTHS, Found, Matching, lengths_beside
@@ -40,8 +42,15 @@ CODE_BYTES, CODE_SPACED = (4, 8, 16, 32), (2, 3, 4, 5, 8)
 BIT_SPACED = (1, 2, 4, 5, 8, 16)
 QUALITIES = (24, 32, 40, 51)  # crf
 BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames, 0 the whole route
+WHITENINGS: Mapping[str, Mapping[str, int]] = {  # other settings than the defaults
+    "16 bits": {"bits": 16},
+    "8 bits": {"bits": 8},
+    "64 numbers": {"numbers": 64},
+    "32 numbers": {"numbers": 32},
+}
+WHITENED = 5.0  # route bytes per place of the map behind each of them
 TOLERANCE = 5
-OURS, NULL = "dejavu", "null"
+OURS, NULL, OTHERS = "dejavu", "null", "dejavu, other whitenings"
 
 
 class Row(NamedTuple):
@@ -90,12 +99,20 @@ class Route(NamedTuple):
     fixed: int
 
 
+class Answer(NamedTuple):
+    """What a contender finds, and its bytes: those that grow with the route, and all others."""
+
+    found: Found
+    route: int
+    fixed: int
+
+
 class Contender(NamedTuple):
-    """A way to store a route's descriptors. keep: stores them; what it raises says why it cannot."""
+    """A way to store a route. answer: stores it and matches all queries; what it raises says why not."""
 
     name: str
     family: str
-    keep: Callable[[], Kept]
+    answer: Callable[[Matching], Answer]
 
 
 def bench_storage(
@@ -103,6 +120,7 @@ def bench_storage(
     places: Sequence[int] = (),
     codebooks: str | None = None,
     given: DejaVu | None = None,
+    whitening: DejaVu | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> Iterator[Row]:
@@ -114,18 +132,25 @@ def bench_storage(
         codebooks: another route of frames of the same size, on which codebooks of product quantisers are
             trained that then count nothing. The built-in routes have seed 1 of the same simulator.
         given: a model with a map of the one pair's reference, set beside the others.
+        whitening: a model whose whitening describes all routes; None learns one for each.
         seed: of the whitening and the null. progress: show progress bars on a terminal.
 
     Raises:
         InputError: sources that are no pairs or do not fit each other, and what the sources raise.
     """
     for name, reference, query, other in _routes(sources, places, codebooks, given):
-        route = described(name, reference, query, seed, progress)
-        contenders = list(contenders_of(route, other, seed))
+        model = DejaVu()
+        if whitening is not None:
+            model.take_whitening(whitening)
+        route = described(name, reference, query, model, seed, progress)
+        if given is not None and given.map.places != len(route.places):
+            raise InputError(
+                f"the map holds {given.map.places} places and {reference.name} {len(route.places)}; expected "
+                "the reference that it was made of"
+            )
+        contenders = list(contenders_of(route, other, given, seed))
         for contender in tqdm(contenders, name, disable=None if progress else True, leave=False):
             yield judged(route, contender)
-        if given is not None:
-            yield _judged_map(route, given)
 
 
 def _routes(
@@ -160,16 +185,26 @@ def _name(reference: str, query: str) -> str:
 
 
 def described(
-    name: str, reference: Traverse, query: Traverse, seed: int = 0, progress: bool = False
+    name: str,
+    reference: Traverse,
+    query: Traverse,
+    model: DejaVu | None = None,
+    seed: int = 0,
+    progress: bool = False,
 ) -> Route:
-    """A route's whitened descriptors, as `DejaVu` with its defaults makes them.
+    """A route's whitened descriptors.
+
+    Args:
+        model: makes them; None is one with the defaults.
+        seed: of a whitening that is learned here.
 
     Raises:
         InputError: frames that differ in size, or nothing that says which places are right.
     """
-    model = DejaVu()
+    model = DejaVu() if model is None else model
     assert model.whitening is not None  # of the defaults
-    model.whitening.seed = seed
+    if not model.whitening.fixed:
+        model.whitening.seed = seed
     check_sizes(model, reference, query)
     places = model.describe_reference(reference, None, "describing" if progress else None)
     queries = model.extract_all(query, "describing the query" if progress else None)
@@ -183,36 +218,53 @@ def described(
     return Route(name, model, reference, query, places.float(), queries.float(), truth, fixed)
 
 
-def contenders_of(route: Route, other: Traverse | None, seed: int = 0) -> Iterator[Contender]:
+def contenders_of(
+    route: Route, other: Traverse | None, given: DejaVu | None = None, seed: int = 0
+) -> Iterator[Contender]:
     """All that is set side by side on a route, ours first.
 
     Args:
-        other: the route of the free codebooks; None leaves them out, and says so.
+        other: the route of the free codebooks and of a whitening that is shared; None leaves them out, and
+            says so.
+        given: see `bench_storage`.
     """
+    for name, family, keep in _stores(route, other, seed):
+        yield Contender(name, family, partial(_among, route, keep))
+    yield from _other_whitenings(route, other, seed)
+    if given is not None:
+        yield Contender("dejavu, the map that was given", "dejavu, given", partial(_by_map, route, given))
+    yield Contender("the paper", "the paper", partial(_by_paper, route))
+
+
+Store = tuple[str, str, Callable[[], Kept]]  # name, family, and what it gives back of the descriptors
+
+
+def _stores(route: Route, other: Traverse | None, seed: int) -> Iterator[Store]:
+    """Ways to keep the very same descriptors."""
     places, numbers = route.places, route.places.shape[1]
     for budget in BUDGETS:
-        yield Contender(f"dejavu {budget:g}", OURS, partial(spectral, places, budget))
+        yield f"dejavu {budget:g}", OURS, partial(spectral, places, budget)
     for budget in BUDGETS:
-        yield Contender(f"null {budget:g}", NULL, partial(spectral, places, budget, seed))
+        yield f"null {budget:g}", NULL, partial(spectral, places, budget, seed)
     for k in SPACED:
         name = "whole database" if k == 1 else every(k, "frame")
-        yield Contender(f"{name}, float", "frames", partial(every_kth, places, k, 4 * numbers))
-        yield Contender(f"{name}, int8", "frames", partial(every_kth, places, k, numbers, as_int8))
+        yield f"{name}, float", "frames", partial(every_kth, places, k, 4 * numbers)
+        yield f"{name}, int8", "frames", partial(every_kth, places, k, numbers, as_int8)
     for k in BETWEEN:
         keep = partial(every_kth, places, k, numbers, as_int8, between=True)
-        yield Contender(f"{every(k, 'frame')}, int8, interpolated", "interpolated", keep)
+        yield f"{every(k, 'frame')}, int8, interpolated", "interpolated", keep
     for count in COMPONENTS:
-        yield Contender(f"PCA, {count} numbers, int8", "PCA", partial(principal, places, count))
+        yield f"PCA, {count} numbers, int8", "PCA", partial(principal, places, count)
     for k in BIT_SPACED:
         keep = partial(every_kth, places, k, -(-numbers // 8), signs)
-        yield Contender(f"signs of {every(k, 'frame')}", "binary", keep)
+        yield f"signs of {every(k, 'frame')}", "binary", keep
     yield from _product_quantisers(route, other)
     for codec in ("libx264", "libx265"):
         for crf in QUALITIES:
-            yield Contender(f"{codec[3:]}, crf {crf}", "video", partial(_video, route, codec, crf))
+            yield f"{codec[3:]}, crf {crf}", "video", partial(_video, route, codec, crf)
 
 
-def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Contender]:
+def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Store]:
     """PQ and OPQ, by codebooks of another route, which count nothing, and by the route's own, which do."""
 
     @cache
@@ -235,7 +287,7 @@ def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Conten
         for k, between in ((k, b) for k in CODE_SPACED for b in (False, True)):
             name = f"{'O' * rotated}PQ, {m} bytes of {every(k, 'frame')}"
             name += f"{', interpolated' * between}{', own codebooks' * own}"
-            yield Contender(name, family, partial(keep, k, m, rotated, own, between))
+            yield name, family, partial(keep, k, m, rotated, own, between)
 
 
 def _video(route: Route, codec: str, crf: int) -> Kept:
@@ -243,30 +295,82 @@ def _video(route: Route, codec: str, crf: int) -> Kept:
     return Kept(route.model.extract_all(coded).float(), coded.bytes)
 
 
+def _other_whitenings(route: Route, other: Traverse | None, seed: int) -> Iterator[Contender]:
+    """The map of the same frames by other whitenings, one of them another route's."""
+    assert route.model.whitening is not None
+    if route.model.whitening.fixed:  # given: there is none to change
+        return
+
+    def learned(settings: Mapping[str, int]) -> DejaVu:
+        return DejaVu(whitening=Whitening(**settings))  # type: ignore[arg-type]  # all are whole numbers
+
+    def shared() -> DejaVu:
+        if other is None:
+            raise InputError("no other route to learn a whitening on; expected --codebooks SOURCE")
+        check_sizes(route.model, route.reference, other)
+        source, model = DejaVu(), DejaVu()
+        assert source.whitening is not None
+        source.whitening.seed = seed
+        source.describe_reference(other)
+        model.take_whitening(source)
+        return model
+
+    def answer(model: Callable[[], DejaVu], matching: Matching) -> Answer:
+        again = described(route.name, route.reference, route.query, model(), seed)
+        return _among(again, partial(spectral, again.places, WHITENED), matching)
+
+    models: dict[str, Callable[[], DejaVu]]
+    models = {name: partial(learned, settings) for name, settings in WHITENINGS.items()}
+    for name, model in (models | {"of another route": shared}).items():
+        yield Contender(f"dejavu {WHITENED:g}, whitening {name}", OTHERS, partial(answer, model))
+
+
+def _among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer:
+    """Nearest of the descriptors that a store gives back, by cosine."""
+    kept = keep()
+    found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", matching=matching)
+    return Answer(found, kept.route, kept.fixed + route.fixed)
+
+
+def _by_map(route: Route, model: DejaVu, matching: Matching) -> Answer:
+    """A map on descriptors of its own."""
+    found = model.found(model.extract_all(route.query), matching).moved(model.map.scored)
+    summary = model.summary()
+    return Answer(found, summary.route_bytes, summary.fixed_bytes)
+
+
+def _by_paper(route: Route, matching: Matching) -> Answer:
+    """Template means of the features themselves at frequencies found in them, frame by frame."""
+    return _by_map(route, paper_model().learn(route.reference), matching)
+
+
 def judged(route: Route, contender: Contender) -> Row:
     """Store a route, match all queries, and score them."""
     row = Row(route.name, contender.name, contender.family)
     matching = _matching(len(route.places), len(route.queries))
-    done: list[tuple[Kept, Found]] = []
-
-    def work() -> Tensor:
-        kept = contender.keep()
-        store = kept.descriptors, route.queries, kept.apart, "cosine"
-        done.append((kept, nearest_frames(*store, matching=matching)))
-        return kept.descriptors
-
+    answers: list[Answer] = []
     began = time.perf_counter()
     try:
-        peak = peak_memory(work)
-        if not done:  # a system that tells nothing of memory
-            work()
+        peak = peak_memory(lambda: answers.append(contender.answer(matching)))
+        if not answers:  # a system that tells nothing of memory
+            answers.append(contender.answer(matching))
     except InputError as error:
         return row._replace(skipped=str(error))
     except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
         return row._replace(skipped=f"{type(error).__name__}: {' '.join(str(error).split())}"[:200])
-    seconds, (kept, found) = time.perf_counter() - began, done[0]
-    row = row._replace(peak_bytes=peak)
-    return _scored(row, route, found, seconds, kept.route, kept.fixed + route.fixed)
+    seconds, (answer,) = time.perf_counter() - began, answers
+    scores = evaluate_each(answer.found.sequences, route.truth, TOLERANCE)
+    return row._replace(
+        seconds=seconds,
+        peak_bytes=peak,
+        bytes=answer.route + answer.fixed,
+        fixed_bytes=answer.fixed,
+        route_bytes=answer.route,
+        route_bytes_per_place=answer.route / len(route.places),
+        recall_at_1=scores[1].recall_at_1,
+        auc=scores[1].auc,
+        sequences=sequences_as_json(scores),
+    )
 
 
 def _matching(places: int, queries: int) -> Matching:
@@ -274,35 +378,6 @@ def _matching(places: int, queries: int) -> Matching:
     longest = max(length for length in LENGTHS if length <= places)
     sequence = SequenceMatcher(longest)
     return Matching(sequence, lengths_beside(sequence, queries, places))
-
-
-def _scored(row: Row, route: Route, found: Found, seconds: float, size: int, fixed: int) -> Row:
-    scores = evaluate_each(found.sequences, route.truth, TOLERANCE)
-    return row._replace(
-        seconds=seconds,
-        bytes=size + fixed,
-        fixed_bytes=fixed,
-        route_bytes=size,
-        route_bytes_per_place=size / len(route.places),
-        recall_at_1=scores[1].recall_at_1,
-        auc=scores[1].auc,
-        sequences=sequences_as_json(scores),
-    )
-
-
-def _judged_map(route: Route, model: DejaVu) -> Row:
-    """A map that was given, on descriptors of its own."""
-    if model.map.places != len(route.places):
-        raise InputError(
-            f"the map holds {model.map.places} places and {route.reference.name} {len(route.places)}; "
-            "expected the reference that it was made of"
-        )
-    began = time.perf_counter()
-    found = model.found(model.extract_all(route.query), _matching(len(route.places), len(route.queries)))
-    summary, seconds = model.summary(), time.perf_counter() - began
-    row = Row(route.name, "dejavu, the map that was given", "dejavu, given")
-    moved = found.moved(model.map.scored)
-    return _scored(row, route, moved, seconds, summary.route_bytes, summary.fixed_bytes)
 
 
 class Point(NamedTuple):
@@ -354,9 +429,10 @@ def _ran(row: Row) -> bool:
 
 
 def _families(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """The rows of each family but `OTHERS`, which differ in what does not grow with the route."""
     found: dict[str, list[Row]] = {}
     for row in rows:
-        if _ran(row):
+        if _ran(row) and row.family != OTHERS:
             found.setdefault(row.family, []).append(row)
     return found
 
@@ -399,12 +475,36 @@ def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return found
 
 
+class Whitened(NamedTuple):
+    """The area of our map by one whitening, and the bytes that this takes once."""
+
+    name: str
+    fixed_bytes: int
+    auc: float
+
+
+def whitenings(rows: Sequence[Row]) -> dict[str, list[Whitened]]:
+    """For each route with other whitenings than its own: that one, the first, and the others."""
+    found: dict[str, list[Whitened]] = {}
+    for case, own in _cases(rows).items():
+        others = [row for row in own if _ran(row) and row.family == OTHERS]
+        ours = [row for row in own if _ran(row) and row.contender == f"{OURS} {WHITENED:g}"]
+        if others and ours:
+            names = ["the default", *(row.contender.rpartition("whitening ")[2] for row in others)]
+            found[case] = [
+                Whitened(name, row.fixed_bytes or 0, row.auc or 0)
+                for name, row in zip(names, ours + others, strict=True)
+            ]
+    return found
+
+
 def run_storage(
     out: Path,
     sources: Sequence[str] = (),
     places: Sequence[int] = (),
     codebooks: str | None = None,
     given: DejaVu | None = None,
+    whitening: DejaVu | None = None,
     progress: bool = False,
 ) -> list[Row]:
     """`bench_storage`, written into a folder as rows are finished: bench.json, and bench.png at the end.
@@ -414,12 +514,12 @@ def run_storage(
     """
     check_output_folder(out)
     rows: list[Row] = []
-    for row in bench_storage(sources, places, codebooks, given, progress=progress):
+    for row in bench_storage(sources, places, codebooks, given, whitening, progress=progress):
         if not rows:
             make_output_folder(out)  # what fails before leaves none
         rows = _with_ratios([*rows, row])
         write_rows(out, rows)
-    figure, _ = plot_frontiers(pictured(rows))
+    figure, _ = plot_frontiers(pictured(rows), whitenings(rows))
     with whole_file(out / "bench.png") as temporary:
         figure.savefig(temporary)
     return rows
@@ -460,9 +560,10 @@ def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float
 def storage_tables(rows: Sequence[Row], at: float = 1.6) -> Iterator[tuple[str, list[list[str]]]]:
     """For each route: a heading and rows of text, the best area of each family in so many bytes per place.
 
-    A second table has the bytes per place that each family needs for our area at `at` bytes, by T.
+    A second table has the bytes per place that each family needs for our area at `at` bytes, by T; a third
+    the areas by other whitenings.
     """
-    equal = equal_areas(rows)
+    equal, others = equal_areas(rows), whitenings(rows)
     for case, own in _cases(rows).items():
         families = _families(own)
         table = [["AUC, route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
@@ -483,6 +584,10 @@ def storage_tables(rows: Sequence[Row], at: float = 1.6) -> Iterator[tuple[str, 
                 if name != OURS:
                     sizes = (one["bytes_per_place"][name] for one in chosen.values())
                     table.append([name, *("never" if size is None else f"{size:.2f}" for size in sizes)])
+            yield "", table
+        if case in others:
+            table = [[f"whitening, {WHITENED:g} bytes per place:", "fixed kB", "AUC"]]
+            table += [[one.name, f"{one.fixed_bytes / 1000:.0f}", f"{one.auc:.3f}"] for one in others[case]]
             yield "", table
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.evaluation.quantisers import Kept
 from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments import frontier
 from dejavu_torch.experiments.bench import MEMORY
@@ -33,7 +34,9 @@ from dejavu_torch.experiments.frontier import (
     run_storage,
     skipped_lines,
     storage_tables,
+    whitenings,
 )
+from dejavu_torch.recognition.matching import Matching
 
 PLACES, NUMBERS = 300, 24
 
@@ -61,7 +64,8 @@ def rows(pair: tuple[str, str]) -> list[Row]:
 def test_all_families_are_there(rows: list[Row]) -> None:
     pytest.importorskip("faiss")
     ran = {row.family for row in rows if row.skipped is None}
-    assert ran == {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
+    stores = {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
+    assert ran == stores | {"dejavu, other whitenings"}
     assert [row.contender for row in rows[:2]] == ["dejavu 0.5", "dejavu 1"]
     assert all("PQ" in row.contender for row in rows if "PQ" in row.family)
     assert len({row.contender for row in rows}) == len(rows)
@@ -87,7 +91,7 @@ def test_all_bytes_are_counted_fixed_and_growing_apart(rows: list[Row]) -> None:
     assert whole.route_bytes == PLACES * columns * 4
     assert whole.fixed_bytes == ours.fixed_bytes
     assert whole.fixed_bytes is not None
-    assert whole.fixed_bytes >= NUMBERS * NUMBERS  # the whitening
+    assert whole.fixed_bytes >= NUMBERS * NUMBERS // 2  # the whitening, 4 bits a number
     assert whole.bytes == whole.route_bytes + whole.fixed_bytes
     assert ours.route_bytes_per_place == pytest.approx(5, rel=0.02)
     pca = found["PCA, 3 numbers, int8"]
@@ -126,6 +130,69 @@ def test_the_map_is_scored_as_compare_scores_it(rows: list[Row]) -> None:
     assert found.recall_at_1 == pytest.approx(float(right.float().mean()), abs=0.01)
 
 
+def test_other_whitenings_take_other_fixed_bytes(pair: tuple[str, str], rows: list[Row]) -> None:
+    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
+    contenders = [one for one in contenders_of(route, ArrayTraverse(series(5))) if "whitening" in one.name]
+    others = {one.name.rpartition("whitening ")[2]: judged(route, one) for one in contenders}
+    sizes = {name: row.fixed_bytes or 0 for name, row in others.items()}
+    assert sizes["16 bits"] > sizes["8 bits"] > route.fixed == sizes["of another route"]
+    assert all(row.route_bytes_per_place == pytest.approx(5, rel=0.02) for row in others.values() if row.auc)
+    assert "numbers" in (others["64 numbers"].skipped or "")  # of 24
+    shown = whitenings([*rows, others["of another route"]])  # of another case than the rows
+    assert [[one.name for one in some] for some in shown.values()] == [["the default", "16 bits", "8 bits"]]
+    (table,) = [table for _, table in storage_tables(rows) if table[0][1] == "fixed kB"]
+    assert [row[0] for row in table[1:]] == ["the default", "16 bits", "8 bits"]
+    figure, _ = plot_frontiers(frontier.pictured(rows), shown)
+    texts = [text.get_text() for text in figure.axes[1].texts]
+    assert texts[-1] == f"16 bits, {sizes['16 bits'] / 1000:.0f} kB"
+
+
+def test_a_whitening_that_is_given_describes_all(
+    pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("learn", pair[1], "--map", tmp_path / "map.safetensors")
+    monkeypatch.setattr(frontier, "_stores", lambda route, *_: [("all", "frames", lambda: store(route))])
+    whitened = []
+
+    def store(route: frontier.Route) -> Kept:
+        whitened.append(route.places)
+        return Kept(route.places, len(route.places))
+
+    run("bench", "storage", *pair, "--whitening", tmp_path / "map.safetensors", "--out", tmp_path / "out")
+    model = DejaVu.load(tmp_path / "map.safetensors")
+    assert torch.equal(whitened[0], model.whitened(series(0)))
+    written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    assert [row["family"] for row in written] == ["frames", "the paper"]
+    raw = DejaVu(whitening="none").learn(series(0))
+    raw.save(tmp_path / "raw.safetensors")
+    error = fails(
+        capsys,
+        "bench",
+        "storage",
+        *pair,
+        "--whitening",
+        tmp_path / "raw.safetensors",
+        "--out",
+        tmp_path / "o",
+    )
+    assert "without whitening" in error
+
+
+def test_the_paper_beside_them() -> None:
+    period = torch.arange(1024)[:, None] % torch.tensor([16, 32])
+    wave = (period < torch.tensor([8, 16])).float() + 0.01 * torch.rand(1024, 2)
+    route = described("wave", ArrayTraverse(wave), ArrayTraverse(wave + 0.01))
+    row = judged(route, paper_of(route))
+    assert row.skipped is None
+    assert (row.route_bytes or 0) > 0
+    short = described("short", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
+    assert "1024" in (judged(short, paper_of(short)).skipped or "")
+
+
+def paper_of(route: frontier.Route) -> Contender:
+    return next(one for one in contenders_of(route, None) if one.family == "the paper")
+
+
 def test_a_budget_below_the_least_and_too_few_places_are_rows() -> None:
     pytest.importorskip("faiss")
     route = described("short", *(ArrayTraverse(series(seed)[:40]) for seed in (0, 1)))
@@ -147,7 +214,7 @@ def test_without_faiss_its_rows_are_skipped(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_codec_that_is_not_there_is_a_row() -> None:
     route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
 
-    def missing() -> None:
+    def missing(matching: Matching) -> None:
         import av
 
         av.CodecContext.create("libx999", "w")
