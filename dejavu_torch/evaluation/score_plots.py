@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from textwrap import fill
 from types import MappingProxyType
@@ -268,7 +269,8 @@ def plot_frontiers(
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
         _area_axis(axis)
-        axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
+        title = re.sub(r"[^ :]*/", "", case)  # sources without their folders
+        axis.set_title(fill(title, LETTERS - 10), loc="left", fontsize=10, weight="bold")
         axis.set_xlabel("route bytes per place")
         if case in whitenings:
             _plot_whitenings(next(column), whitenings[case])
