@@ -30,8 +30,8 @@ def storage_curve(
 
     Args:
         run: with a spectral map, whose settings are kept, and a ground truth.
-        budgets: route bytes per place; those that a contender cannot meet are left out. The map
-            of a long route is within a fifth or so of them, and stands at what it takes.
+        budgets: route bytes per place; those that a contender cannot meet are left out. Each
+            contender stands at what it takes.
         seed: of the null's shuffle. progress: show a progress bar on a terminal.
 
     Returns:
