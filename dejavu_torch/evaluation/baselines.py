@@ -72,13 +72,17 @@ def nearest_frames(
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
-        k: 1 stores all frames. A frame that is not stored has the distance of the one before it.
+        k: 1 stores all frames. A frame that is not stored has the distance of the nearest one that is.
         progress: text of a progress bar on a terminal; None is no bar.
 
     Returns:
-        What is found, in reference frames that are stored.
+        What is found: by single queries, reference frames that are stored; by sequences, which tell frames
+        between these apart, any.
     """
-    stored, before = reference[::k], torch.arange(len(reference), device=reference.device) // k
+    stored = reference[::k]
+    nearest = ((torch.arange(len(reference), device=reference.device) + k // 2) // k).clamp(
+        max=len(stored) - 1
+    )
     batches = tqdm(
         query.split(max(1, DISTANCES_AT_ONCE // len(reference))),
         progress,
@@ -87,8 +91,18 @@ def nearest_frames(
     )
     scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
     if k > 1:
-        scores = (part[:, before] for part in scores)
-    return matching.found(scores).moved(lambda frame: torch.where(frame >= 0, frame // k * k, -1))
+        scores = (part[:, nearest] for part in scores)
+    found, nearest = matching.found(scores), nearest.cpu()
+
+    def of_one(frame: Tensor) -> Tensor:
+        return torch.where(frame >= 0, k * nearest[frame], -1)
+
+    candidates, sequences = found.candidates, dict(found.sequences)
+    if matching.single:
+        candidates = candidates._replace(index=of_one(candidates.index))
+    if 1 in sequences:
+        sequences[1] = sequences[1]._replace(index=of_one(sequences[1].index))
+    return Found(candidates, sequences)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:

@@ -23,10 +23,11 @@ WITHOUT_END = 10**6  # frames between key frames: one, the first
 
 
 class CodedVideo(IndexedTraverse):
-    """The frames of a traverse, made small, encoded and decoded, and made large again.
+    """Every k-th frame of a traverse, made small, encoded and decoded, and made large again.
 
     Args:
         traverse: of frames. codec: "libx264" or "libx265". crf: its quality, 0 to 51, 51 the worst.
+        step: k.
         longest: pixels of the longer side of what is encoded.
 
     Attributes:
@@ -36,7 +37,7 @@ class CodedVideo(IndexedTraverse):
         InputError: ready features instead of frames. ValueError: the codec is not there.
     """
 
-    def __init__(self, traverse: Traverse, codec: str, crf: int, longest: int = 64) -> None:
+    def __init__(self, traverse: Traverse, codec: str, crf: int, step: int = 1, longest: int = 64) -> None:
         import av
 
         if len(traverse.frame_shape) != 3:
@@ -51,9 +52,9 @@ class CodedVideo(IndexedTraverse):
         encoder.pix_fmt, encoder.time_base, encoder.framerate = "yuv420p", Fraction(1, 25), Fraction(25)
         encoder.options = {"crf": str(crf), "preset": "slow", "g": str(WITHOUT_END)}
         if codec == "libx265":
-            encoder.options |= {"x265-params": "log-level=none"}
+            encoder.options |= {"x265-params": "log-level=none:info=0"}
         packets, count = [], 0
-        for batch in traverse.batches(BATCH):
+        for batch in traverse.select(range(0, traverse.length or WITHOUT_END, step), BATCH):
             for pixels in _pixels(batch, small):
                 frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 frame.pts, count = count, count + 1

@@ -22,8 +22,8 @@ Code = Callable[[Tensor], Tensor]  # descriptors (n,K) -> what a store gives bac
 class Kept(NamedTuple):
     """Descriptors of all places as a store gives them back, and what it takes.
 
-    descriptors: (N,K). route: bytes that grow with the route, and what is fitted on it. fixed: bytes that do
-    not grow with it, beside the whitening. apart: k, where only every k-th place is stored, and the others
+    descriptors: (N,K). route: bytes that grow with the route, and codebooks fitted on it. fixed: bytes that
+    do not grow with it, beside the whitening. apart: k, where only every k-th place is stored, and the others
     are given back as the one before them.
     """
 
@@ -68,10 +68,11 @@ def every_kth(
     return Kept(keys.repeat_interleave(k, 0)[:count], size, apart=k)
 
 
-def principal(places: Tensor, numbers: int) -> Kept:
-    """The strongest principal components of all places, in int8 with a scale each.
+def principal(places: Tensor, numbers: int, k: int = 1) -> Kept:
+    """The strongest principal components of every k-th place, in int8 with a scale each; between them lines.
 
-    The mean and the axes, a byte a number, count as fixed.
+    The mean and the axes, a byte a number, count as fixed, though they are fitted on the route: axes of
+    another one would do nearly as well.
 
     Raises:
         InputError: more numbers than a descriptor has, or than there are places.
@@ -84,7 +85,8 @@ def principal(places: Tensor, numbers: int) -> Kept:
     scores = (places - mean) @ axes.T
     scale = scores.abs().amax(0).clamp(min=1e-30) / 127
     back = ((scores / scale).round() * scale) @ axes + mean
-    return Kept(back, scores.numel(), axes.numel() + 4 * numbers + 4 * len(mean))
+    kept = every_kth(back, k, numbers, between=k > 1)
+    return kept._replace(fixed=axes.numel() + 4 * numbers + 4 * len(mean))
 
 
 def signs(places: Tensor) -> Tensor:

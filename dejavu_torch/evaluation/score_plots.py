@@ -19,7 +19,7 @@ _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
 FAMILIES = {  # of `plot_frontiers`: colour and line
     "dejavu": (_OURS, "-"),
-    "dejavu, given": ("#00406b", "-"),
+    "dejavu, given": ("#00406b", "--"),
     "null": (COLOURS["null"], ":"),
     "frames": (COLOURS["stride"], "-"),
     "interpolated": (COLOURS["interpolated"], "-"),
@@ -264,8 +264,8 @@ def plot_frontiers(
             sizes, areas = zip(*points, strict=True)
             axis.plot(sizes, _drawn(areas), marker="o", markersize=5 if ours else 3, label=name, **style)
         axis.set_xscale("log")
-        axis.set_xlim(0.25, 700)
         ticks = [0.5, 1, 2, 5, 10, 20, 50, 200]
+        axis.set_xlim(0.4, 1.2 * max([50.0, *(size for points in families.values() for size, _ in points)]))
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
         _area_axis(axis)
@@ -290,7 +290,9 @@ def _plot_whitenings(axis: Any, whitenings: Sequence[tuple[str, int, float]]) ->
     reach = max(max(areas) - min(areas), 0.01)
     axis.set_xlim(min(areas) - 1.2 * reach, max(areas) + 0.1 * reach)  # names in the left half
     axis.locator_params(axis="x", nbins=5)
-    axis.set(ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="area, by whitening and its bytes")
+    axis.set(
+        ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="AUC at 5 route bytes per place, by whitening"
+    )
     axis.grid(alpha=0.25)
 
 

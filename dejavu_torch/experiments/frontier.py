@@ -17,7 +17,7 @@ from tqdm import tqdm
 import dejavu_torch
 from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
 from dejavu_torch.data.source import open_source
-from dejavu_torch.evaluation.baselines import as_int8, every, nearest_frames
+from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.coded_video import CodedVideo
 from dejavu_torch.evaluation.contenders import evaluate_each, sequences_as_json
 from dejavu_torch.evaluation.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
@@ -37,10 +37,10 @@ SHOWN = (1.0, 1.6, 3.2, 5.0, 10.0)  # of the table
 NEAR = 1.02  # a budget is met by what takes at most so much of it
 SPACED = (1, 2, 3, 4, 5, 8, 10)  # k of every k-th frame as it is
 BETWEEN = (8, 10, 16, 25, 40, 64, 100)  # and with straight lines between
-COMPONENTS = (1, 2, 3, 5, 8, 10, 16)
+COMPONENTS, COMPONENT_SPACED = (2, 4, 8, 16, 32), (1, 2, 5, 10)
 CODE_BYTES, CODE_SPACED = (4, 8, 16, 32), (2, 3, 4, 5, 8)
-BIT_SPACED = (1, 2, 4, 5, 8, 16)
-QUALITIES = (24, 32, 40, 51)  # crf
+BIT_SPACED = (1, 2, 3, 4, 5, 8, 10, 16)
+QUALITIES, VIDEO_SPACED = (24, 32, 40, 51), (1, 4, 8)  # crf
 BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames, 0 the whole route
 WHITENINGS: Mapping[str, Mapping[str, int]] = {  # other settings than the defaults
     "16 bits": {"bits": 16},
@@ -49,6 +49,7 @@ WHITENINGS: Mapping[str, Mapping[str, int]] = {  # other settings than the defau
     "32 numbers": {"numbers": 32},
 }
 WHITENED = 5.0  # route bytes per place of the map behind each of them
+LEVEL = 0.95  # an area that tells stores apart: near 1 it hangs on single queries
 TOLERANCE = 5
 OURS, NULL, OTHERS = "dejavu", "null", "dejavu, other whitenings"
 
@@ -56,8 +57,9 @@ OURS, NULL, OTHERS = "dejavu", "null", "dejavu, other whitenings"
 class Row(NamedTuple):
     """What one contender is recognised at on one route, and what it takes; None where it is not known.
 
-    family: of contenders that make one front. seconds: to store the route and match all queries.
-    peak_bytes: most memory held meanwhile beyond what was held before.
+    family: of contenders that make one front. seconds: to store the route and match all queries; of what
+    has descriptors of its own with describing all frames, and of the first of several rows that share a
+    training with that. peak_bytes: most memory held meanwhile beyond what was held before.
     ratio_to_ours: seconds over those of our fastest. bytes: of all, with the whitening; those that do not
     grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
     together. skipped: why there are no figures.
@@ -138,16 +140,13 @@ def bench_storage(
     Raises:
         InputError: sources that are no pairs or do not fit each other, and what the sources raise.
     """
-    for name, reference, query, other in _routes(sources, places, codebooks, given):
-        model = DejaVu()
-        if whitening is not None:
-            model.take_whitening(whitening)
-        route = described(name, reference, query, model, seed, progress)
-        if given is not None and given.map.places != len(route.places):
-            raise InputError(
-                f"the map holds {given.map.places} places and {reference.name} {len(route.places)}; expected "
-                "the reference that it was made of"
-            )
+    routes = _routes(sources, places, codebooks, given)
+    for _, reference, query, _ in routes:
+        for model in (_model(whitening), given):
+            if model is not None:
+                _check(model, reference, query)
+    for name, reference, query, other in routes:
+        route = described(name, reference, query, _model(whitening), seed, progress)
         contenders = list(contenders_of(route, other, given, seed))
         for contender in tqdm(contenders, name, disable=None if progress else True, leave=False):
             yield judged(route, contender)
@@ -167,7 +166,10 @@ def _routes(
         raise InputError(f"--places {' '.join(map(str, places))}; expected at least 2 each")
     if sources:
         other = None if codebooks is None else open_source(codebooks)
-        pairs = zip(sources[::2], sources[1::2], strict=True)
+        pairs = list(zip(sources[::2], sources[1::2], strict=True))
+        twice = next((pair for i, pair in enumerate(pairs) if pair in pairs[:i]), None)
+        if twice:
+            raise InputError(f"the pair {_name(*twice)} is given twice; expected it once")
         return [(_name(a, b), open_source(a), open_source(b), other) for a, b in pairs]
     if codebooks is not None:
         raise InputError("--codebooks are of pairs of sources; the built-in routes have seed 1 of their own")
@@ -178,6 +180,34 @@ def _routes(
             own = [open_source(f"{address}seed={s}&traverse={t}") for s, t in ((0, 0), (0, 1), (1, 0))]
             found.append((f"sim:{kind}, {own[0].length} places", *own))
     return found  # type: ignore[return-value]  # mypy sees no triple
+
+
+def _model(whitening: DejaVu | None) -> DejaVu:
+    """One with the defaults, or with the whitening of another."""
+    model = DejaVu()
+    if whitening is not None:
+        model.take_whitening(whitening)
+    return model
+
+
+def _check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
+    """Refuse, before the long work, a pair that does not fit the model or each other."""
+    features, whitening = check_sizes(model, reference, query), model.whitening
+    if whitening is not None and whitening.learned and len(whitening.projection) != features:
+        raise InputError(
+            f"the whitening is of {len(whitening.projection)} features and {reference.name} gives {features} "
+            "a frame; expected as many, as frames of one size give"
+        )
+    if reference.length is not None and query.length is not None and reference.length != query.length:
+        raise InputError(
+            f"{reference.name} has {reference.length} frames and {query.name} {query.length}; expected as "
+            "many, frame i being place i"
+        )
+    if model.map.places and reference.length is not None and model.map.places != reference.length:
+        raise InputError(
+            f"the map holds {model.map.places} places and {reference.name} {reference.length}; expected the "
+            "reference that it was made of"
+        )
 
 
 def _name(reference: str, query: str) -> str:
@@ -205,7 +235,6 @@ def described(
     assert model.whitening is not None  # of the defaults
     if not model.whitening.fixed:
         model.whitening.seed = seed
-    check_sizes(model, reference, query)
     places = model.describe_reference(reference, None, "describing" if progress else None)
     queries = model.extract_all(query, "describing the query" if progress else None)
     truth = ground_truth_of(None, reference, query, len(places), len(queries))
@@ -254,14 +283,19 @@ def _stores(route: Route, other: Traverse | None, seed: int) -> Iterator[Store]:
         keep = partial(every_kth, places, k, numbers, as_int8, between=True)
         yield f"{every(k, 'frame')}, int8, interpolated", "interpolated", keep
     for count in COMPONENTS:
-        yield f"PCA, {count} numbers, int8", "PCA", partial(principal, places, count)
+        for k in COMPONENT_SPACED:
+            name = f"PCA, {count} numbers of {every(k, 'frame')}, int8{', interpolated' * (k > 1)}"
+            yield name, "PCA", partial(principal, places, count, k)
     for k in BIT_SPACED:
-        keep = partial(every_kth, places, k, -(-numbers // 8), signs)
-        yield f"signs of {every(k, 'frame')}", "binary", keep
+        for between in (False, True) if k > 1 else (False,):
+            keep = partial(every_kth, places, k, -(-numbers // 8), signs, between)
+            yield f"signs of {every(k, 'frame')}{', interpolated' * between}", "binary", keep
     yield from _product_quantisers(route, other)
     for codec in ("libx264", "libx265"):
         for crf in QUALITIES:
-            yield f"{codec[3:]}, crf {crf}", "video", partial(_video, route, codec, crf)
+            for k in VIDEO_SPACED:
+                name = f"{codec[3:]}, crf {crf}, {every(k, 'frame')}{', interpolated' * (k > 1)}"
+                yield name, "video", partial(_video, route, codec, crf, k)
 
 
 def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Store]:
@@ -290,9 +324,13 @@ def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Store]
             yield name, family, partial(keep, k, m, rotated, own, between)
 
 
-def _video(route: Route, codec: str, crf: int) -> Kept:
-    coded = CodedVideo(route.reference, codec, crf)
-    return Kept(route.model.extract_all(coded).float(), coded.bytes)
+def _video(route: Route, codec: str, crf: int, k: int) -> Kept:
+    """Every k-th frame coded and described again, straight lines between the descriptors."""
+    coded = CodedVideo(route.reference, codec, crf, step=k)
+    keys, count = route.model.extract_all(coded).float(), len(route.places)
+    if k > 1 and (count - 1) % k:  # the last place is given back as the last one stored
+        keys = torch.cat([keys, keys[-1:]])
+    return Kept(between_keyframes(keys, count, k) if k > 1 else keys, coded.bytes)
 
 
 def _other_whitenings(route: Route, other: Traverse | None, seed: int) -> Iterator[Contender]:
@@ -560,42 +598,49 @@ def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float
 def storage_tables(rows: Sequence[Row], at: float = 1.6) -> Iterator[tuple[str, list[list[str]]]]:
     """For each route: a heading and rows of text, the best area of each family in so many bytes per place.
 
-    A second table has the bytes per place that each family needs for our area at `at` bytes, by T; a third
-    the areas by other whitenings.
+    A second table has the bytes per place that each family needs, by T, for our area at `at` bytes or, where
+    that is larger, for `LEVEL`; a third the areas by other whitenings.
     """
-    equal, others = equal_areas(rows), whitenings(rows)
+    others = whitenings(rows)
     for case, own in _cases(rows).items():
         families = _families(own)
-        table = [["AUC, route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
+        table = [["route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
         for name, some in families.items():
             fits = ([r.auc or 0 for r in some if (r.route_bytes_per_place or 0) <= NEAR * b] for b in SHOWN)
             table.append([name, *(f"{max(areas):.3f}" if areas else "" for areas in fits)])
-        yield case, table
-        near = [one for one in equal if one["case"] == case and one["route_bytes_per_place"] <= NEAR * at]
-        chosen = {
-            length: max(mine, key=lambda one: float(one["route_bytes_per_place"]))
-            for length in LENGTHS
-            if (mine := [one for one in near if one["T"] == length])
-        }
-        if chosen:
-            table = [["bytes per place for our AUC:", *(f"T = {length}" for length in chosen)]]
-            table.append([OURS, *(f"{one['route_bytes_per_place']:.2f}" for one in chosen.values())])
-            for name in families:
-                if name != OURS:
-                    sizes = (one["bytes_per_place"][name] for one in chosen.values())
-                    table.append([name, *("never" if size is None else f"{size:.2f}" for size in sizes)])
-            yield "", table
+        yield f"{case}: AUC", table
+        levels = {}
+        for length in LENGTHS:
+            ours = [point.auc for point in front(families.get(OURS, ()), length) if point.size <= NEAR * at]
+            if ours:
+                levels[length] = min(max(ours), LEVEL)
+        if levels:
+            table = [["queries together:", *(f"T = {length}" for length in levels)]]
+            table.append(["AUC", *(f"{level:.3f}" for level in levels.values())])
+            for name, some in families.items():
+                needed = (_needed(level, front(some, length)) for length, level in levels.items())
+                table.append([name, *needed])
+            yield "route bytes per place for an AUC", table
         if case in others:
-            table = [[f"whitening, {WHITENED:g} bytes per place:", "fixed kB", "AUC"]]
+            table = [["whitening:", "fixed kB", "AUC"]]
             table += [[one.name, f"{one.fixed_bytes / 1000:.0f}", f"{one.auc:.3f}"] for one in others[case]]
-            yield "", table
+            yield f"AUC of dejavu at {WHITENED:g} bytes per place", table
+
+
+def _needed(auc: float, points: Sequence[Point]) -> str:
+    size = bytes_for(auc, points)
+    if size is None:
+        return "never"
+    return f"{'<' * (points[0].auc > auc)}{size:.2f}"
 
 
 def skipped_lines(rows: Sequence[Row]) -> list[str]:
-    """Why rows were skipped, one line for each reason."""
-    reasons: dict[tuple[str, str], int] = {}
+    """Why rows were skipped, one line for each reason, with the first of them."""
+    reasons: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row.skipped:
-            key = row.case, row.skipped
-            reasons[key] = reasons.get(key, 0) + 1
-    return [f"{case}: {count} skipped: {reason}" for (case, reason), count in reasons.items()]
+            reasons.setdefault((row.case, row.skipped), []).append(row.contender)
+    return [
+        f"{case}: skipped {names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {reason}"
+        for (case, reason), names in reasons.items()
+    ]

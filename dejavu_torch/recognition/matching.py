@@ -54,6 +54,13 @@ class Matching(NamedTuple):
     ranks: int = 1
     apart: int = 0
 
+    @property
+    def single(self) -> bool:
+        """Whether each query is matched by itself."""
+        return self.sequence is None or (
+            isinstance(self.sequence, SequenceMatcher) and self.sequence.length == 1
+        )
+
     def found(self, batches: Iterable[Tensor]) -> Found:
         """What is found by scores (B,N) of single queries, batches one behind the other.
 

@@ -56,13 +56,15 @@ def test_the_uncompressed_reference_finds_its_own_frames() -> None:
 
 @pytest.mark.parametrize("k", [1, 4])
 def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> None:
-    """Its distances are those of the stored frame before it, and the frame reported is a stored one."""
+    """Their distances are those of the nearest stored frame; a sequence tells where between them it is."""
     reference, query, matcher = torch.rand(30, 3), torch.rand(25, 3), SequenceMatcher(6)
-    match = nearest_frames(reference, query, k, matching=Matching(matcher)).match()
-    stored = reference[torch.arange(30) // k * k]
-    score, index = matcher(torch.cdist(query, stored, p=1)).min(1)
-    assert match.index.tolist() == (index // k * k).tolist()
-    assert torch.allclose(match.score, score)
+    found = nearest_frames(reference, query, k, matching=Matching(matcher, lengths=(1, 6)))
+    nearest = [min(range(0, 30, k), key=lambda stored: (abs(stored - frame), -stored)) for frame in range(30)]
+    score, index = matcher(torch.cdist(query, reference[nearest], p=1)).min(1)
+    for match in (found.match(), found.sequences[6]):
+        assert match.index.tolist() == index.tolist()
+        assert torch.allclose(match.score, score)
+    assert found.sequences[1].index.tolist() == nearest_frames(reference, query, k).match().index.tolist()
 
 
 def test_distances_in_parts_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,3 +38,14 @@ def test_grey_frames_of_odd_sizes() -> None:
 def test_ready_features_are_no_frames() -> None:
     with refused("ready features", "expected frames"):
         CodedVideo(ArrayTraverse(torch.rand(5, 8)), "libx264", 20)
+
+
+def test_every_kth_frame() -> None:
+    if "libx264" not in av.codecs_available:
+        pytest.skip("no libx264")
+    traverse = open_source("sim:aerial?frames=10")
+    every, third = (CodedVideo(traverse, "libx264", 10, step) for step in (1, 3))
+    assert (every.length, third.length) == (10, 4)
+    assert third.bytes < every.bytes
+    errors = (all_of(third)[-1] - all_of(traverse)).square().mean((1, 2, 3))
+    assert int(errors.argmin()) == 9

@@ -94,8 +94,11 @@ def test_all_bytes_are_counted_fixed_and_growing_apart(rows: list[Row]) -> None:
     assert whole.fixed_bytes >= NUMBERS * NUMBERS // 2  # the whitening, 4 bits a number
     assert whole.bytes == whole.route_bytes + whole.fixed_bytes
     assert ours.route_bytes_per_place == pytest.approx(5, rel=0.02)
-    pca = found["PCA, 3 numbers, int8"]
-    assert (pca.route_bytes, pca.fixed_bytes) > (3 * PLACES - 1, whole.fixed_bytes)
+    pca = found["PCA, 4 numbers of every frame, int8"]
+    assert pca.route_bytes == 4 * PLACES
+    assert (pca.fixed_bytes or 0) > whole.fixed_bytes
+    between = found["PCA, 4 numbers of every 10th frame, int8, interpolated"]
+    assert between.route_bytes == 4 * (PLACES // 10 + 1)  # the last one too
     assert found["signs of every frame"].route_bytes == PLACES * 4  # of 25 bits
 
 
@@ -253,15 +256,21 @@ def test_equal_areas() -> None:
 
 
 def test_the_tables() -> None:
-    rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8)]
+    rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8), of(2, 0.99, "more")]
     (title, best), (_, equal) = storage_tables([*rows, Row("case", "none", "none", skipped="absent")], at=3.2)
-    assert title == "case"
+    assert title == "case: AUC"
     assert best[1:] == [
         ["dejavu", "0.500", "0.500", "0.750", "0.750", "0.750"],
         ["other", "0.400", "0.400", "0.400", "0.400", "0.800"],
+        ["more", "", "", "0.990", "0.990", "0.990"],
     ]
-    assert [row[1] for row in equal] == ["T = 1", "3.20", f"{bytes_for(0.75, front(rows[2:])):.2f}"]
-    assert skipped_lines([Row("case", "none", "none", skipped="absent")]) == ["case: 1 skipped: absent"]
+    other = f"{bytes_for(0.75, front(rows[2:4])):.2f}"
+    assert [row[1] for row in equal] == ["T = 1", "0.750", "3.20", other, "<2.00"]
+    (_, _), (_, equal) = storage_tables([of(1, 0.9, "dejavu"), of(1.6, 0.99, "dejavu"), of(2, 0.8)])
+    assert [row[1] for row in equal] == ["T = 1", "0.950", f"{1.6 ** (5 / 9):.2f}", "never"]
+    skipped = [Row("case", name, "none", skipped="absent") for name in "abc"]
+    assert skipped_lines(skipped) == ["case: skipped a and 2 more: absent"]
+    assert skipped_lines(skipped[:1]) == ["case: skipped a: absent"]
 
 
 def test_rows_are_written_as_they_finish(
@@ -338,6 +347,11 @@ def test_built_in_routes() -> None:
         (["--places", "1"], ["--places 1", "at least 2"]),
         (["--codebooks", "A"], ["--codebooks", "pairs"]),
         (["A", "nowhere"], ["nowhere", "expected"]),
+        (["A", "B", "A", "B"], ["given twice"]),
+        (["A", "B", "A", "SHORT"], ["300 frames", "200", "as many"]),
+        (["A", "B", "--map", "OF_SHORT"], ["200 places", "300", "the reference"]),
+        (["A", "B", "--map", "OF_NARROW"], ["24", "9"]),
+        (["A", "B", "--whitening", "OF_NARROW"], ["a.npy gives 24", "9 features"]),
         (["A", "SHORT"], ["300 frames", "200", "as many"]),
         (["A", "NARROW"], ["24 features", "9"]),
     ],
@@ -351,11 +365,16 @@ def test_what_is_refused(
 ) -> None:
     np.save(tmp_path / "short.npy", series(1)[:200].numpy())
     np.save(tmp_path / "narrow.npy", series(1)[:, :9].numpy())
+    for name in ("short", "narrow"):
+        if f"OF_{name.upper()}" in words:
+            run("learn", tmp_path / f"{name}.npy", "--map", tmp_path / f"{name}.safetensors")
     known = {
         "A": pair[0],
         "B": pair[1],
         "SHORT": str(tmp_path / "short.npy"),
         "NARROW": str(tmp_path / "narrow.npy"),
+        "OF_SHORT": str(tmp_path / "short.safetensors"),
+        "OF_NARROW": str(tmp_path / "narrow.safetensors"),
     }
     chosen = [known.get(word, word) for word in words]
     error = fails(capsys, "bench", "storage", *chosen, "--out", tmp_path / "out")
