@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import zlib
+from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -27,6 +29,7 @@ NEAR = 34  # kinds of neighbourhood
 CONTEXTS = LENGTH + 8 * NEAR
 FIRST = (2, 1)  # 0s and 1s of a context before there are any; each one counts 2
 
+BLOCK = 2**18  # levels whose bits are found at a time
 SPAN, BYTE = 56, 48  # bits of the coder's interval at first, and at least
 
 
@@ -49,11 +52,9 @@ def encode(levels: Tensor) -> Stream:
         column two rows before, which is the line of the same kind, cosine or sine.
     """
     whole = levels.detach().cpu().contiguous().numpy()
-    contexts, bits, order = (np.concatenate(part) for part in zip(*_decisions(whole), strict=True))
-    order = order.argsort(kind="stable")
     zeros, ones = [FIRST[0]] * CONTEXTS, [FIRST[1]] * CONTEXTS
     packed, low, span = bytearray(), 0, 1 << SPAN
-    for context, bit in zip(contexts[order].tolist(), bits[order].tolist(), strict=True):
+    for context, bit in itertools.chain.from_iterable(map(_in_order, _decisions(whole))):
         zero, one = zeros[context], ones[context]
         part = span // (zero + one) * zero
         if bit:
@@ -79,7 +80,8 @@ def coded_bytes(levels: Tensor) -> int:
         1
     """
     counts = np.zeros(2 * CONTEXTS, np.int64)
-    for contexts, bits, _ in _decisions(levels.detach().cpu().contiguous().numpy()):
+    blocks = _decisions(levels.detach().cpu().contiguous().numpy())
+    for contexts, bits, _ in itertools.chain.from_iterable(blocks):
         counts += np.bincount(2 * contexts + bits, minlength=2 * CONTEXTS)
     start = torch.tensor(FIRST, dtype=torch.float64) / 2
     after = torch.from_numpy(counts).view(-1, 2) + start
@@ -122,33 +124,41 @@ def check_claim(rows: int, columns: int) -> None:
         )
 
 
-def _decisions(levels: Ints) -> list[tuple[Ints, Ints, Ints]]:
-    """All bits that `encode` codes: their contexts, what they are, and numbers that sort them."""
+def _decisions(levels: Ints) -> Iterator[list[tuple[Ints, Ints, Ints]]]:
+    """All bits that `encode` codes, a block of rows at a time: contexts, what they are, what sorts them."""
     filled = np.flatnonzero(levels.any(1))
     rows, columns = int(filled[-1]) + 1 if len(filled) else 0, levels.shape[1]
-    places = np.arange(min(rows + 1, len(levels)))
-    last = (places == rows).astype(np.int8)
-    parts: list[tuple[Ints, Ints, Ints]]
-    parts = [(np.full(len(places), END, np.int16), last, places * columns * 32)]
-    if not rows:
-        return parts
-    sizes = np.abs(levels[:rows].astype(np.int16))
-    near = _near(_summed(sizes), np.arange(rows)).ravel()
-    size, order = sizes.ravel(), np.arange(rows * columns) * 32 + 1
-    negative, length = levels[:rows].ravel() < 0, _lengths()[size]
-    before = np.sign(np.concatenate([np.zeros((2, columns), np.int8), levels[:rows]])[:rows]).ravel()
+    sums = _summed(levels[:rows])
+    ends = min(rows + 1, len(levels))
+    step = max(1, BLOCK // columns)
+    for start in range(0, ends, step):
+        places = np.arange(start, min(start + step, ends))
+        last = (places == rows).astype(np.int8)
+        parts: list[tuple[Ints, Ints, Ints]]
+        parts = [(np.full(len(places), END, np.int16), last, (places - start) * columns * 32)]
+        there = places[places < rows]
+        if len(there):
+            parts += _of_levels(levels, there, _near(sums, there))
+        yield parts
+
+
+def _of_levels(levels: Ints, rows: Ints, near: Ints) -> Iterator[tuple[Ints, Ints, Ints]]:
+    """The bits of the levels of some rows, one behind the other."""
+    here, near = levels[rows].ravel(), near.ravel()
+    size, order = np.abs(here.astype(np.int16)), np.arange(len(here)) * 32 + 1
+    before = np.where(rows[:, None] < 2, 0, np.sign(levels[np.maximum(rows - 2, 0)])).ravel()
+    negative, length = here < 0, _lengths()[size]
     for n in range(8):
-        parts.append((LENGTH + n * NEAR + near, (length > n).astype(np.int8), order + n))
+        yield LENGTH + n * NEAR + near, (length > n).astype(np.int8), order + n
         kept = length > n
         size, near, order = size[kept], near[kept], order[kept]
         length = length[kept]
         if not n:
-            parts.append((SIGN + 1 + before[kept], negative[kept].astype(np.int8), order + 8))
+            yield SIGN + 1 + before[kept], negative[kept].astype(np.int8), order + 8
         for bit in range(n):
             ends = length == n + 1
             context = np.full(int(ends.sum()), BITS + n * 8 + bit, np.int16)
-            parts.append((context, size[ends] >> bit & 1, order[ends] + 16 - bit))
-    return parts
+            yield context, size[ends] >> bit & 1, order[ends] + 16 - bit
 
 
 def _decode(packed: bytes, levels: Ints) -> None:
@@ -213,10 +223,17 @@ def _shift(packed: bytearray, low: int) -> int:
     return rest << 8
 
 
-def _summed(sizes: Ints) -> Ints:
-    """(W,K) magnitudes, summed over the rows before: (W+1,K)."""
-    sums = np.zeros((len(sizes) + 1, sizes.shape[1]), np.int32)
-    np.minimum(sizes, MOST).cumsum(0, out=sums[1:])
+def _in_order(parts: list[tuple[Ints, Ints, Ints]]) -> Iterator[tuple[int, int]]:
+    """Contexts and bits as they are coded."""
+    contexts, bits, order = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = order.argsort()
+    return zip(contexts[order].tolist(), bits[order].tolist(), strict=True)
+
+
+def _summed(levels: Ints) -> Ints:
+    """(W,K) levels, their magnitudes summed over the rows before: (W+1,K)."""
+    sums = np.zeros((len(levels) + 1, levels.shape[1]), np.int32)
+    np.minimum(np.abs(levels, dtype=np.int16), MOST).cumsum(0, out=sums[1:])
     return sums
 
 

@@ -56,6 +56,15 @@ def test_any_levels_come_back(rows: int, columns: int, data: st.DataObject) -> N
     assert 0 <= coded_bytes(own) - len(stream.bytes) <= 1
 
 
+def test_how_many_rows_are_coded_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = to_int8(levels())[0]
+    whole = encode(own), coded_bytes(own)
+    for block in (1, 7 * 16, 7 * 200):
+        monkeypatch.setattr(codec, "BLOCK", block)
+        assert torch.equal(encode(own).bytes, whole[0].bytes)
+        assert coded_bytes(own) == whole[1]
+
+
 def test_a_carry_runs_through_bytes_that_are_full() -> None:
     packed = bytearray([7, 255, 255])
     assert _shift(packed, (256 + 5 << BYTE) + 3) == 3 << 8
