@@ -198,16 +198,24 @@ def _check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
             f"the whitening is of {len(whitening.projection)} features and {reference.name} gives {features} "
             "a frame; expected as many, as frames of one size give"
         )
-    if reference.length is not None and query.length is not None and reference.length != query.length:
-        raise InputError(
-            f"{reference.name} has {reference.length} frames and {query.name} {query.length}; expected as "
-            "many, frame i being place i"
-        )
+    if reference.length is not None and query.length is not None:
+        _truth(reference, query, reference.length, query.length)
     if model.map.places and reference.length is not None and model.map.places != reference.length:
         raise InputError(
             f"the map holds {model.map.places} places and {reference.name} {reference.length}; expected the "
             "reference that it was made of"
         )
+
+
+def _truth(reference: Traverse, query: Traverse, frames: int, queries: int) -> GroundTruth:
+    """What the sources say, or frame i is place i."""
+    truth = ground_truth_of(None, reference, query, frames, queries)
+    if truth is None:
+        raise InputError(
+            f"{reference.name} has {frames} frames and {query.name} {queries}; expected as many, frame i "
+            "being place i"
+        )
+    return truth
 
 
 def _name(reference: str, query: str) -> str:
@@ -237,12 +245,7 @@ def described(
         model.whitening.seed = seed
     places = model.describe_reference(reference, None, "describing" if progress else None)
     queries = model.extract_all(query, "describing the query" if progress else None)
-    truth = ground_truth_of(None, reference, query, len(places), len(queries))
-    if truth is None:
-        raise InputError(
-            f"{reference.name} has {len(places)} frames and {query.name} {len(queries)}; expected as many, "
-            "frame i being place i"
-        )
+    truth = _truth(reference, query, len(places), len(queries))
     fixed = sum(buffer.nbytes for buffer in model.whitening.buffers())
     return Route(name, model, reference, query, places.float(), queries.float(), truth, fixed)
 

@@ -382,6 +382,12 @@ def test_what_is_refused(
     assert not (tmp_path / "out").exists()
 
 
+def test_pairs_of_other_lengths_that_know_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frontier, "contenders_of", lambda *_: [])
+    pair = [f"sim:outdoor?height=32&width=64&stop={stop}&traverse={stop % 2}" for stop in (60, 51)]
+    assert list(bench_storage(pair)) == []
+
+
 def test_the_matcher_takes_no_sources(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     error = fails(capsys, "bench", "matcher", "sim:aerial", "--out", tmp_path / "out")
     assert "storage" in error
