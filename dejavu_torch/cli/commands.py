@@ -335,7 +335,7 @@ def run_bench(
         sources: of storage, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
-        codebooks: of storage, another route, to train codebooks of product quantisers on that count nothing
+        codebooks: of storage, another route, where codebooks and a whitening are learned that count nothing
         whitening: of storage, a map whose whitening describes all routes; each learns its own if not given
         places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given
     """

@@ -36,6 +36,7 @@ STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
     "occlusion": 0.4,
     "noise": 0.03,
 }
+LEAST = 1e-12  # of a number that a power is taken of
 BITS = (4, 8, 16)  # that a number of the projection may take
 ROUNDING = 1e-7  # of the largest variance: what lies below it is none
 
@@ -135,6 +136,8 @@ class Whitening(nn.Module):
         strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
         seed: of the copies.
         bits: of each number of the projection: 4, two to a byte, 8 or 16.
+        power: of the size of each number once it is whitened, above 0 and at most 1, its sign kept. Below 1 a
+            few large numbers, such as those of something new in the frame, count for less.
 
     Shape: (B,D) -> (B,K).
 
@@ -170,6 +173,7 @@ class Whitening(nn.Module):
         strengths: Mapping[str, Any] | None = None,
         seed: int = 0,
         bits: int = 4,
+        power: float = 1.0,
     ) -> None:
         super().__init__()
         least = min(1 if count is None else count for count in (numbers, views, most_views))
@@ -178,15 +182,15 @@ class Whitening(nn.Module):
                 f"Whitening got numbers={numbers}, components={components}, views={views}, "
                 f"most_views={most_views}; expected at least 1 each, and no more numbers than components"
             )
-        if not (shrinkage is None or 0 < shrinkage <= 1) or bits not in BITS:
+        if not (shrinkage is None or 0 < shrinkage <= 1) or not 0 < power <= 1 or bits not in BITS:
             raise InputError(
-                f"Whitening got shrinkage={shrinkage}, bits={bits}; expected a shrinkage above 0 and at most "
-                f"1, {', '.join(map(str, BITS))} bits"
+                f"Whitening got shrinkage={shrinkage}, power={power}, bits={bits}; expected a shrinkage and "
+                f"a power above 0 and at most 1, {', '.join(map(str, BITS))} bits"
             )
         if not isinstance(strengths, Mapping | None):
             raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
-        self.most_views, self.seed, self.bits = most_views, seed, bits
+        self.most_views, self.seed, self.bits, self.power = most_views, seed, bits, power
         self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # learned elsewhere: it serves this route as it is
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), as `stored`
@@ -221,6 +225,9 @@ class Whitening(nn.Module):
             whitened = (exact @ self.whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
                 return torch.cat([whitened, self.length.to(whitened).expand(len(whitened), 1)], 1)
+            if self.power < 1:
+                # the least size keeps gradients finite
+                whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
             return nn.functional.normalize(whitened, dim=1)
 
     def copies(self, frames: int, features: int) -> int:
@@ -292,7 +299,17 @@ class Whitening(nn.Module):
         super()._load_from_state_dict(state, prefix, *args)
 
     def extra_repr(self) -> str:
-        names = ("numbers", "components", "shrinkage", "views", "most_views", "strengths", "seed", "bits")
+        names = (
+            "numbers",
+            "components",
+            "shrinkage",
+            "views",
+            "most_views",
+            "strengths",
+            "seed",
+            "bits",
+            "power",
+        )
         shown = [name for name in names if name != "strengths" or self.strengths != STRENGTHS]
         return ", ".join(f"{name}={getattr(self, name)}" for name in shown)
 

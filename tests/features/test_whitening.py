@@ -153,6 +153,29 @@ def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
     assert whitening.projection.nbytes == 40 * 10 * bits // 8
 
 
+def test_a_power_of_whitened_numbers() -> None:
+    places, views = route()
+    plain, roots = (Whitening(numbers=10, power=power) for power in (1.0, 0.5))
+    for whitening in (plain, roots):
+        whitening.learn(places, [(views, torch.arange(600))])
+    whitened = plain(views)
+    expected = torch.nn.functional.normalize(whitened.sign() * whitened.abs().sqrt(), dim=1)
+    torch.testing.assert_close(roots(views), expected)
+    assert found(roots, views, places) > 0.95
+    query = views[:2].double().requires_grad_()
+    assert torch.autograd.gradcheck(roots, query)
+    middle = (roots.offset / roots.scale).double() @ torch.linalg.pinv(roots.whole.double())
+    middle = middle[None].requires_grad_()  # whitened to zeros
+    roots(middle).sum().backward()
+    assert middle.grad is not None
+    assert middle.grad.isfinite().all()
+    without = Whitening(numbers=3, power=0.5)
+    without.learn(places)  # components as they are
+    other = Whitening(numbers=3)
+    other.learn(places)
+    assert torch.equal(without(views), other(views))
+
+
 @pytest.mark.parametrize("numbers", [1, 2, 7, 10])
 def test_numbers_of_four_bits_come_back_from_their_bytes(numbers: int) -> None:
     whole = torch.randint(-7, 8, (30, numbers), generator=torch.Generator().manual_seed(numbers))
@@ -253,6 +276,8 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
         ({"views": 0}, ("views=0",)),
         ({"shrinkage": 0.0}, ("shrinkage=0.0", "above 0")),
         ({"bits": 6}, ("bits=6", "4, 8, 16")),
+        ({"power": 0.0}, ("power=0.0", "above 0")),
+        ({"power": 1.5}, ("power=1.5", "at most 1")),
     ],
 )
 def test_whitening_settings_out_of_range(settings: dict[str, float], words: tuple[str, ...]) -> None:
