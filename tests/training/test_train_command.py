@@ -234,11 +234,11 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
         assert "lines of their spectra" in said.out
         assert isinstance(DejaVu.load(run / "map.safetensors").map, SpectralMap)
     last = run / "checkpoints" / "last.ckpt"
-    for size in (12, 6, 1.5):  # the map is made anew of the checkpoint's features
+    for size in (12, 6, 1.2):  # the map is made anew of the checkpoint's features
         options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
         options += ["--data.validation", "gone.npy"]  # which is not read
         train("export", "--ckpt_path", last, *options)
-        assert ("this route needs about" in capfd.readouterr().out) == (size == 1.5)
+        assert ("this route needs about" in capfd.readouterr().out) == (size == 1.2)
     maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("plain", "12", "6")]
     levels = [model.map.levels for model in maps]
     assert torch.equal(levels[0], levels[1])
