@@ -290,9 +290,7 @@ def _plot_whitenings(axis: Any, whitenings: Sequence[tuple[str, int, float]]) ->
     reach = max(max(areas) - min(areas), 0.01)
     axis.set_xlim(min(areas) - 1.2 * reach, max(areas) + 0.1 * reach)  # names in the left half
     axis.locator_params(axis="x", nbins=5)
-    axis.set(
-        ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="AUC at 5 route bytes per place, by whitening"
-    )
+    axis.set(ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="AUC of the map, by whitening")
     axis.grid(alpha=0.25)
 
 
