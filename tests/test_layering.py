@@ -15,6 +15,7 @@ FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
     {"types", "resize"},
+    {"memory"},
     {"features", "periods", "data"},
     {"database"},
     {"recognition"},
@@ -26,13 +27,14 @@ ORDER = [
     {"cli"},
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
-ONLY = {"motion": {"types", "data"}}  # rooms that use less than all to their left
+ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all to their left
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
+    "memory": "types",
     "data": "types resize",
     "features": "types resize",
     "periods": "types",
-    "database": "types data periods",
+    "database": "types memory data periods",
     "recognition": "types",
     "motion": "types data",
     "model": "types data features periods database recognition motion",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import zlib
 from collections.abc import Iterator
 from functools import cache
@@ -15,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dejavu_torch.memory import free_memory
 from dejavu_torch.types import InputError
 
 Ints = NDArray[np.integer[Any]]
@@ -118,7 +118,7 @@ def check_claim(rows: int, columns: int) -> None:
     Raises:
         InputError: naming both.
     """
-    if min(rows, columns) < 1 or rows * columns * LEVEL > memory():
+    if min(rows, columns) < 1 or rows * columns * LEVEL > free_memory():
         raise InputError(
             f"the map claims {rows} x {columns} levels; expected at least one, and what fits into the memory"
         )
@@ -284,11 +284,3 @@ def to_int8(levels: Tensor) -> tuple[Tensor, Tensor]:
 def from_int8(small: Tensor, escapes: Tensor) -> Tensor:
     """The inverse of `to_int8`, (W,K) int32."""
     return small.to(torch.int32).masked_scatter(small == ESCAPE, escapes)
-
-
-def memory() -> float:
-    """Bytes of the machine's memory; inf where it does not say."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, ValueError, OSError):
-        return math.inf

@@ -1,0 +1,64 @@
+"""How much memory there is, so that what cannot fit is refused before it is made."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+from dejavu_torch.types import InputError
+
+GROUP = Path("/sys/fs/cgroup")  # the limits of a container
+
+
+def free_memory() -> float:
+    """Bytes that may still be taken: what the system has, and the process is allowed; inf where none says."""
+    return min(_of_system(), _of_container(), _of_process())
+
+
+def check_room(needed: float, what: str) -> None:
+    """Refuse what the memory does not hold.
+
+    Args:
+        needed: bytes. what: it is, as the message begins.
+
+    Raises:
+        InputError: with both numbers.
+
+    Example:
+        >>> check_room(10**6, "a strip of 1000 x 1000 pixels")
+    """
+    free = free_memory()
+    if needed > free:
+        raise InputError(f"{what} takes {needed / 1e9:.3g} GB; expected at most the {free / 1e9:.3g} GB free")
+
+
+def _of_system() -> float:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        kilobytes = {name: value for name, _, value in (line.partition(":") for line in lines)}
+        return 1024.0 * int(kilobytes["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):  # another system
+        pass
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+def _of_container() -> float:
+    try:
+        return float((GROUP / "memory.max").read_text()) - float((GROUP / "memory.current").read_text())
+    except (OSError, ValueError):  # none, or "max"
+        return math.inf
+
+
+def _of_process() -> float:
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except (ImportError, OSError, ValueError):  # another system
+        return math.inf
+    return math.inf if limit == resource.RLIM_INFINITY else float(limit - taken)

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dejavu_torch import memory
+from dejavu_torch.memory import check_room, free_memory
+from dejavu_torch.types import InputError
+
+
+def test_some_memory_is_free_and_less_than_an_exabyte() -> None:
+    assert 2**20 < free_memory() < 2**60
+
+
+def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "free_memory", lambda: 2e9)
+    check_room(2e9, "a strip")
+    with pytest.raises(InputError, match=r"^a strip takes 3.5 GB; expected at most the 2 GB free$"):
+        check_room(3.5e9, "a strip")
+
+
+def test_the_limit_of_a_container_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    before = free_memory()
+    (tmp_path / "memory.current").write_text("1000000\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    assert free_memory() == pytest.approx(before, rel=0.5)
+    (tmp_path / "memory.max").write_text("3000000\n")
+    assert free_memory() == 2e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="this system does not say what is taken")
+def test_the_limit_of_the_process_counts() -> None:
+    code = (
+        "import resource; from dejavu_torch.memory import free_memory;"
+        "resource.setrlimit(resource.RLIMIT_AS, (2**36, resource.RLIM_INFINITY));"
+        "assert free_memory() < 2**36; print(free_memory())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 0 < float(run.stdout) < 2**36
+
+
+def test_a_system_that_says_nothing_limits_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_of_system", "_of_container", "_of_process"):
+        monkeypatch.setattr(memory, name, lambda: math.inf)
+    check_room(1e30, "anything")
