@@ -159,7 +159,7 @@ def test_a_claim_beyond_the_memory_is_refused_before_anything_is_made(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stream = encode(to_int8(levels())[0])
-    with refused("claims 10000000000 x 10000", "free_memory"):
+    with refused("claims 10000000000 x 10000", "memory"):
         decode(stream, 10**10, 10**4)
     monkeypatch.setattr(codec, "free_memory", lambda: math.inf)
     assert decode(stream, 200, 7).shape == (200, 7)
