@@ -117,6 +117,12 @@ class FrequencyLayer:
             )
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
+        a, b = self.period.as_integer_ratio()
+        if max(self.stop * b, a * self.phases) >= 2**63:
+            raise InputError(
+                f"a layer has period {self.period}, {self.phases} phases and the end {self.stop}; "
+                "expected numbers whose products are below 2^63"
+            )
         ascending = all(a < b for a, b in pairwise(self.features))
         if not self.features or self.features[0] < 0 or not ascending:
             raise InputError(

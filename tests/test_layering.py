@@ -31,7 +31,7 @@ ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all t
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
     "memory": "types",
-    "data": "types resize",
+    "data": "types resize memory",
     "features": "types resize",
     "periods": "types",
     "database": "types memory data periods",

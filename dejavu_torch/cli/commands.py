@@ -370,6 +370,7 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
         features: class of the map's features, if not ours
     """
     from dejavu_torch.database.l1 import l1_backend
+    from dejavu_torch.database.mapfile import FORMAT
     from dejavu_torch.periods.stft import BACKEND
 
     model = DejaVu.load(map, features)
@@ -387,6 +388,7 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
     if model.trained is not None:
         steps, seconds, seed = model.trained
         print(f"trained for {steps} steps in {seconds:.0f} s, seed {seed}")
+    print(f"map format {FORMAT}, its checksums agree")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
     _print_next("localize", map, "QUERY", "--out", "matches.csv")
 
