@@ -14,6 +14,8 @@ from dejavu_torch.types import InputError
 
 LARGEST = 2**53  # beyond it a float does not hold every whole number
 
+BYTES_A_CHARACTER = 64  # that the lines of a table take once they are read
+
 
 def check_regular(path: Path, expected: str) -> int:
     """The bytes of a file; refuses what is none, such as a fifo or a device, which would be waited for.
@@ -71,7 +73,7 @@ def read_text(path: Path, expected: str) -> str:
     Raises:
         InputError: it cannot be read, is no text, or larger than the memory.
     """
-    check_room(4.0 * check_regular(path, expected), f"the text of {path}")
+    check_room(BYTES_A_CHARACTER * check_regular(path, expected), f"the text of {path}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
