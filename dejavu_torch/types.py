@@ -14,10 +14,30 @@ import torch
 from torch import Tensor, nn
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch: 256 MB
+LONGEST_MESSAGE = 2000  # characters
+
+
+def printable(text: object) -> str:
+    """A text as one line that can be printed anywhere: what cannot, such as a line break in a name, escaped.
+
+    Example:
+        >>> print(printable("a\\nb.png"))
+        a\\nb.png
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 class InputError(ValueError):
-    """Bad input. Its message is one line: what was seen and what was expected."""
+    """Bad input. Its message is one line: what was seen and what was expected.
+
+    Names in it may hold anything: what is not printable is escaped, and of a long text the middle left out.
+    """
+
+    def __init__(self, message: object) -> None:
+        text = printable(message)
+        if len(text) > LONGEST_MESSAGE:
+            text = f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 2 :]}"
+        super().__init__(text)
 
 
 class Traverse(ABC):

@@ -31,9 +31,9 @@ ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all t
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
     "memory": "types",
-    "data": "types resize memory",
+    "data": "types memory resize",
     "features": "types resize",
-    "periods": "types",
+    "periods": "types memory",
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "types data",

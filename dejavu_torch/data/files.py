@@ -3,13 +3,65 @@
 from __future__ import annotations
 
 import os
+import stat
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError
 
 LARGEST = 2**53  # beyond it a float does not hold every whole number
+
+BYTES_A_CHARACTER = 64  # that the lines of a table take once they are read
+
+
+def check_regular(path: Path, expected: str) -> int:
+    """The bytes of a file; refuses what is none, such as a fifo or a device, which would be waited for.
+
+    Args:
+        expected: what the file should hold, for messages.
+
+    Raises:
+        InputError: no such file, or no regular one.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise InputError(f"{path} cannot be read: {_why(error)}; expected {expected}") from error
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a directory" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        raise InputError(f"{path} is {kind}; expected {expected}")
+    return status.st_size
+
+
+@contextmanager
+def reading(path: Path, seen: str, expected: str) -> Iterator[None]:
+    """Read a file by what is not ours: whatever that raises is one refusal, whatever it warns of is no line.
+
+    Args:
+        seen: what a message says of a file that cannot be read, such as "is no image".
+        expected: what the file should hold, for messages.
+
+    Raises:
+        InputError: no regular file, or one that cannot be read; those of the block as they are.
+    """
+    check_regular(path, expected)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:  # a decoder may raise anything: struct.error, KeyError, MemoryError, ..
+        raise InputError(f"{path} {seen}: {_why(error)}; expected {expected}") from error
+
+
+def _why(error: Exception) -> str:
+    """An exception in words of one line."""
+    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(str(text).split())
 
 
 def read_text(path: Path, expected: str) -> str:
@@ -19,12 +71,13 @@ def read_text(path: Path, expected: str) -> str:
         expected: what the file should hold, for messages.
 
     Raises:
-        InputError: it cannot be read, or is no text.
+        InputError: it cannot be read, is no text, or larger than the memory.
     """
+    check_room(BYTES_A_CHARACTER * check_regular(path, expected), f"the text of {path}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; expected {expected}") from error
+        raise InputError(f"{path} cannot be read: {_why(error)}; expected {expected}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is no UTF-8 text; expected {expected}") from error
     if "\0" in text:

@@ -103,7 +103,7 @@ def evaluate_file(
     }
     ours = contend(matches.name, match, known, tolerance)
     seen = places or 1 + max(int(table.max()) for table in (match.index, known.positives))
-    borders = torch.arange(seen + 1) if place_map is None else place_map.borders
+    borders = torch.tensor([seen]) if place_map is None else place_map.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
     pictures |= draw_coverage(match, known, tolerance, borders, queries, facts["unit"])
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
