@@ -14,7 +14,7 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"types", "resize"},
+    {"types", "resize", "text"},
     {"memory"},
     {"features", "periods", "data"},
     {"database"},
