@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from unicodedata import category
+
 
 def printable(text: object) -> str:
-    """A text of one line: each character that is not printable, such as a line break, is escaped.
+    """A text of one line: each character that is neither printable nor a space, as a line break, is escaped.
 
     Bytes of a file name that are no text in the system's encoding count among them.
 
@@ -12,4 +14,7 @@ def printable(text: object) -> str:
         >>> printable("two\\nlines")
         'two\\\\nlines'
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+    return "".join(
+        c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode()
+        for c in str(text)
+    )
