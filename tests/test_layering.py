@@ -14,7 +14,7 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"types", "resize"},
+    {"types", "resize", "text"},
     {"memory"},
     {"features", "periods", "data"},
     {"database"},
@@ -38,10 +38,11 @@ ARROWS = {
     "recognition": "types",
     "motion": "types data",
     "model": "types data features periods database recognition motion",
-    "evaluation": "types resize data features periods database recognition motion model",
+    "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types resize data features periods database recognition motion model evaluation",
-    "experiments": "types data features periods database recognition motion model evaluation",
-    "cli": "types data features periods database recognition motion model evaluation training experiments",
+    "experiments": "types text data features periods database recognition motion model evaluation",
+    "cli": "types text data features periods database recognition motion model evaluation training "
+    "experiments",
 }
 
 
