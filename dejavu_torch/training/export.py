@@ -59,9 +59,7 @@ class MapExport(Callback):
         if best is not None and not Path(best).is_file():
             log.warning("%s is gone: the map is of the last step", best)
         elif best is not None:
-            seconds = pl_module.seconds  # of the whole run, not up to there
             load_weights(pl_module, best)
-            pl_module.seconds = seconds
         self.write(pl_module, Path(trainer.default_root_dir))
 
     def on_exception(

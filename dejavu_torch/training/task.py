@@ -6,7 +6,6 @@ import copy
 import logging
 import math
 import os
-import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -155,8 +154,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.began = 0  # the step at which it began
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
         self.metric: PlaceRecognition | None = None  # `setup` makes it
-        self.steps, self.seconds = 0, 0.0  # of the training that a checkpoint comes from
-        self._clock: float | None = None
+        self.steps = 0  # of the training that a checkpoint comes from
         self._callbacks: list[pl.Callback] = []
 
     @property
@@ -271,7 +269,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             mapper.trainable = False
         steps = 0 if self._trainer is None else self.trainer.global_step
         seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
-        model.trained = Training(steps or self.steps, self._elapsed(), int(seed) if seed else None)
+        model.trained = Training(steps or self.steps, int(seed) if seed else None)
         return model
 
     def require_map(self) -> None:
@@ -310,8 +308,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.index, self.began = self.index + 1, step
 
     def on_fit_start(self) -> None:
-        """Start the clock; callbacks that watch a figure wait for the last stage."""
-        self._clock = time.perf_counter()
+        """Callbacks that watch a figure wait for the last stage."""
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
             self.trainer.callbacks = [  # type: ignore[attr-defined]
@@ -360,17 +357,10 @@ class PlaceRecognitionTask(pl.LightningModule):
             module.eval()
         return self
 
-    def on_train_end(self) -> None:
-        """Stop the clock."""
-        self.seconds, self._clock = self._elapsed(), None
-
     def teardown(self, stage: str) -> None:
         """Give the trainer back its callbacks."""
         if self._callbacks:
             self.trainer.callbacks, self._callbacks = self._callbacks, []  # type: ignore[attr-defined]
-
-    def _elapsed(self) -> float:
-        return self.seconds + (0.0 if self._clock is None else time.perf_counter() - self._clock)
 
     # validation and test
 
@@ -408,10 +398,9 @@ class PlaceRecognitionTask(pl.LightningModule):
     # checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the stage, the clock, and what is trained; a map that is made is made anew."""
+        """Keep the stage, and what is trained; a map that is made is made anew."""
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
-        checkpoint |= {"seconds": self._elapsed()}
         if self.made:
             checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
 
@@ -433,7 +422,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         if not self.made:
             self._take_templates(checkpoint["state_dict"])
         self.index, self.began = checkpoint["stage"], checkpoint["began"]
-        self.steps, self.seconds = checkpoint["global_step"], checkpoint["seconds"]
+        self.steps = checkpoint["global_step"]
         other = sorted(set(self._trained()) ^ set(checkpoint["trained"]))
         if other:
             raise InputError(
