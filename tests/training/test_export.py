@@ -14,7 +14,8 @@ from small_training import Stop, data_of, footage, new_task, trainer, warned
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.training.export import LastCheckpoint, load_weights
+from dejavu_torch.training.export import LastCheckpoint
+from dejavu_torch.training.task import load_weights
 
 
 class Wreck(Callback):
