@@ -259,34 +259,38 @@ def mutate_text(random: Random, text: str, tokens: Sequence[str] = TOKENS) -> by
     return text.encode(random.choice(("utf-16", "latin-1")), "replace") if random.random() < 0.05 else data
 
 
-def mutate_words(random: Random, words: Sequence[str], others: Sequence[str]) -> list[str]:
-    """A command line with words removed, doubled, exchanged, emptied, changed, or of other commands.
+def mutate_words(random: Random, words: Sequence[str], others: Sequence[Sequence[str]]) -> list[str]:
+    """A command line with words removed, doubled, exchanged, emptied, changed, or some of other lines.
+
+    Args:
+        others: words that stand together, such as an option and its value.
 
     No word becomes an absolute path: what a command writes stays in its folder.
     """
     found = list(words)
     for _ in range(times(random)):
-        at, act = random.randrange(len(found)) if found else 0, random.randrange(8)
-        if not found or act == 0:
-            found.insert(at, random.choice(others))
-        elif act == 1:
-            del found[at]
-        elif act == 2:
-            found.insert(at, found[at])
+        at, act = random.randrange(len(found)) if found else 0, random.randrange(12)
+        if not found or act < 3:
+            found += random.choice(others)
         elif act == 3:
+            del found[at]
+        elif act == 4:
+            found.insert(at, found[at])
+        elif act == 5:
             other = random.randrange(len(found))
             found[at], found[other] = found[other], found[at]
-        elif act == 4:
-            found[at] = random.choice(others)
-        elif act == 5:
-            found[at] = random.choice(TOKENS)
+        elif act == 6:
+            found[at : at + 1] = random.choice(others)
         else:
-            name, equals, _ = found[at].partition("=")
-            if equals and random.random() < 0.5:
-                found[at] = f"{name}={random.choice(TOKENS)}"
+            values = [i for i, word in enumerate(found) if (i and not word.startswith("--")) or "=" in word]
+            at = random.choice(values) if values and random.random() < 0.7 else at
+            name, equals, value = found[at].partition("=")
+            name, value = (name + equals, value) if name.startswith("--") and equals else ("", found[at])
+            if random.random() < 0.5:
+                found[at] = name + random.choice(TOKENS)
             else:
-                found[at] = mutate_text(random, found[at]).decode(errors="surrogateescape")
-    # a system hands over no word with a zero byte, and none that begins at the root of its files
+                found[at] = name + mutate_text(random, value).decode(errors="surrogateescape")
+    # a system hands over no word with a zero byte; the others begin at the root of its files, or at home
     return [re.sub("(^|=|:)(/|~)+", r"\1", word.replace("\0", "")) for word in found]
 
 

@@ -533,7 +533,7 @@ def train_commands(case: Case) -> None:
     elif act < 0.7:
         Path("in/train.yaml").write_bytes(mutated_yaml(random, TRAIN))
     else:
-        words = ["train", *mutate_words(random, words[1:], TRAIN_WORDS)]
+        words = ["train", *mutate_words(random, words[1:], TRAIN_OTHERS)]
     case.begin(command=True)
     cli.run(words)
 
@@ -677,94 +677,72 @@ SLOW_LINES = (
         "3",
     ],
 )
-OTHER_WORDS = sorted(
-    {word for line in (*LINES, *SLOW_LINES) for word in line}
-    | {
-        "in/empty",
-        "in/a_file",
-        "in",
-        "out",
-        "missing",
-        "out/no/m.csv",
-        "utm:25",
-        "utm",
-        "train",
-        "--config",
-        "paper",
-    }
-    | {
-        "in/last.ckpt",
-        "in/config.yaml",
-        "--velocity",
-        "--velocity.step=2",
-        "--mapper=TemplateMapper",
-        "--corners",
-    }
-    | {
-        "--mapper.help",
-        "--features=HOG",
-        "--mapper.route_bytes_per_place",
-        "--velocity=GroundOdometry",
-        "--query",
-    }
-    | {
-        "--mapper",
-        "null",
-        "--features.help",
-        "Whitening",
-        "[]",
-        "{}",
-        "[[0,0],[1,0],[1,1],[0,1]]",
-        "--whitening.seed",
-    }
-    | {
-        "--whitening.views=2",
-        "--preprocess.grid=[2,2]",
-        "--threshold=nan",
-        "x" * 300 + ".safetensors",
-        "\udcff.npy",
-    }
-)
-TRAIN_WORDS = sorted(
-    {
-        "fit",
-        "validate",
-        "test",
-        "export",
-        "--config",
-        "in/config.yaml",
-        "in/a_file",
-        "--data.source",
-        "in/query.npy",
-    }
-    | {
-        "--trainer.max_steps=1",
-        "--trainer.max_epochs",
-        "--model.backbone.dimension=4",
-        "--data.batch_size=0",
-        "--help",
-    }
-    | {
-        "--data.validation=in/query.npy",
-        "--trainer.precision=16",
-        "--ckpt_path",
-        "in/spectral.safetensors",
-        "-c",
-    }
-    | {
-        "--trainer.default_root_dir=in/a_file",
-        "--trainer.accelerator=gpu",
-        "--optimizer",
-        "--seed_everything",
-        "null",
-    }
-)
+
+
+def groups(line: Sequence[str]) -> list[list[str]]:
+    """The words of a line, each option with its value."""
+    found: list[list[str]] = []
+    for word in line:
+        after_option = bool(found) and len(found[-1]) == 1 and found[-1][0].startswith("--")
+        if after_option and "=" not in found[-1][0] and not word.startswith("--"):
+            found[-1].append(word)
+        else:
+            found.append([word])
+    return found
+
+
+OTHERS = [
+    *(group for line in (*LINES, *SLOW_LINES) for group in groups(line)),
+    *(
+        [word]
+        for word in ("in/empty", "in/a_file", "in", "out", "missing", "utm:25", "train", "in/last.ckpt")
+    ),
+    *(
+        [word]
+        for word in ("--velocity", "--config", "null", "[]", "{}", "x" * 300 + ".safetensors", "\udcff.npy")
+    ),
+    *(["--velocity.step", "2"], ["--velocity=GroundOdometry"], ["--corners", "[[0,0],[1,0],[1,1],[0,1]]"]),
+    *(["--mapper=TemplateMapper"], ["--mapper", "null"], ["--features=HOG"], ["--features.cell", "1000"]),
+    *(["--mapper.help"], ["--features.help", "Whitening"], ["--mapper.route_bytes_per_place", "1e-9"]),
+    *(["--whitening.seed", "-1"], ["--whitening.views=2"], ["--preprocess.grid=[2,2]"], ["--threshold=nan"]),
+    *(["--query", "in/query.npy"], ["--config", "paper"], ["--config", "in/config.yaml"], ["--truth", "utm"]),
+    *(
+        ["--tolerance", "9223372036854775808"],
+        ["--seed", "-1"],
+        ["--seed", str(2**70)],
+        ["--batch_size", "0"],
+    ),
+    *(["--top", "999"], ["--sequence", "999"], ["--sequence=3", "--filter"], ["--speeds", "[nan]"]),
+    *(
+        ["--moves", "[0,0]"],
+        ["--out", "in/a_file"],
+        ["--out", "out/no/m.csv"],
+        ["--map", "in/spectral.safetensors"],
+    ),
+]
+TRAIN_OTHERS = [
+    *([word] for word in ("fit", "validate", "test", "export", "in/a_file", "--help", "-c", "null", "")),
+    *(["--data.source", "in/query.npy"], ["--data.batch_size=0"], ["--data.validation=in/query.npy"]),
+    *(
+        ["--trainer.max_steps=1"],
+        ["--trainer.max_epochs", "1"],
+        ["--trainer.precision=16"],
+        ["--optimizer", "x"],
+    ),
+    *(["--trainer.default_root_dir=in/a_file"], ["--trainer.accelerator=gpu"], ["--seed_everything", "-1"]),
+    *(
+        ["--ckpt_path", "in/spectral.safetensors"],
+        ["--config", "in/config.yaml"],
+        ["--model.backbone.dimension=4"],
+    ),
+    *(["--data.tolerance", "-1"], ["--trainer.max_steps=-1"], ["--model.learning_rate", "nan"]),
+]
 
 
 def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
     """A mutated command line; what takes minutes is not begun."""
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
-    words = mutate_words(case.random, case.random.choice(lines), OTHER_WORDS)
+    words = mutate_words(case.random, case.random.choice(lines), OTHERS)
     if any(word == "train" for word in words[:1]):
         words = words[1:]
 

@@ -1,7 +1,7 @@
 """Runs readers on mutated inputs, and tells what went wrong: `python -m tests.fuzz --cases 20000`.
 
-Every case is known by reader, seed and number and runs in a folder of its own, in a process forked from this
-one, with 4 GiB more address space than it begins with and 20 s of CPU a case. A process that dies is a finding
+Every case is known by reader, seed and number, and runs in a folder of its own in a process forked from this
+one, with 4 GiB more address space than it begins with and 20 s of CPU. A process that dies is a finding
 of the case it died of, and another goes on behind it.
 
 What counts as a finding:
@@ -194,7 +194,7 @@ def _prepare(root: Path) -> None:
         file = os.open(root / name, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_TRUNC)
         os.dup2(file, output)
     sys.stdout = open(1, "w", encoding="utf-8", errors="surrogateescape", closefd=False)  # noqa: SIM115
-    sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
+    sys.stderr = open(2, "w", 1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
     logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING, stream=sys.stderr, force=True)
     os.environ["TMPDIR"] = tempfile.tempdir = str(root / "tmp")
     os.environ["MPLCONFIGDIR"] = str(root / "matplotlib")
@@ -222,6 +222,7 @@ def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: i
             folder.parent.mkdir(exist_ok=True)
             maker(root / "making")
             (root / "making").rename(folder)
+    sys.stderr.flush()
     base = _address_space()
     resource.setrlimit(resource.RLIMIT_AS, (base + MEMORY, resource.RLIM_INFINITY))
     for number in numbers:
