@@ -14,10 +14,30 @@ import torch
 from torch import Tensor, nn
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch: 256 MB
+LONGEST_MESSAGE = 2000  # characters
+
+
+def printable(text: object) -> str:
+    """A text as one line that can be printed anywhere: what cannot, such as a line break in a name, escaped.
+
+    Example:
+        >>> print(printable("a\\nb.png"))
+        a\\nb.png
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 class InputError(ValueError):
-    """Bad input. Its message is one line: what was seen and what was expected."""
+    """Bad input. Its message is one line: what was seen and what was expected.
+
+    Names in it may hold anything: what is not printable is escaped, and of a long text the middle left out.
+    """
+
+    def __init__(self, message: object) -> None:
+        text = printable(message)
+        if len(text) > LONGEST_MESSAGE:
+            text = f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 2 :]}"
+        super().__init__(text)
 
 
 class Traverse(ABC):
@@ -117,6 +137,12 @@ class FrequencyLayer:
             )
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
+        a, b = self.period.as_integer_ratio()
+        if max(self.stop * b, a * self.phases) >= 2**63:
+            raise InputError(
+                f"a layer has period {self.period}, {self.phases} phases and the end {self.stop}; "
+                "expected numbers whose products are below 2^63"
+            )
         ascending = all(a < b for a, b in pairwise(self.features))
         if not self.features or self.features[0] < 0 or not ascending:
             raise InputError(

@@ -14,7 +14,7 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"types", "resize"},
+    {"types", "resize", "text"},
     {"memory"},
     {"features", "periods", "data"},
     {"database"},
@@ -31,17 +31,18 @@ ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all t
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
     "memory": "types",
-    "data": "types resize",
+    "data": "types memory resize",
     "features": "types resize",
-    "periods": "types",
+    "periods": "types memory",
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "types data",
     "model": "types data features periods database recognition motion",
-    "evaluation": "types resize data features periods database recognition motion model",
+    "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types resize data features periods database recognition motion model evaluation",
-    "experiments": "types data features periods database recognition motion model evaluation",
-    "cli": "types data features periods database recognition motion model evaluation training experiments",
+    "experiments": "types text data features periods database recognition motion model evaluation",
+    "cli": "types text data features periods database recognition motion model evaluation training "
+    "experiments",
 }
 
 

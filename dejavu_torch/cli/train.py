@@ -17,6 +17,7 @@ from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
 from dejavu_torch.cli.commands import print_map
 from dejavu_torch.cli.parser import Parser, refusal
+from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.files import check_output_folder, make_output_folder, remove_empty_folders
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport, load_weights
@@ -176,7 +177,8 @@ class TrainCLI(LightningCLI):
         root = Path(self.trainer.default_root_dir)
         new, refused = not root.exists(), False
         try:
-            self.trainer.fit(**arguments)
+            with interrupts_raise():
+                self.trainer.fit(**arguments)
         except InputError:
             refused = True
             if new:

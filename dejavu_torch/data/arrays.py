@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import math
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.files import LARGEST, reading
 from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse
 
 UNNAMED = "the array"
+HEADER = 2**14  # bytes; numpy parses no longer header
 EXPECTED = (
     "frames (N,H,W) or (N,H,W,3) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) float"
 )
@@ -26,11 +31,12 @@ class ArrayTraverse(IndexedTraverse):
         name: what to call it in messages.
 
     Raises:
-        InputError: another shape or type, or no frames.
+        InputError: another shape or type, or no frames; while reading, float frames outside [0, 1] or NaN.
     """
 
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
-        shape, kind = tuple(values.shape), str(values.dtype).removeprefix("torch.")
+        shape = tuple(values.shape)
+        kind = str(values.dtype).removeprefix("torch.") if isinstance(values, Tensor) else values.dtype.name
         pixels = kind == "uint8" and (len(shape) == 3 or (len(shape) == 4 and shape[3] in (1, 3)))
         floats = kind in ("float16", "bfloat16", "float32", "float64") and len(shape) in (2, 4)
         if not (pixels or floats):
@@ -43,26 +49,61 @@ class ArrayTraverse(IndexedTraverse):
 
     def read(self, frames: range) -> Tensor:
         part = self.values[frames.start : frames.stop : frames.step]
-        batch = part if isinstance(part, Tensor) else torch.from_numpy(np.array(part))
-        if batch.dtype == torch.uint8:
-            batch = batch[..., None] if batch.ndim == 3 else batch
-            return batch.permute(0, 3, 1, 2).float() / 255
-        return batch if batch.dtype == torch.float64 else batch.float()
+        if not isinstance(part, Tensor):  # a copy, of this machine's byte order
+            part = torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))
+        if part.dtype == torch.uint8:
+            part = part[..., None] if part.ndim == 3 else part
+            return part.permute(0, 3, 1, 2).float() / 255
+        batch = part if part.dtype == torch.float64 else part.float()
+        if batch.ndim == 4:
+            low, high = batch.aminmax()
+            if not (low >= 0 and high <= 1):  # or NaN
+                raise InputError(
+                    f"{self.name} holds float frames from {low:.4g} to {high:.4g}; expected 0 to 1"
+                )
+        return batch
 
 
 def read_array(path: Path) -> ArrayTraverse:
     """An `.npy` file of frames or features, memory-mapped.
 
     Raises:
-        InputError: not a whole .npy file, or an array of another shape or type.
+        InputError: not a whole .npy file, an array of another shape or type, or a frame larger than the memory.
     """
-    try:
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(values, np.ndarray):
-            raise ValueError("several arrays in one file")
-    except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path} is no whole .npy array; expected {EXPECTED}") from error
+    with reading(path, "is no whole .npy array", EXPECTED):
+        with path.open("rb") as file:
+            shape, kind, by_columns, start = read_header(file.read(HEADER))
+            length = file.seek(0, 2)
+        if start + math.prod(shape) * kind.itemsize > length:
+            raise ValueError(f"{shape} {kind} in {length} bytes")
+        if math.prod(shape):
+            check_room(24.0 * math.prod(shape[1:]), f"a frame of {path}")
+            values: np.ndarray = np.memmap(path, kind, "r", start, shape, "F" if by_columns else "C")
+        else:  # nothing to map
+            values = np.zeros(shape, kind)
     return ArrayTraverse(values, str(path))
+
+
+def read_header(head: bytes) -> tuple[tuple[int, ...], np.dtype, bool, int]:
+    """What the first `HEADER` bytes of an .npy array say, before any of its numbers is read.
+
+    Returns:
+        Shape, type, whether columns come first, and the byte where the numbers start.
+
+    Raises:
+        ValueError: no header, a shape that no array has, or a type of anything but plain numbers. What numpy
+            raises of a header that cannot be parsed may be of any type.
+    """
+    file = io.BytesIO(head)
+    version = np.lib.format.read_magic(file)
+    one = version == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
+    shape, by_columns, kind = read(file)
+    if not all(type(side) is int and 0 <= side < LARGEST for side in shape):
+        raise ValueError(f"shape {shape}")
+    if kind.hasobject or kind.subdtype is not None or kind.names is not None:
+        raise ValueError("no plain numbers")
+    return shape, kind, by_columns, file.tell()
 
 
 def as_traverse(source: Traverse | Tensor) -> Traverse:

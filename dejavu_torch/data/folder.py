@@ -7,20 +7,26 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 from torch import Tensor
 
+from dejavu_torch.data.files import LARGEST, reading
 from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.memory import check_room
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
+FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")  # and no other, such as one that starts a program
+MOST_PIXELS = 2**26  # of an image or a frame; a small file can claim any number
+BYTES_A_PIXEL = 24  # that reading takes at most: decoded, as an array, and as floats
 
 
 class ImageFolder(IndexedTraverse):
     """The images of a folder, sorted by name; numbers in names count as numbers (9 before 10).
 
-    Grey images give one channel, all others three; an image that says how the camera was turned is upright.
+    Grey images give one channel, all others three; an image that says how the camera was turned is upright; of
+    several images in a file only the first counts.
 
     Args:
         path: the folder.
@@ -54,14 +60,15 @@ class ImageFolder(IndexedTraverse):
         self._first: tuple[str, str] | None = None  # name and shape of the first image that was read
 
     def read(self, frames: range) -> Tensor:
-        return torch.stack([self._image(self.files[i]) for i in frames])
+        images = [self._image(self.files[i]) for i in frames]
+        return images[0][None] if len(images) == 1 else torch.stack(images)
 
     def frame_name(self, i: int) -> str:
         return self.files[i].name
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file)
-        size = fitted_size(image.shape[1], image.shape[2], self.width, self.height)
+        size = fitted_size(file, image.shape[1], image.shape[2], self.width, self.height)
         if size != image.shape[1:]:
             image = resize_frames(image[None], size)[0].clamp(0, 1)
         channels, height, width = image.shape
@@ -73,41 +80,67 @@ class ImageFolder(IndexedTraverse):
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Refuse a size in pixels below 0, which stands for the frames' own."""
+    """Refuse a size in pixels below 0, which stands for the frames' own, or beyond any frame."""
     if width < 0 or height < 0:
         raise InputError(f"{path}: width={width}, height={height}; expected width and height of at least 0")
+    if max(width, height) > LARGEST:
+        raise InputError(f"{path}: width={width}, height={height}; expected at most {MOST_PIXELS} pixels")
 
 
-def fitted_size(rows: int, columns: int, width: int, height: int) -> tuple[int, int]:
+def check_pixels(path: Path, rows: int, columns: int) -> None:
+    """Refuse, ahead of any allocation, an image or a frame of more pixels than can be meant, or that there is room for."""
+    seen = f"{path} has {rows} x {columns} pixels"
+    if rows * columns > MOST_PIXELS:
+        raise InputError(f"{seen}; expected at most {MOST_PIXELS}")
+    check_room(BYTES_A_PIXEL * rows * columns, f"{seen}, which")
+
+
+def fitted_size(path: Path, rows: int, columns: int, width: int, height: int) -> tuple[int, int]:
     """(rows, columns) of frames resized to width and height; 0 is their own, or what keeps their aspect.
 
+    Raises:
+        InputError: more pixels than a frame can have; `path` is for the message.
+
     Example:
-        >>> fitted_size(40, 60, width=30, height=0)
+        >>> fitted_size(Path("clip.mp4"), 40, 60, width=30, height=0)
         (20, 30)
     """
     wide = width or (max(1, round(columns * height / rows)) if height else columns)
     high = height or (max(1, round(rows * width / columns)) if width else rows)
+    if (high, wide) != (rows, columns) and high * wide > MOST_PIXELS:
+        raise InputError(f"{path} cannot be resized to {high} x {wide} pixels; expected at most {MOST_PIXELS}")
     return high, wide
 
 
 def read_image(path: Path) -> Tensor:
     """One image file as (C,H,W) float32 in [0, 1]; C is 1 for grey images, else 3.
 
+    Of a file of several images it is the first.
+
     Raises:
-        InputError: the file cannot be read as an image.
+        InputError: the file cannot be read as an image, has over 2^26 pixels or more than there is memory for,
+            or numbers outside [0, 1].
     """
-    try:
-        with Image.open(path) as opened:
-            image = ImageOps.exif_transpose(opened)
-            if image.mode.startswith(("I", "F")):  # 16-bit grey, or floats that are in [0, 1] already
-                scale = 65535 if image.mode.startswith("I") else 1
-                pixels = np.asarray(image, dtype=np.float32)[..., None] / scale
-            else:
-                pixels = np.asarray(image.convert("L" if image.mode in ("1", "L", "LA") else "RGB"))
-                pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.float32) / 255
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path} cannot be read as an image: {' '.join(str(error).split())}") from error
-    return torch.from_numpy(pixels).permute(2, 0, 1)
+    with (
+        reading(path, "cannot be read as an image", "an image such as .png or .jpg"),
+        Image.open(path, formats=FORMATS) as opened,
+    ):
+        check_pixels(path, opened.height, opened.width)
+        ImageOps.exif_transpose(opened, in_place=True)
+        mode = opened.mode
+        wide = mode.startswith(("I", "F"))  # 16-bit grey, or floats that are in [0, 1] already
+        plain = mode if wide else "L" if mode in ("1", "L", "LA") else "RGB"
+        pixels = np.asarray(opened if mode == plain else opened.convert(plain))
+    if wide:
+        image = torch.from_numpy(pixels.astype(np.float32))[None]
+        image.div_(65535 if mode.startswith("I") else 1)
+        low, high = image.aminmax()
+        if not (low >= 0 and high <= 1):  # or NaN
+            raise InputError(f"{path} holds numbers from {low:.4g} to {high:.4g} of white; expected 0 to 1")
+        return image
+    # turned while they are bytes, and then floats of that order: the least that is held at once
+    channels = np.array(pixels.reshape(*pixels.shape[:2], -1).transpose(2, 0, 1), order="C")
+    return torch.from_numpy(channels).float().div_(255)
 
 
 def _natural(name: str) -> tuple[list[str | int], str]:

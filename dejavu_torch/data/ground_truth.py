@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -18,10 +17,13 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from dejavu_torch.data.files import LARGEST, as_number, read_text
+from dejavu_torch.data.arrays import HEADER, read_header
+from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_text, reading
+from dejavu_torch.memory import check_room
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 PAIRS_AT_ONCE = 2**20
+BYTES_A_PLACE = 32  # of a table of right places, and of what is computed of it
 
 
 def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
@@ -33,8 +35,20 @@ def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
 
 
 def padded(rows: Iterable[Tensor]) -> Tensor:
-    """Places of each query, (n,) int64, as a table (Q,R), -1 as padding."""
-    return pad_sequence(list(rows), batch_first=True, padding_value=-1)
+    """Places of each query, (n,) int64, as a table (Q,R), -1 as padding.
+
+    Raises:
+        InputError: a table for which there is no room.
+    """
+    rows = list(rows)
+    check_table(len(rows), max(map(len, rows), default=0))
+    return pad_sequence(rows, batch_first=True, padding_value=-1)
+
+
+def check_table(queries: int, places: int) -> None:
+    """Refuse, before it is made, a ground truth of more places a query than there is room for."""
+    needed = BYTES_A_PLACE * queries * places
+    check_room(needed, f"a ground truth of up to {places} places for each of {queries} queries")
 
 
 def offset_truth(queries: int | Tensor, frames: int | None, offset: int = 0) -> Tensor:
@@ -88,10 +102,14 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
         [[0, 1]]
     """
     rows: list[Tensor] = []
+    most = 0
     for part in query.double().split(max(1, PAIRS_AT_ONCE // max(1, len(reference)))):
         # matrix products would cancel the metres of large coordinates
         distance = torch.cdist(part, reference.double(), compute_mode="donot_use_mm_for_euclid_dist")
-        rows += _columns(distance <= radius)
+        near = distance <= radius
+        most = max(most, int(near.sum(1).max()))
+        check_table(len(query), most)
+        rows += _columns(near)
     return padded(rows)
 
 
@@ -106,7 +124,7 @@ def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
         >>> is_right(torch.tensor([5, 6, -1]), torch.tensor([[0], [0], [0]]), tolerance=5).tolist()
         [True, False, False]
     """
-    near = (index[:, None] - truth).abs() <= tolerance
+    near = (index[:, None] - truth).abs() <= min(tolerance, LARGEST)  # what int64 cannot hold would compare wrong
     return (near & (truth >= 0) & (index >= 0)[:, None]).any(1)
 
 
@@ -353,13 +371,13 @@ def read_table(truth: str, request: Request) -> GroundTruth:
 def _at_shown(listed: dict[int, list[float]], frames: Tensor) -> dict[int, list[float]]:
     """Listed query frames that no query shows, given to the nearest frame that is shown and not listed."""
     ordered = frames.sort().values
-    moved = dict(listed)
+    moved = {frame: list(places) for frame, places in listed.items()}
     for frame in listed:
         after = int(torch.searchsorted(ordered, frame))
         near = ordered[max(0, after - 1) : after + 1].tolist()
         nearest = min(near, key=lambda other: abs(other - frame))
         if nearest not in listed:
-            moved[nearest] = [*moved.get(nearest, []), *listed[frame]]
+            moved.setdefault(nearest, []).extend(listed[frame])
     return moved
 
 
@@ -427,9 +445,7 @@ def _rounded(place: float) -> int:
 def read_matrices(truth: str, request: Request) -> GroundTruth:
     """An npz of the matrices (reference frames, query frames) GThard and/or GTsoft."""
     path = Path(truth)
-    matrices = _load_matrices(path)
-    for name, matrix in matrices.items():
-        _check_shape(f"{path}: {name}", matrix, request.frames, request.queries)
+    matrices = _load_matrices(path, request)
     if len({matrix.shape for matrix in matrices.values()}) > 1:
         raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
     hard, *soft = [torch.from_numpy(m[:, request.numbers.numpy()].astype(bool)).T for m in matrices.values()]
@@ -442,30 +458,43 @@ def _columns(which: Tensor) -> Iterator[Tensor]:
     return (row.nonzero()[:, 0] for row in which)
 
 
-def _load_matrices(path: Path) -> dict[str, np.ndarray]:
-    """GThard and GTsoft in this order, those that are there."""
+def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
+    """GThard and GTsoft in this order, those that are there; nothing is read of a matrix that does not fit."""
     expected = "boolean matrices GThard and/or GTsoft"
-    try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError("one bare array")
-        with file:
-            found: dict[str, np.ndarray] = {
-                name: file[name] for name in ("GThard", "GTsoft") if name in file.files
-            }
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} is no whole .npz file of arrays; expected {expected}") from error
+    found: dict[str, np.ndarray] = {}
+    with reading(path, "is no whole .npz file of arrays", expected), zipfile.ZipFile(path) as archive:
+        there = [name.removesuffix(".npy") for name in archive.namelist()]
+        for name in ("GThard", "GTsoft"):
+            if name not in there:
+                continue
+            entry = archive.getinfo(f"{name}.npy")
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("another compression than that of numpy")  # which a few bytes can make endless
+            with archive.open(entry) as file:
+                shape, kind, by_columns, start = read_header(file.read(HEADER))
+            _check_shape(f"{path}: {name}", shape, kind, request.frames, request.queries)
+            count = math.prod(shape)
+            if start + count * kind.itemsize != entry.file_size:
+                raise ValueError(f"{name} is {shape} {kind} in {entry.file_size} bytes")
+            check_room(2.0 * entry.file_size + 16.0 * count, f"{path}: {name} {shape} {kind}")
+            with archive.open(entry) as file:  # no more than it says, whatever it unpacks to
+                numbers = np.frombuffer(file.read(entry.file_size), kind, count, start)
+            if not np.isfinite(numbers).all():
+                raise ValueError(f"{name} holds numbers that are not finite")
+            found[name] = numbers.reshape(shape, order="F" if by_columns else "C")
     if not found:
-        raise InputError(f"{path} holds {', '.join(file.files) or 'nothing'}; expected {expected}")
+        raise InputError(f"{path} holds {', '.join(there) or 'nothing'}; expected {expected}")
     return found
 
 
-def _check_shape(name: str, matrix: np.ndarray, frames: int | None, queries: int | Tensor) -> None:
+def _check_shape(
+    name: str, sides: tuple[int, ...], kind: np.dtype, frames: int | None, queries: int | Tensor
+) -> None:
     count = queries if isinstance(queries, int) else int(queries.max()) + 1
-    seen = f"{name} is {matrix.shape} {matrix.dtype}"
+    seen = f"{name} is {sides} {kind}"
     rows = "reference frames" if frames is None else frames
     wanted = f"expected a matrix of ({rows}, {count}), a column a query frame"
-    if matrix.ndim != 2 or matrix.dtype.kind not in "biuf":
+    if len(sides) != 2 or kind.kind not in "biuf":
         raise InputError(f"{seen}; {wanted}")
 
     def fits(rows: int, columns: int) -> bool:
@@ -473,7 +502,7 @@ def _check_shape(name: str, matrix: np.ndarray, frames: int | None, queries: int
         enough = columns == count or (columns > count and not isinstance(queries, int))
         return enough and frames in (None, rows)
 
-    shape = matrix.shape[0], matrix.shape[1]
+    shape = sides[0], sides[1]
     # where the reference is not known, as many rows as queries speak for a transposed matrix
     if not fits(*shape) or (frames is None and shape[1] != count == shape[0]):
         raise InputError(f"{seen}; {wanted}{'; transposed it fits' if fits(*shape[::-1]) else ''}")
@@ -486,10 +515,7 @@ def _file(suffix: str, truth: str) -> bool:
     """Whether a text names a file of a kind; refuses one that cannot be opened."""
     if Path(truth).suffix.lower() != suffix:
         return False
-    try:
-        Path(truth).open("rb").close()
-    except OSError as error:
-        raise InputError(f"truth {truth} cannot be read: {error.strerror}; expected {_expected()}") from error
+    check_regular(Path(truth), _expected())
     return True
 
 

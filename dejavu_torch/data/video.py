@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.folder import check_size, fitted_size
+from dejavu_torch.data.files import check_regular, reading
+from dejavu_torch.data.folder import MOST_PIXELS, check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.types import InputError, Traverse
 
@@ -29,6 +30,8 @@ SUFFIXES = {
     *(".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts"),
     *(".wmv", ".flv", ".ogv", ".mjpeg"),
 }
+# what these files are, and nothing else that FFmpeg knows, such as a list of other files or addresses
+FORMATS = "mov,mp4,matroska,webm,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,live_flv,ogg,mjpeg"
 EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"
 BOXES = {b"ftyp", b"free", b"skip", b"wide", b"moov", b"moof", b"mdat", b"mfra", b"sidx", b"styp", b"uuid"}
 UNEVEN = 1.5  # longest interval over the median one; rounded to ticks of half a frame or less it is less
@@ -58,8 +61,7 @@ class Video(Traverse):
         self.path, self.name = Path(path), str(path)
         check_size(self.path, width, height)
         self.width, self.height = width, height
-        if not self.path.is_file():
-            raise InputError(f"{path} is not there; expected a video file")
+        check_regular(self.path, "a video file")
         self._seconds: list[float] = []  # of the frames that were read so far
         self._complete = False  # whether these are all frames
         if not _is_whole(self.path):
@@ -130,8 +132,6 @@ class Video(Traverse):
         Args:
             decode: False yields nothing: only the timestamps are read.
         """
-        import av
-
         seconds: list[float] = []
         packets = 0
         try:
@@ -160,8 +160,10 @@ class Video(Traverse):
                     raise self._broken(len(seconds), "frames are missing")
                 if not seconds:
                     raise InputError(f"{self.name} holds no frames; expected a video")
-        except av.FFmpegError as error:
-            raise self._broken(len(seconds), str(error.strerror)) from error
+        except InputError:
+            raise
+        except Exception as error:  # of any type
+            raise self._broken(len(seconds), getattr(error, "strerror", None) or str(error)) from error
         if not self._complete:
             self._seconds = seconds if in_order else sorted(seconds)
             self._complete = True
@@ -182,22 +184,18 @@ class Video(Traverse):
 
     def _pixels(self, frame: VideoFrame) -> np.ndarray:
         """One frame, upright and resized, (H,W,3) uint8."""
-        import av
         from av.video.reformatter import Interpolation as How
 
         # full chroma, or colours are averaged over pairs of columns of the result as well
         how = int(How.AREA | How.FULL_CHR_H_INT | How.FULL_CHR_H_INP)
         turns = round(frame.rotation / 90) % 4  # quarters, counterclockwise
         w, h = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
-        height, width = fitted_size(h, w, self.width, self.height)
+        height, width = fitted_size(self.path, h, w, self.width, self.height)
         if turns % 2:
             width, height = height, width
-        try:
+        check_pixels(self.path, height, width)
+        with reading(self.path, f"cannot be resized to {height} x {width} pixels", "less"):
             pixels = frame.reformat(width, height, "rgb24", interpolation=how).to_ndarray()
-        except (av.FFmpegError, ValueError, MemoryError) as error:
-            raise InputError(
-                f"{self.name} cannot be resized to {height} x {width} pixels; expected less"
-            ) from error
         return np.rot90(pixels, turns)
 
     @contextmanager
@@ -206,19 +204,21 @@ class Video(Traverse):
         from av.stream import Disposition
 
         options: dict[str, Any] = {"metadata_errors": "replace"}
+        options["container_options"] = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
         if self.path.suffix.lower() == ".mjpeg":
             options["format"] = "mjpeg"  # bare pictures in a row, often mistaken for something else
-        try:
+        with reading(self.path, "cannot be read as a video", "a video file"):
             # "file:" so that a colon in the name is not taken for a protocol
             container = av.open(f"file:{self.path}", "r", **options)
-        except av.FFmpegError as error:
-            raise InputError(f"{self.name} cannot be read as a video: {error.strerror}") from error
         with container:
             stream: Any = container.streams.best("video")
             if stream is None or stream.disposition & Disposition.attached_pic:  # the cover of a song
                 raise InputError(f"{self.name} has no video stream; expected a video")
             if stream.codec_context is None:
                 raise InputError(f"{self.name} has a codec that cannot be decoded; expected such as H.264")
+            check_pixels(self.path, stream.codec_context.height, stream.codec_context.width)
+            # a frame may be of another size than the stream
+            stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
             stream.thread_type = "AUTO"
             yield container, stream
 

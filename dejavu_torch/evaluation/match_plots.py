@@ -396,17 +396,17 @@ def plot_coverage(
 
     Args:
         truth: (Q,R) right places, or a GroundTruth, or None where nothing is known.
-        borders: (N+1,) see `PlaceMap.borders`. queries: (Q,) the frame of each query.
-        unit: of the tolerance.
+        borders: (N+1,) see `PlaceMap.borders`; (1,) the number of frames where places are frames.
+        queries: (Q,) the frame of each query. unit: of the tolerance.
     """
     figure, axis = canvas(3.8)
     reported, frames = match.index >= 0, int(borders[-1])
 
     def dots(which: Tensor, colour: str, label: str, size: float = 3) -> None:
         if which.any():
-            axis.plot(
-                queries[which], borders[match.index[which]], ".", color=colour, markersize=size, label=label
-            )
+            place = match.index[which]
+            shown = borders[place] if len(borders) > 1 else place
+            axis.plot(queries[which], shown, ".", color=colour, markersize=size, label=label)
 
     missing = ~reported
     if truth is None:

@@ -21,7 +21,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
-from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
+from dejavu_torch.data.files import check_output_folder, whole_folder
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.spectral import SpectralMapper
@@ -363,17 +363,13 @@ def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> lis
         raise InputError(f"bench {what!r} is unknown; expected {', '.join(BENCHES)} or storage")
     check_output_folder(out)  # before the long work
     rows = BENCHES[what](frames, repeats)
-    make_output_folder(out)
-    write_bench(out, rows)
+    with whole_folder(out) as folder:
+        write_bench(folder, rows)
     return rows
 
 
 def write_bench(folder: Path, rows: Sequence[Row]) -> None:
-    """Write bench.json and bench.png into a folder that exists.
-
-    Raises:
-        InputError: the folder cannot be written in.
-    """
+    """Write bench.json and bench.png into a folder that exists."""
     facts = {
         "rows": [row._asdict() for row in rows],
         "threads": torch.get_num_threads(),
@@ -386,10 +382,8 @@ def write_bench(folder: Path, rows: Sequence[Row]) -> None:
         if row.ratio_to_ours is not None:
             cases.setdefault(row.case, {})[row.contender] = row.ratio_to_ours
     figure, _ = plot_ratios(cases)
-    with whole_file(folder / "bench.png") as temporary:
-        figure.savefig(temporary)
-    with whole_file(folder / "bench.json") as temporary:
-        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    figure.savefig(folder / "bench.png")
+    (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def _version(package: str) -> str | None:

@@ -211,6 +211,11 @@ class Whitening(nn.Module):
         """Whether there is a projection."""
         return self.projection.numel() > 0
 
+    @property
+    def dimension(self) -> int:
+        """Numbers of a whitened descriptor, once there is a projection."""
+        return len(self.scale) + len(self.length)
+
     def forward(self, descriptors: Tensor) -> Tensor:
         if not self.learned:
             return descriptors
