@@ -179,11 +179,10 @@ class Match(NamedTuple):
 class Training(NamedTuple):
     """How a map was trained; None of it where it was learnt by eq. 1.
 
-    steps: of the optimiser. seconds: they took. seed: of the run, None where none was set.
+    steps: of the optimiser. seed: of the run, None where none was set.
     """
 
     steps: int
-    seconds: float
     seed: int | None
 
 

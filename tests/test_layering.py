@@ -33,7 +33,7 @@ ARROWS = {
     "memory": "types",
     "data": "types memory resize",
     "features": "types resize",
-    "periods": "types memory",
+    "periods": "types",
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "types data",

@@ -389,8 +389,8 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
         if part in parts[:3] or part.extra_repr():
             print(f"{type(part).__name__}: {part.extra_repr()}")
     if model.trained is not None:
-        steps, seconds, seed = model.trained
-        print(f"trained for {steps} steps in {seconds:.0f} s, seed {seed}")
+        steps, seed = model.trained
+        print(f"trained for {steps} steps, seed {seed}")
     print(f"map format {FORMAT}, its checksums agree")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
     _print_next("localize", map, "QUERY", "--out", "matches.csv")

@@ -26,9 +26,7 @@ LARGEST = 2**53  # beyond it a float does not hold every whole number
 PREFIX = ".dejavu-"  # of the folders where files are written until they are whole
 LONGEST_NAME, LONGEST_PATH = 255, 4096 - 64  # bytes; a path leaves room for the files of a folder
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-_temporary: set[Path] = (
-    set()
-)  # the folders of this process that are there nowBYTES_A_CHARACTER = 64  # that the lines of a table take once they are read
+BYTES_A_CHARACTER = 64  # that the lines of a table take once they are read
 _temporary: set[Path] = set()  # the folders of this process that are there now
 
 

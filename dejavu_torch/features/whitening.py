@@ -14,7 +14,7 @@ from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
 
-ROWS = 8192  # in double precision at a time
+ROWS = 1024  # in double precision at a time
 SAMPLED = 4096  # rows that principal components are found in
 NUMBERS = 128  # of a descriptor, unless said otherwise
 PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
