@@ -176,7 +176,7 @@ def maps(folder: Path) -> None:
     for name, (model, reference, query) in models.items():
         model.learn(reference)
         if name == "learned":
-            model.trained = Training(4, 1.5, 0)
+            model.trained = Training(4, 0)
         model.save(folder / f"{name}.safetensors")
         np.save(folder / f"{name}.npy", query)
     shutil.rmtree(folder / "photos")
@@ -544,17 +544,35 @@ def train_commands(case: Case) -> None:
 # configs and command lines ---------------------------------------------------------------------------------
 
 
+SETTINGS = (
+    "0",
+    "1",
+    "2",
+    "0.5",
+    "null",
+    "true",
+    "l2",
+    "mean",
+    "[2, 2]",
+    "16",
+    "1e-3",
+    "cosine",
+    "linear",
+    "none",
+)
+
+
 def mutated_yaml(random: Random, text: str) -> bytes:
     act = random.random()
     if act < 0.03:
         return (BOMB + text).encode()
     if act < 0.06:
         return (text + "\na: " * 2 + "[" * 20_000).encode()
-    if act < 0.25:
+    if act < 0.4:
         lines = text.splitlines()
         at = random.randrange(len(lines))
         name = lines[at].partition(":")[0]
-        lines[at] = f"{name}: {random.choice((*TAGS, *map(str, NUMBERS)))}"
+        lines[at] = f"{name}: {random.choice(random.choice((TAGS, NUMBERS, SETTINGS)))}"
         return "\n".join(lines).encode()
     return mutate_text(random, text)
 
@@ -904,6 +922,7 @@ def video(case: Case) -> None:
     take(open_source(f"{clip}{random.choice(('', '', '?width=8', '?start=3&stop=9&step=2'))}"))
 
 
+PLAUSIBLE = ("0", "1", "2", "3", "5", "8", "20", "25", "1:2", "3:9", "true", "-1", "100")
 SOURCES = (
     *(
         "in/frames.npy?start=1&stop=9&step=2",
@@ -931,7 +950,7 @@ def source(case: Case) -> None:
     random = case.random
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
     text = random.choice(SOURCES)
-    if random.random() < 0.4 and "?" in text:
+    if random.random() < 0.6 and "?" in text:
         address, _, query = text.partition("?")
         options = query.split("&")
         at = random.randrange(len(options))
