@@ -27,7 +27,6 @@ import safetensors.torch
 import torch
 from PIL import Image
 from pytorch_lightning import Trainer
-from safetensors import safe_open
 from torch import Tensor
 
 from dejavu_torch import cli
@@ -37,8 +36,8 @@ from dejavu_torch.cli.presets import FOLDER, with_configs
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import open_source
+from dejavu_torch.database import mapfile
 from dejavu_torch.database.codec import Stream, decode, encode
-from dejavu_torch.database.mapfile import metadata_of
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.curves import evaluate
@@ -177,7 +176,7 @@ def maps(folder: Path) -> None:
     for name, (model, reference, query) in models.items():
         model.learn(reference)
         if name == "learned":
-            model.trained = Training(4, 1.5, 0)
+            model.trained = Training(4, 0)
         model.save(folder / f"{name}.safetensors")
         np.save(folder / f"{name}.npy", query)
     shutil.rmtree(folder / "photos")
@@ -350,15 +349,19 @@ def pick_map(case: Case, maker: Maker = maps) -> Path:
 
 def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and header of a valid map."""
-    with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return tensors, json.loads(file.metadata()["config"])
+    tensors, header = mapfile.read_map(path)
+    return tensors, header
 
 
-def seal(tensors: dict[str, Tensor], header: str) -> bytes:
-    """A map file of any tensors and any header, as whole as `write_map` makes it."""
+def sealed(tensors: dict[str, Tensor], header: str) -> bytes:
+    """A map file of any tensors and the JSON of any header, with the checksums of just these."""
     plain = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
-    return safetensors.torch.save(plain, metadata_of({}) | {"config": header})
+    try:
+        sums = mapfile.checksums(plain, json.loads(header))
+    except (ValueError, RecursionError):  # no JSON that could have a checksum
+        sums = {}
+    text = f'{{"version": {mapfile.FORMAT}, "checksums": {json.dumps(sums)}, "{mapfile.HEADER}": {header}}}'
+    return safetensors.torch.save(plain, {mapfile.NAME: text})
 
 
 def crafted(random: Random, path: Path) -> bytes:
@@ -376,7 +379,7 @@ def crafted(random: Random, path: Path) -> bytes:
         text = mutate_text(random, text).decode(errors="replace")
     if act > 0.67:
         tensors = mutate_tensors(random, tensors)
-    return seal(tensors, text)
+    return sealed(tensors, text)
 
 
 def damaged(random: Random, data: bytes) -> bytes:
@@ -541,17 +544,35 @@ def train_commands(case: Case) -> None:
 # configs and command lines ---------------------------------------------------------------------------------
 
 
+SETTINGS = (
+    "0",
+    "1",
+    "2",
+    "0.5",
+    "null",
+    "true",
+    "l2",
+    "mean",
+    "[2, 2]",
+    "16",
+    "1e-3",
+    "cosine",
+    "linear",
+    "none",
+)
+
+
 def mutated_yaml(random: Random, text: str) -> bytes:
     act = random.random()
     if act < 0.03:
         return (BOMB + text).encode()
     if act < 0.06:
         return (text + "\na: " * 2 + "[" * 20_000).encode()
-    if act < 0.25:
+    if act < 0.4:
         lines = text.splitlines()
         at = random.randrange(len(lines))
         name = lines[at].partition(":")[0]
-        lines[at] = f"{name}: {random.choice((*TAGS, *map(str, NUMBERS)))}"
+        lines[at] = f"{name}: {random.choice(random.choice((TAGS, NUMBERS, SETTINGS)))}"
         return "\n".join(lines).encode()
     return mutate_text(random, text)
 
@@ -580,7 +601,15 @@ LINES = (
     ["learn", "in/features.npy", *LEARN, "--threshold", "0.5", "--batch_size", "16"],
     ["learn", "in/photos?width=12", *LEARN, "--features.cell", "4", "--whitening", "none"],
     ["learn", "in/frames.npy", *LEARN, "--config", "local_maxima", "--mapper.periods.window", "16"],
-    ["learn", "in/frames.npy", *LEARN, "--mapper.chunk=16", "--whitening.numbers=8", "--mapper.step", "0.1"],
+    [
+        "learn",
+        "in/frames.npy",
+        *LEARN,
+        "--mapper.chunk=16",
+        "--whitening.numbers=8",
+        "--mapper.resolution",
+        "2",
+    ],
     ["learn", "in/frames.npy", *LEARN, "--second", "in/photos?stop=30", "--second_truth", "0", "--seed", "3"],
     ["learn", "in/frames.npy", *LEARN, "--whitening", "in/spectral.safetensors"],
     ["learn", "in/clip.mp4?width=24", *LEARN, "--preprocess.contrast", "patch", "--preprocess.channel=1"],
@@ -693,10 +722,7 @@ def groups(line: Sequence[str]) -> list[list[str]]:
 
 OTHERS = [
     *(group for line in (*LINES, *SLOW_LINES) for group in groups(line)),
-    *(
-        [word]
-        for word in ("in/empty", "in/a_file", "in", "out", "missing", "utm:25", "train", "in/last.ckpt")
-    ),
+    *([word] for word in ("in/empty", "in/a_file", "in", "out", "missing", "utm:25", "in/last.ckpt")),
     *(
         [word]
         for word in ("--velocity", "--config", "null", "[]", "{}", "x" * 300 + ".safetensors", "\udcff.npy")
@@ -742,9 +768,11 @@ TRAIN_OTHERS = [
 def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
     """A mutated command line; what takes minutes is not begun."""
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
-    words = mutate_words(case.random, case.random.choice(lines), OTHERS)
-    if any(word == "train" for word in words[:1]):
-        words = words[1:]
+    line = case.random.choice(lines)
+    own = [group for other in lines if other[0] == line[0] for group in groups(other[1:])] or OTHERS
+    words = [line[0], *mutate_words(case.random, line[1:], case.random.choice((own, OTHERS)))]
+    if case.random.random() < 0.05:
+        words = mutate_words(case.random, line, OTHERS)
 
     def too_long(*_: object, **__: object) -> None:
         raise InputError("this would take too long here")
@@ -894,6 +922,7 @@ def video(case: Case) -> None:
     take(open_source(f"{clip}{random.choice(('', '', '?width=8', '?start=3&stop=9&step=2'))}"))
 
 
+PLAUSIBLE = ("0", "1", "2", "3", "5", "8", "20", "25", "1:2", "3:9", "true", "-1", "100")
 SOURCES = (
     *(
         "in/frames.npy?start=1&stop=9&step=2",
@@ -921,7 +950,7 @@ def source(case: Case) -> None:
     random = case.random
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
     text = random.choice(SOURCES)
-    if random.random() < 0.4 and "?" in text:
+    if random.random() < 0.6 and "?" in text:
         address, _, query = text.partition("?")
         options = query.split("&")
         at = random.randrange(len(options))
