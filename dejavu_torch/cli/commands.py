@@ -371,11 +371,7 @@ def run_bench(
         note = "x ours: seconds / those of the fastest dejavu"
     if any("No module" in (row.skipped or "") for row in rows):
         print("what is skipped needs pip install '.[bench]'")
-<<<<<<< HEAD
-    _say(f"x ours: seconds / those of the fastest dejavu; next: open {out / 'bench.png'}")
-=======
-    print(f"{note}; next: open {out / 'bench.png'}")
->>>>>>> bench
+    _say(f"{note}; next: open {out / 'bench.png'}")
 
 
 def run_info(map: Path, *, features: nn.Module | None = None) -> None:

@@ -372,20 +372,12 @@ def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> lis
     return rows
 
 
-<<<<<<< HEAD
-def write_bench(folder: Path, rows: Sequence[Row]) -> None:
-    """Write bench.json and bench.png into a folder that exists."""
-=======
 def write_bench(folder: Path, rows: Sequence[Row], picture: Plot | None = None) -> None:
     """Write bench.json and bench.png into a folder that exists.
 
     Args:
         picture: None draws the seconds over ours.
-
-    Raises:
-        InputError: the folder cannot be written in.
     """
->>>>>>> bench
     facts = {
         "rows": [row._asdict() for row in rows],
         "threads": torch.get_num_threads(),
@@ -393,21 +385,9 @@ def write_bench(folder: Path, rows: Sequence[Row], picture: Plot | None = None) 
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "versions": {"dejavu_torch": dejavu_torch.__version__} | {name: _version(name) for name in COMPARED},
     }
-<<<<<<< HEAD
-    cases: dict[str, dict[str, float]] = {}
-    for row in rows:
-        if row.ratio_to_ours is not None:
-            cases.setdefault(row.case, {})[row.contender] = row.ratio_to_ours
-    figure, _ = plot_ratios(cases)
+    figure, _ = picture or plot_ratios(bars(rows, lambda row: row.ratio_to_ours))
     figure.savefig(folder / "bench.png")
     (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-=======
-    figure, _ = picture or plot_ratios(bars(rows, lambda row: row.ratio_to_ours))
-    with whole_file(folder / "bench.png") as temporary:
-        figure.savefig(temporary)
-    with whole_file(folder / "bench.json") as temporary:
-        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
->>>>>>> bench
 
 
 def bars(rows: Sequence[Row], height: Callable[[Row], float | None]) -> dict[str, dict[str, float]]:

@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from dejavu_torch.data.files import check_output_folder, make_output_folder
+from dejavu_torch.data.files import check_output_folder, whole_folder
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.database.l1 import l1_backend
@@ -323,10 +323,11 @@ def run_memory(out: Path, places: Sequence[int] = ()) -> list[Row]:
     """
     check_output_folder(out)  # before the long work
     rows = with_ratios(list(bench_memory(places)))
-    make_output_folder(out)
     peaks = bars(rows, lambda row: row.peak_bytes and row.peak_bytes / 1e6)
     peaks.pop(LOADED, None)
-    write_bench(out, rows, plot_ratios(peaks, "memory at most, in MB; less is better") if peaks else None)
+    picture = plot_ratios(peaks, "memory at most, in MB; less is better") if peaks else None
+    with whole_folder(out) as folder:
+        write_bench(folder, rows, picture)
     return rows
 
 
