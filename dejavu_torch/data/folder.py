@@ -108,7 +108,9 @@ def fitted_size(path: Path, rows: int, columns: int, width: int, height: int) ->
     wide = width or (max(1, round(columns * height / rows)) if height else columns)
     high = height or (max(1, round(rows * width / columns)) if width else rows)
     if (high, wide) != (rows, columns) and high * wide > MOST_PIXELS:
-        raise InputError(f"{path} cannot be resized to {high} x {wide} pixels; expected at most {MOST_PIXELS}")
+        raise InputError(
+            f"{path} cannot be resized to {high} x {wide} pixels; expected at most {MOST_PIXELS}"
+        )
     return high, wide
 
 

@@ -124,7 +124,9 @@ def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
         >>> is_right(torch.tensor([5, 6, -1]), torch.tensor([[0], [0], [0]]), tolerance=5).tolist()
         [True, False, False]
     """
-    near = (index[:, None] - truth).abs() <= min(tolerance, LARGEST)  # what int64 cannot hold would compare wrong
+    near = (index[:, None] - truth).abs() <= min(
+        tolerance, LARGEST
+    )  # what int64 cannot hold would compare wrong
     return (near & (truth >= 0) & (index >= 0)[:, None]).any(1)
 
 
@@ -469,7 +471,9 @@ def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
                 continue
             entry = archive.getinfo(f"{name}.npy")
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError("another compression than that of numpy")  # which a few bytes can make endless
+                raise ValueError(
+                    "another compression than that of numpy"
+                )  # which a few bytes can make endless
             with archive.open(entry) as file:
                 shape, kind, by_columns, start = read_header(file.read(HEADER))
             _check_shape(f"{path}: {name}", shape, kind, request.frames, request.queries)
