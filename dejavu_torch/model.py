@@ -451,7 +451,9 @@ class DejaVu(nn.Module):
 
     def _features(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """What whitening takes: features of a traverse in batches (B,D), without gradients."""
-        return feature_batches(traverse, self.pipeline, self.batch_size, self.map.positions.device, progress)
+        pixels = math.prod(getattr(self.features, "resize", None) or (1,))  # that a frame is brought to
+        at_once = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
+        return feature_batches(traverse, self.pipeline, at_once, self.map.positions.device, progress)
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
         """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""

@@ -17,7 +17,7 @@ from command_line import TEMPLATES, fails, frames, report_of, run, write_images
 from PIL import Image
 
 from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
-from dejavu_torch.cli import COMMANDS
+from dejavu_torch.cli import COMMANDS, commands
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.types import Training
 
@@ -631,6 +631,40 @@ def test_full_disk(
     assert "No space left" in fails(capsys, "localize", small_map, QUERY, "--out", out)
     assert [file.name for file in tmp_path.iterdir()] == ["m.csv"]
     assert out.read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("problem", "told"),
+    [
+        (MemoryError(), "not enough memory: it ran out"),
+        (
+            MemoryError("Unable to allocate 7 GiB\nfor an array"),
+            "not enough memory: Unable to allocate 7 GiB for",
+        ),
+        (RecursionError("maximum recursion depth exceeded"), "nested too deeply"),
+        (ImportError("libtorch.so: cannot allocate memory"), "not enough memory"),
+    ],
+)
+def test_what_lacks_memory_is_one_line(
+    problem: Exception, told: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_info(map: Path) -> None:
+        raise problem
+
+    monkeypatch.setattr(commands, "run_info", run_info)
+    monkeypatch.setattr("dejavu_torch.cli.parser.parse", lambda *_: {"map": Path("a")})
+    assert told in fails(capsys, "info", "a")
+
+
+def test_what_torch_cannot_allocate_is_one_line_and_a_bug_is_a_traceback(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dejavu_torch.cli.parser.parse", lambda *_: {})
+    monkeypatch.setattr(commands, "run_info", lambda: torch.empty(10**17))
+    assert "not enough memory: can't allocate" in fails(capsys, "info", "a")
+    monkeypatch.setattr(commands, "run_info", lambda: torch.zeros(2) @ torch.zeros(3))
+    with pytest.raises(RuntimeError, match="inconsistent"):
+        run("info", "a")
 
 
 @pytest.mark.slow

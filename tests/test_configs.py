@@ -82,7 +82,7 @@ def test_a_preset_is_found_by_name_from_anywhere(tmp_path: Path, monkeypatch: py
         assert find_config(name) == ROOT / "configs" / f"{name}.yaml"
     (tmp_path / "paper").mkdir()  # such as a report of it
     assert find_config("paper") == ROOT / "configs" / "paper.yaml"
-    (tmp_path / "mine.yaml").touch()
+    (tmp_path / "mine.yaml").write_text("batch_size: 9")
     assert find_config("mine.yaml") == Path("mine.yaml")
     with pytest.raises(InputError, match=r"mine is not there.*train_small"):
         find_config("mine")

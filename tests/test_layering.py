@@ -14,8 +14,8 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"types", "resize", "text"},
-    {"memory"},
+    {"types", "text"},
+    {"resize", "memory"},
     {"features", "periods", "data"},
     {"database"},
     {"recognition"},
@@ -31,6 +31,7 @@ ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all t
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
     "memory": "types",
+    "resize": "types",
     "data": "types memory resize",
     "features": "types resize",
     "periods": "types",

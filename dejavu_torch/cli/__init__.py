@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import pairwise
 from typing import NoReturn
 
@@ -66,9 +65,12 @@ def _run(given: Sequence[str]) -> None:
     if not given or given[0] not in COMMANDS:
         overview(given[0] if given else "--help")
     _log_to_stderr()
-    with suppress(FileNotFoundError):  # the folder is gone
-        if os.getcwd() not in sys.path:
-            sys.path.append(os.getcwd())  # a user's own classes, as `python -m` finds them
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:  # some libraries would end the process
+        fail("the current folder does not exist any more; expected one that does")
+    if here not in sys.path:
+        sys.path.append(here)  # a user's own classes, as `python -m` finds them
     from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
     from dejavu_torch.cli.parser import COMMAND, UsageError, parse
     from dejavu_torch.cli.presets import with_configs

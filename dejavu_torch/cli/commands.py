@@ -349,9 +349,9 @@ def run_bench(
         given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
         found = frontier.run_storage(out, sources, places, codebooks, given, shared, progress=True)
         for title, table in frontier.storage_tables(found):
-            print(*[title] * bool(title), text_table(table), "", sep="\n")
+            print(*[printable(title)] * bool(title), text_table(table), "", sep="\n")
         for line in frontier.skipped_lines(found):
-            print(line)
+            _say(line)
         _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
     if what in bench.BENCHES and (sources or places or map or codebooks or whitening):

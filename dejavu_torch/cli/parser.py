@@ -11,6 +11,7 @@ from typing import Any, NoReturn, get_args, get_origin
 import docstring_parser
 import jsonargparse
 
+from dejavu_torch.data.files import LARGEST
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.hog import HOG
@@ -55,6 +56,15 @@ def refusal(error: Exception) -> InputError:
     return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST]}")
 
 
+def whole_numbers(value: object) -> Iterator[int]:
+    """The whole numbers in a value and in lists and mappings in it."""
+    if isinstance(value, int):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from whole_numbers(part)
+
+
 def one_line(text: object) -> str:
     """A text without line breaks."""
     return " ".join(str(text).split())
@@ -72,14 +82,19 @@ class Parser(jsonargparse.ArgumentParser):
     """An argument parser whose errors are UsageErrors of one line."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, formatter_class=HelpFormatter, **kwargs)
+        # nor is --conf taken for --config, which is looked for ahead of the parser
+        super().__init__(*args, formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, *rest: Any, **settings: Any
     ) -> Any:
         # a null for a part of a part is handed to the parser of that part as None
         words = args and [f"{word[:-4]}null" if word.endswith("=None") else word for word in args]
-        return super().parse_args(words, *rest, **settings)
+        parsed = super().parse_args(words, *rest, **settings)
+        for key, value in vars(parsed.as_flat()).items():
+            if any(abs(number) > LARGEST for number in whole_numbers(value)):
+                self.error(f'Parser key "{key}": {value}; expected whole numbers of at most {LARGEST}')
+        return parsed
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         head, required, names = message.partition("required: ")

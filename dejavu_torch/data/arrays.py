@@ -31,7 +31,8 @@ class ArrayTraverse(IndexedTraverse):
         name: what to call it in messages.
 
     Raises:
-        InputError: another shape or type, or no frames; while reading, float frames outside [0, 1] or NaN.
+        InputError: another shape or type, or no frames; while reading, float frames of an array outside
+            [0, 1] or NaN.
     """
 
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
@@ -55,7 +56,7 @@ class ArrayTraverse(IndexedTraverse):
             part = part[..., None] if part.ndim == 3 else part
             return part.permute(0, 3, 1, 2).float() / 255
         batch = part if part.dtype == torch.float64 else part.float()
-        if batch.ndim == 4:
+        if batch.ndim == 4 and not isinstance(self.values, Tensor):  # which a pipeline may have normalised
             low, high = batch.aminmax()
             if not (low >= 0 and high <= 1):  # or NaN
                 raise InputError(

@@ -79,7 +79,7 @@ def nearest_frames(
         What is found: by single queries, reference frames that are stored; by sequences, which tell frames
         between these apart, any.
     """
-    stored = reference[::k]
+    stored = reference[:: min(k, len(reference))]
     nearest = ((torch.arange(len(reference), device=reference.device) + k // 2) // k).clamp(
         max=len(stored) - 1
     )
@@ -117,7 +117,8 @@ def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tole
         >>> fair_stride(frames=1000, dimension=10, itemsize=4, map_bytes=8000, tolerance=5)
         5
     """
-    strides = range(1, max(1, 2 * tolerance) + 1)
+    coarsest = max(1, 2 * tolerance)
+    strides = *range(1, min(coarsest, frames) + 1), coarsest  # beyond the route one frame is left
     fair = [k for k in strides if stride_bytes(frames, dimension, itemsize, k) >= map_bytes]
     return max(fair, default=1)
 

@@ -137,6 +137,7 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
             f"leave-out got width {width} and features {tuple(reference.shape)}; "
             f"expected width >= 0 and ({route.places}, {route.dimension})"
         )
+    width = min(width, route.places)  # all frames
     if model.trained is not None:
         raise InputError("leave-out got trained templates, no means; expected a map that was not trained")
     if not route.plan:

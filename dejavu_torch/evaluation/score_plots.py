@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas
+from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas, label
 
 _OURS = COLOURS["map"]
 _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
@@ -76,10 +76,10 @@ def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
     Args:
         contenders: by key, which gives the colour; HOG is dashed, nulls are dotted.
     """
-    names = {key: one.name for key, one in contenders.items()}
+    names = {key: label(one.name) for key, one in contenders.items()}
     for key, one in contenders.items():
         silent = one.curve is not None and len(one.curve.recall) == 0
-        names[key] = fill(f"{one.name} (reports nothing)" if silent else one.name, LETTERS - 8)
+        names[key] = fill(f"{names[key]} (reports nothing)" if silent else names[key], LETTERS - 8)
     lines = sum(1 + name.count("\n") for name in names.values())
     figure, axis = canvas(3.4 + 1.1 * LINE * lines)
     for key, one in reversed(list(contenders.items())):  # the first on top
@@ -103,7 +103,7 @@ def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
 
 def plot_auc(contenders: Mapping[str, Contender]) -> Plot:
     """Area under the curve of each contender that has scores, as a bar in the colour of its curve."""
-    areas = {key: (one.name, one.scores.auc) for key, one in contenders.items() if one.scores}
+    areas = {key: (label(one.name), one.scores.auc) for key, one in contenders.items() if one.scores}
     figure, axis = canvas(0.9 + 0.55 * len(areas))
     bars = axis.barh(range(len(areas)), [area for _, area in areas.values()], height=0.42)
     for row, (bar, (key, (name, area))) in enumerate(zip(bars, areas.items(), strict=True)):
@@ -270,7 +270,7 @@ def plot_frontiers(
         axis.minorticks_off()
         _area_axis(axis)
         title = re.sub(r"[^ :]*/", "", case)  # sources without their folders
-        axis.set_title(fill(title, LETTERS - 10), loc="left", fontsize=10, weight="bold")
+        axis.set_title(fill(label(title), LETTERS - 10), loc="left", fontsize=10, weight="bold")
         axis.set_xlabel("route bytes per place")
         if case in whitenings:
             _plot_whitenings(next(column), whitenings[case])

@@ -262,8 +262,9 @@ class PlaceFilter(SequenceModel):
 
     def _scores(self, posterior: Tensor, scores: Tensor) -> Tensor:
         """-log of the probability of each place and its neighbours: (Q,W) and what they are of -> (Q,W)."""
-        side = self.within + 1  # two means over so many make a triangle
-        padded = F.pad(posterior[:, None], (self.within, self.within))
+        within = min(self.within, posterior.shape[1])  # further neighbours there are not
+        side = within + 1  # two means over so many make a triangle
+        padded = F.pad(posterior[:, None], (within, within))
         mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
         score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1).log()
         return score.masked_fill(~scores.isfinite(), math.inf)

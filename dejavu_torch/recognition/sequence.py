@@ -12,6 +12,8 @@ from torch import Tensor
 
 from dejavu_torch.types import InputError, SequenceModel
 
+LONGEST = 2**16  # queries of a sequence
+
 log = logging.getLogger("dejavu_torch")
 
 
@@ -36,7 +38,7 @@ class SequenceMatcher(SequenceModel):
         normalisation.
 
     Raises:
-        InputError: a length below 1, no speeds, or speeds that are not finite; forward: scores that are no
+        InputError: a length below 1 or above 65536, no speeds, or speeds that are not finite; forward: scores that are no
             (Q,N), or rows ahead of another number of places.
 
     Example:
@@ -47,8 +49,8 @@ class SequenceMatcher(SequenceModel):
 
     def __init__(self, length: int = 11, speeds: Sequence[float] = (1.0,)) -> None:
         super().__init__()
-        if not isinstance(length, int) or length < 1:
-            raise InputError(f"a sequence of {length} queries; expected a whole number, at least 1")
+        if not isinstance(length, int) or not 1 <= length <= LONGEST:
+            raise InputError(f"a sequence of {length} queries; expected a whole number, 1 to {LONGEST}")
         given = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
         if not given or not all(map(math.isfinite, given)):
             raise InputError(

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
@@ -18,6 +19,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from dejavu_torch.data.files import make_output_folder, whole_file
+from dejavu_torch.database.place_map import EXTRA
 from dejavu_torch.types import InputError
 
 EXPECTED = "expected a checkpoint that `dejavu train fit` wrote"
@@ -31,6 +33,8 @@ KEYS: dict[str, type] = {  # what every reader needs; the rest is Lightning's, s
     "began": int,
     "trained": list,
 }
+FREE = ("params", "lr", "initial_lr", "weight_decay")  # of an optimizer: the checkpoint's are taken
+MOST_PLAIN = 10**6  # numbers and texts beside a model's tensors
 MOST = 2**53  # steps, epochs and the like
 VERSION = re.compile(r"[2-9]\.\d+(\.\d+)?\S*")  # older ones kept other things
 
@@ -79,6 +83,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             if packed or sum(record.file_size for record in records) > path.stat().st_size:
                 raise InputError(f"{path} claims more bytes than it holds; {EXPECTED}")
             damaged = archive.testzip()  # torch does not look at checksums
+            pickled = [archive.read(one) for one in records if one.filename.endswith("data.pkl")]
+        if any(b"cbuiltins\nbytearray\n" in one for one in pickled):  # of any size, which torch would make
+            raise InputError(f"{path} claims more bytes than it holds; {EXPECTED}")
         if damaged is not None:
             raise InputError(f"{path} is damaged: {damaged} does not have its checksum; {EXPECTED}")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
@@ -87,16 +94,21 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except (InputError, OSError):
         raise
     except Exception as error:  # whatever a file can make of zipfile and torch
-        raise InputError(f"the checkpoint cannot be read: {path}: {cause_of(error)}; {EXPECTED}") from error
+        told = "it is of more than tensors and plain data"
+        told = told if isinstance(error, UnpicklingError) else cause_of(error)
+        raise InputError(f"the checkpoint cannot be read: {path}: {told}; {EXPECTED}") from error
     try:
-        check_content(checkpoint)
+        check_content(checkpoint, path.stat().st_size)
     except InputError as error:
         raise InputError(f"{path} is no checkpoint of a training: {error}; {EXPECTED}") from error
     return dict(checkpoint)
 
 
-def check_content(checkpoint: Any) -> None:
+def check_content(checkpoint: Any, size: int) -> None:
     """Refuse what is no checkpoint of a training.
+
+    Args:
+        size: of its file, in bytes.
 
     Raises:
         InputError: naming what is missing, of another type, out of range, NaN or infinite.
@@ -121,15 +133,34 @@ def check_content(checkpoint: Any) -> None:
     if checkpoint["began"] > checkpoint["global_step"]:
         raise InputError(f"its stage began at step {checkpoint['began']} of {checkpoint['global_step']}")
     for name, value in checkpoint["state_dict"].items():
-        if not isinstance(name, str) or not (isinstance(value, Tensor) or name.endswith("_extra_state")):
-            raise InputError(f"{str(name)[:80]} in its state_dict is no tensor")
+        if not isinstance(name, str) or not (isinstance(value, Tensor) or name.endswith(EXTRA)):
+            raise InputError(f"{str(name)[:80]!r} in its state_dict is no tensor")
+        if name.startswith("dejavu.") and name.endswith(EXTRA) and not is_plain(value):
+            raise InputError(f"{name[:80]} is not of plain numbers and text")
     for tensor in tensors_in(checkpoint):
         dense = tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized
-        if not dense or tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+        held = min(size, tensor.untyped_storage().nbytes()) if dense else 0
+        if not dense or tensor.numel() * tensor.element_size() > held:
             raise InputError(f"a tensor {tuple(tensor.shape)} has more numbers than the file")
     for key in ("state_dict", "optimizer_states"):
         if not all(bool(tensor.isfinite().all()) for tensor in tensors_in(checkpoint.get(key))):
             raise InputError(f"{key} has NaN or infinite numbers")
+
+
+def is_plain(value: Any) -> bool:
+    """Whether a value is of finite numbers, texts, lists and dicts, and no more than a map's header holds."""
+    left, count = [value], 0
+    while left and count < MOST_PLAIN:
+        one, count = left.pop(), count + 1
+        if isinstance(one, dict) and all(isinstance(key, str) for key in one):
+            left.extend(one.values())
+        elif isinstance(one, (list, tuple)):
+            left.extend(one)
+        elif not (
+            one is None or isinstance(one, (str, int)) or (isinstance(one, float) and math.isfinite(one))
+        ):
+            return False
+    return not left
 
 
 def tensors_in(value: Any) -> Iterator[Tensor]:
@@ -170,6 +201,13 @@ def check_resumable(checkpoint: dict[str, Any], trainer: pl.Trainer) -> None:
             f"the checkpoint is of step {checkpoint['global_step']}, its loops are at {steps}; {EXPECTED}"
         )
     for optimizer, state in zip(trainer.optimizers, checkpoint["optimizer_states"], strict=True):
+        for group, mine in zip(state["param_groups"], optimizer.param_groups, strict=True):
+            other = [name for name in group if name not in FREE and group[name] != mine[name]]
+            if other:
+                raise InputError(
+                    f"the checkpoint cannot be resumed: {other[0]} of its optimizer is "
+                    f"{str(group[other[0]])[:80]}, in this run {str(mine[other[0]])[:80]}"
+                )
         check_moments(optimizer, state["state"])
 
 
@@ -197,7 +235,7 @@ def check_moments(optimizer: Optimizer, state: dict[Any, Any]) -> None:
     """Refuse what an optimizer remembers of other parameters.
 
     Raises:
-        InputError: a shape that is not of the parameter, or a number of another type.
+        InputError: a shape that is not of the parameter, or a number out of range.
     """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     adam = {"step", "exp_avg", "exp_avg_sq"} if isinstance(optimizer, torch.optim.Adam) else None
@@ -205,17 +243,16 @@ def check_moments(optimizer: Optimizer, state: dict[Any, Any]) -> None:
         known = type(index) is int and 0 <= index < len(parameters) and isinstance(values, dict)
         if not known or (adam is not None and values.keys() != adam):
             raise InputError(
-                f"the checkpoint cannot be resumed: {index} is no parameter that is trained; {EXPECTED}"
+                f"the checkpoint cannot be resumed: its optimizer is not of this run; {EXPECTED}"
             )
         for name, value in values.items():
-            shape = tuple(value.shape) if isinstance(value, Tensor) else ()
-            number = isinstance(value, (Tensor, int, float)) and not (
-                isinstance(value, float) and not math.isfinite(value)
-            )
-            if not number or shape != (() if name == "step" else tuple(parameters[index].shape)):
+            lowest = 0.0 if name in ("step", "exp_avg_sq") else -math.inf
+            shape = torch.Size() if name == "step" else parameters[index].shape
+            fits = isinstance(value, Tensor) and value.shape == shape and value.is_floating_point()
+            if not fits or not bool(((value >= lowest) & (value < MOST)).all()):
                 raise InputError(
-                    f"the checkpoint cannot be resumed: {name} of the optimizer is {shape}, of a parameter "
-                    f"{tuple(parameters[index].shape)}; {EXPECTED}"
+                    f"the checkpoint cannot be resumed: {name} of parameter {index} of its optimizer is no "
+                    f"{tuple(shape)} of numbers in range; {EXPECTED}"
                 )
 
 
