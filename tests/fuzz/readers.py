@@ -10,6 +10,7 @@ import base64
 import io
 import json
 import math
+import os
 import shutil
 import struct
 import zipfile
@@ -765,9 +766,17 @@ TRAIN_OTHERS = [
 ]
 
 
+def copy_inputs(case: Case) -> None:
+    """All that command lines name, and what is no regular file."""
+    shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
+    for suffix in ("npy", "mp4", "csv", "safetensors", "png", "yaml", "npz"):
+        os.mkfifo(f"in/fifo.{suffix}")
+    Path("in/loop.npy").symlink_to("loop.npy")
+
+
 def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
     """A mutated command line; what takes minutes is not begun."""
-    shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
+    copy_inputs(case)
     line = case.random.choice(lines)
     own = [group for other in lines if other[0] == line[0] for group in groups(other[1:])] or OTHERS
     words = [line[0], *mutate_words(case.random, line[1:], case.random.choice((own, OTHERS)))]
@@ -808,8 +817,10 @@ def npy(case: Case) -> None:
     act = random.random()
     if act < 0.2:
         values = (np.nan, np.inf, -1.0, 1e30, 2.0, 1e-40)
-        array = array.astype(random.choice((np.float16, np.float32, np.float64)))
+        array = array.astype(np.float64)
         array.flat[random.randrange(array.size)] = random.choice(values)
+        with np.errstate(over="ignore"):
+            array = array.astype(random.choice((np.float16, np.float32, np.float64)))
         np.save(written, array)
     elif act < 0.4:
         kinds = ("<i8", ">f4", "<c8", "O", "S3", "U4", "?", "<M8[s]", "<f2", "V8", "f4,i4", "<u2")
@@ -942,13 +953,14 @@ SOURCES = (
         "sim:underground?frames=20&step=2",
     ),
     *("sim:railway?frames=20&traverse=1", "sim:aerial?frames=30&start=3&stop=20", "in/strip.png"),
+    *("in/fifo.npy", "in/fifo.mp4", "in/loop.npy", "strip:in/fifo.png?width=8"),
 )
 
 
 @reader("source", inputs, share=2)
 def source(case: Case) -> None:
     random = case.random
-    shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
+    copy_inputs(case)
     text = random.choice(SOURCES)
     if random.random() < 0.6 and "?" in text:
         address, _, query = text.partition("?")
