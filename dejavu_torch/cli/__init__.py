@@ -35,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
     logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # what it says of an image is in the one line
     given = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:  # so that temporary files are removed
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))

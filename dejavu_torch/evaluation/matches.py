@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import as_number, read_text, whole_file
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.types import InputError, Match, printable
 
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
 EXPECTED = "columns query,place,score and, if wanted, accepted and rank"
@@ -76,8 +76,7 @@ def write_matches(
 
 
 def _name(name_of: Callable[[int], str] | None, frame: int) -> str:
-    name = "" if name_of is None or frame < 0 else name_of(frame)
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)
+    return "" if name_of is None or frame < 0 else printable(name_of(frame))
 
 
 def read_matches(path: Path) -> Matches:
