@@ -13,18 +13,10 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-BATCH_NUMBERS = 2**26  # in the frames of a batch: 256 MB
+from dejavu_torch.text import printable
+
+BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least one: 256 MB
 LONGEST_MESSAGE = 2000  # characters
-
-
-def printable(text: object) -> str:
-    """A text as one line that can be printed anywhere: what cannot, such as a line break in a name, escaped.
-
-    Example:
-        >>> print(printable("a\\nb.png"))
-        a\\nb.png
-    """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 class InputError(ValueError):
@@ -47,7 +39,7 @@ class Traverse(ABC):
     whatever the batch size.
 
     Attributes:
-        name: what to call it in messages, a path or a `sim:` address.
+        name: what to call it in messages, a path or a `sim:` address; see `printable`.
         length: number of frames N, or None where only reading to the end can tell.
         place: (N,) float64, the true position of each frame in units of reference frames,
             or None where it is unknown.
@@ -104,8 +96,17 @@ class Traverse(ABC):
         return ""
 
     def batch_size(self, most: int) -> int:
-        """How many frames to read at a time: `most`, or fewer where frames are large."""
-        return max(1, min(most, BATCH_NUMBERS // max(1, math.prod(self.frame_shape))))
+        """How many frames to read at a time: `most`, or fewer where frames are large.
+
+        Raises:
+            InputError: a frame of more numbers than a batch may hold.
+        """
+        shape = self.frame_shape
+        fits = BATCH_NUMBERS // max(1, math.prod(shape))
+        if not fits:
+            seen = f"{self.name} has frames of {' x '.join(map(str, shape))} numbers"
+            raise InputError(f"{seen}; expected at most {BATCH_NUMBERS}, as ?width=640 makes of images")
+        return max(1, min(most, fits))
 
 
 @dataclass(frozen=True)

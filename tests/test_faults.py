@@ -344,7 +344,7 @@ def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:
     whole = (folder / "map.safetensors").read_bytes()
 
     def save_for_ever() -> None:
-        from dejavu_torch.data.files import whole_folder
+        from dejavu_torch.data.output import whole_folder
 
         while True:
             model.save(folder / "map.safetensors")
@@ -367,7 +367,7 @@ def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:
 
 
 def test_two_writers_of_a_map_and_a_folder_both_end_well(folder: Path) -> None:
-    from dejavu_torch.data.files import whole_file, whole_folder
+    from dejavu_torch.data.output import whole_file, whole_folder
 
     def write(text: str) -> None:
         for _ in range(100):

@@ -14,7 +14,8 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"types", "text"},
+    {"text"},
+    {"types"},
     {"resize", "memory"},
     {"features", "periods", "data"},
     {"database"},
@@ -30,11 +31,12 @@ RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
 ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all to their left
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
+    "types": "text",
     "memory": "types",
     "resize": "types",
-    "data": "types memory resize",
+    "data": "types text memory resize",
     "features": "types resize",
-    "periods": "types",
+    "periods": "types memory",
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "types data",

@@ -74,7 +74,7 @@ def _run(given: Sequence[str]) -> None:
     from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
     from dejavu_torch.cli.parser import COMMAND, UsageError, parse
     from dejavu_torch.cli.presets import with_configs
-    from dejavu_torch.data.files import remove_temporaries
+    from dejavu_torch.data.output import remove_temporaries
     from dejavu_torch.types import InputError
 
     process.cleanup[:] = [remove_temporaries]
@@ -109,6 +109,7 @@ def _log_to_stderr() -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(OneLine("dejavu: %(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # what it says of an image is in the one line
 
 
 def _shortage(error: Exception) -> str | None:

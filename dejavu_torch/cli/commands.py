@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
-from dejavu_torch.data.files import check_output_file, check_output_folder, whole_folder
+from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap

@@ -48,8 +48,7 @@ def check_config(path: Path) -> None:
     """Refuse what is no YAML file of options, ahead of what makes objects of it.
 
     Raises:
-        InputError: no regular file, no text, no YAML, not a mapping or an empty one, a key that is there twice, more
-            values than any config has, as where aliases name each other, or deeper ones.
+        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `check_yaml` as well.
     """
     if check_regular(path, EXPECTED) > LARGEST:
         raise InputError(f"{path} is larger than {LARGEST} bytes; expected {EXPECTED}")
@@ -63,8 +62,8 @@ def check_config(path: Path) -> None:
 def check_yaml(text: str) -> None:
     """Refuse a text of more, deeper or longer values than any config has, or with a key twice in one mapping.
 
-    It goes through the events of the parser, one by one: no value is made, and nothing calls itself, as do the
-    loaders behind it, which aliases that name each other keep busy for hours, and deep ones end the process.
+    It goes through the events of the parser, one by one: no value is made, and nothing calls itself. Loaders
+    do: aliases that name each other keep them busy for hours, and many levels end the process.
 
     Raises:
         ValueError: naming the line. yaml.YAMLError: no YAML.
@@ -77,14 +76,14 @@ def check_yaml(text: str) -> None:
             if len(event.value) > LONGEST:
                 raise ValueError(f"{line}: a value of {len(event.value)} characters")
             here.add(1, event.value, line)
-            sizes[event.anchor] = 1
+            sizes[event.anchor or ""] = 1
         elif isinstance(event, yaml.AliasEvent):
             here.add(sizes.get(event.anchor, MOST), None, line)  # its own anchor is not yet there
         elif isinstance(event, yaml.CollectionStartEvent):
             open_.append(_Collection(event.anchor, isinstance(event, yaml.MappingStartEvent)))
         elif isinstance(event, yaml.CollectionEndEvent):
             open_.pop()
-            sizes[here.anchor] = here.size
+            sizes[here.anchor or ""] = here.size
             open_[-1].add(here.size, None, line)
         if open_[-1].size >= MOST or len(open_) > DEEPEST:
             raise ValueError(f"{line}: over {MOST} values, or {DEEPEST} levels")

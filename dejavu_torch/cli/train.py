@@ -19,7 +19,7 @@ from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveCon
 from dejavu_torch.cli.commands import print_map
 from dejavu_torch.cli.parser import Parser, refusal
 from dejavu_torch.cli.process import interrupts_raise
-from dejavu_torch.data.files import check_output_folder, make_output_folder, remove_empty_folders, whole_file
+from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport

@@ -13,6 +13,7 @@ from torch import Tensor
 from dejavu_torch.data.files import LARGEST, reading
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
 UNNAMED = "the array"
@@ -69,7 +70,7 @@ def read_array(path: Path) -> ArrayTraverse:
     """An `.npy` file of frames or features, memory-mapped.
 
     Raises:
-        InputError: not a whole .npy file, an array of another shape or type, or a frame larger than the memory.
+        InputError: not a whole .npy file, an array of another shape or type, or no memory for a frame.
     """
     with reading(path, "is no whole .npy array", EXPECTED):
         with path.open("rb") as file:
@@ -82,7 +83,7 @@ def read_array(path: Path) -> ArrayTraverse:
             values: np.ndarray = np.memmap(path, kind, "r", start, shape, "F" if by_columns else "C")
         else:  # nothing to map
             values = np.zeros(shape, kind)
-    return ArrayTraverse(values, str(path))
+    return ArrayTraverse(values, printable(path))
 
 
 def read_header(head: bytes) -> tuple[tuple[int, ...], np.dtype, bool, int]:

@@ -14,6 +14,7 @@ from dejavu_torch.data.files import LARGEST, reading
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.resize import MOST_PIXELS, resize_frames
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
@@ -24,8 +25,8 @@ BYTES_A_PIXEL = 24  # that reading takes at most: decoded, as an array, and as f
 class ImageFolder(IndexedTraverse):
     """The images of a folder, sorted by name; numbers in names count as numbers (9 before 10).
 
-    Grey images give one channel, all others three; an image that says how the camera was turned is upright; of
-    several images in a file only the first counts.
+    Grey images give one channel, all others three; an image that says how the camera was turned is upright;
+    of several images in a file only the first counts.
 
     Args:
         path: the folder.
@@ -54,7 +55,7 @@ class ImageFolder(IndexedTraverse):
             raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
         self.files = sorted(files, key=lambda file: _natural(file.name))
         self.width, self.height = width, height
-        self.name = str(folder)
+        self.name = printable(folder)
         self.length = len(self.files)
         self._first: tuple[str, str] | None = None  # name and shape of the first image that was read
 
@@ -87,7 +88,7 @@ def check_size(path: Path, width: int, height: int) -> None:
 
 
 def check_pixels(path: Path, rows: int, columns: int) -> None:
-    """Refuse, ahead of any allocation, an image or a frame of more pixels than can be meant, or that there is room for."""
+    """Refuse, ahead of any allocation, more pixels of one frame than can be meant, or than there is room for."""
     seen = f"{path} has {rows} x {columns} pixels"
     if rows * columns > MOST_PIXELS:
         raise InputError(f"{seen}; expected at most {MOST_PIXELS}")
@@ -119,7 +120,7 @@ def read_image(path: Path) -> Tensor:
     Of a file of several images it is the first.
 
     Raises:
-        InputError: the file cannot be read as an image, has over 2^26 pixels or more than there is memory for,
+        InputError: the file cannot be read as an image, has over 2^26 pixels, more than there is memory for,
             or numbers outside [0, 1].
     """
     with (

@@ -68,7 +68,9 @@ class FrameRange(Traverse):
             raise InputError(f"{traverse.name}: {told}; expected {expected}")
         self.traverse = traverse
         end = stop or length or LARGEST
-        self.frames = range(start, end, min(step, max(1, end - start)))  # a longer one takes one frame as well
+        self.frames = range(
+            start, end, min(step, max(1, end - start))
+        )  # a longer one takes one frame as well
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
         if length is not None:
             self.length = len(self.frames)

@@ -461,7 +461,7 @@ def _columns(which: Tensor) -> Iterator[Tensor]:
 
 
 def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
-    """GThard and GTsoft in this order, those that are there; nothing is read of a matrix that does not fit."""
+    """GThard and GTsoft in this order, those that are there; nothing is read of one that does not fit."""
     expected = "boolean matrices GThard and/or GTsoft"
     found: dict[str, np.ndarray] = {}
     with reading(path, "is no whole .npz file of arrays", expected), zipfile.ZipFile(path) as archive:

@@ -10,6 +10,7 @@ from torch import Tensor
 from dejavu_torch.data.files import as_number
 from dejavu_torch.data.folder import read_image
 from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError
 
 
@@ -74,4 +75,4 @@ def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: boo
         if first is None or stop is None or first % 1 or stop % 1 or not 0 <= first < stop <= strip.shape[1]:
             raise InputError(f"{path}: rows {rows}; expected first:stop inside 0:{strip.shape[1]}")
         strip = strip[:, int(first) : int(stop)]
-    return SlidingWindow(strip, width, name=str(path))
+    return SlidingWindow(strip, width, name=printable(path))

@@ -18,6 +18,7 @@ from dejavu_torch.data.files import check_regular, reading
 from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.resize import MOST_PIXELS
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class Video(Traverse):
     """
 
     def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
-        self.path, self.name = Path(path), str(path)
+        self.path, self.name = Path(path), printable(path)
         check_size(self.path, width, height)
         self.width, self.height = width, height
         check_regular(self.path, "a video file")

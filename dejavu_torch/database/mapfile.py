@@ -15,7 +15,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from dejavu_torch.data.files import whole_file
+from dejavu_torch.data.output import whole_file
 from dejavu_torch.types import InputError
 
 FORMAT = 7

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import jinja2
 
-from dejavu_torch.data.files import whole_folder
+from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.text import printable

@@ -21,7 +21,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
-from dejavu_torch.data.files import check_output_folder, whole_folder
+from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.spectral import SpectralMapper

@@ -24,8 +24,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from dejavu_torch.data.files import check_output_folder, whole_folder
 from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.spectral import SpectralMapper

@@ -15,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
-from dejavu_torch.data.files import check_output_folder, whole_file, whole_folder
+from dejavu_torch.data.output import check_output_folder, whole_file, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.coded_video import CodedVideo

@@ -8,9 +8,12 @@ from fractions import Fraction
 
 from torch import Tensor
 
+from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import supportive_periods
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
+
+LONGEST = 2**24  # bins of a period, and places of a bin: their products fit whole numbers of 64 bits
 
 log = logging.getLogger("dejavu_torch")
 
@@ -42,14 +45,15 @@ class ImposedPeriods(PeriodFinder):
 
     def __init__(self, periods: list[int] | None = None, bin: int = 5, stagger: bool = False) -> None:
         super().__init__()
-        if bin < 1 + stagger:
+        if not 1 + stagger <= bin <= LONGEST:
             least = "2 places to stagger" if stagger else "1 place"
-            raise InputError(f"imposed periods got bin={bin}; expected at least {least}")
+            raise InputError(f"imposed periods got bin={bin}; expected at least {least}, at most {LONGEST}")
         if periods is not None:
-            whole = all(isinstance(period, int) and period >= 2 for period in periods)
+            whole = all(isinstance(period, int) and 2 <= period <= LONGEST for period in periods)
             if not whole or not periods or len(periods) > len(set(periods)):
                 raise InputError(
-                    f"imposed periods are {periods}; expected distinct whole numbers >= 2, in bins"
+                    f"imposed periods are {periods}; expected distinct whole numbers >= 2, in bins, of at most "
+                    f"{LONGEST}"
                 )
         self.periods = None if periods is None else list(periods)
         self.bin = bin
@@ -64,6 +68,7 @@ class ImposedPeriods(PeriodFinder):
         bins = -(-places // self.bin)
         # a route of a single bin leaves nothing to tell apart
         periods = self.periods or supportive_periods(max(2, bins))
+        check_room(4.0 * sum(periods) * dimension, f"the templates of {sum(periods)} phases")
         distinct = math.lcm(*periods)
         if distinct < bins:
             log.warning(

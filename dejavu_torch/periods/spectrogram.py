@@ -195,7 +195,8 @@ class SpectrogramAnalysis(PeriodFinder):
         kept, shares = [], []
         for columns in chunk.split(max(1, NUMBERS_AT_ONCE // len(chunk)), 1):
             power = chunk_power(columns)
-            bins = strongest_bins(power, self.strongest, len(chunk) // self.min_period, self.peaks)
+            most = min(self.strongest, len(power))  # there are no more
+            bins = strongest_bins(power, most, len(chunk) // self.min_period, self.peaks)
             share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
             kept.append(bins)
             shares.append(share.where(bins > 0, 0.0).amax(0))

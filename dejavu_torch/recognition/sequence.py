@@ -38,8 +38,8 @@ class SequenceMatcher(SequenceModel):
         normalisation.
 
     Raises:
-        InputError: a length below 1 or above 65536, no speeds, or speeds that are not finite; forward: scores that are no
-            (Q,N), or rows ahead of another number of places.
+        InputError: a length below 1 or above 65536, no speeds, or speeds that are not finite; forward: scores
+            that are no (Q,N), or rows ahead of another number of places.
 
     Example:
         >>> scores = torch.tensor([[0.0, 5, 5, 0], [5, 0.0, 0, 5], [0, 5, 0.0, 5]])
@@ -50,7 +50,9 @@ class SequenceMatcher(SequenceModel):
     def __init__(self, length: int = 11, speeds: Sequence[float] = (1.0,)) -> None:
         super().__init__()
         if not isinstance(length, int) or not 1 <= length <= LONGEST:
-            raise InputError(f"a sequence of {length} queries; expected a whole number, at least 1, at most {LONGEST}")
+            raise InputError(
+                f"a sequence of {length} queries; expected a whole number, at least 1, at most {LONGEST}"
+            )
         given = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
         if not given or not all(map(math.isfinite, given)):
             raise InputError(

@@ -18,7 +18,7 @@ from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor
 from torch.optim import Optimizer
 
-from dejavu_torch.data.files import make_output_folder, whole_file
+from dejavu_torch.data.output import make_output_folder, whole_file
 from dejavu_torch.database.place_map import EXTRA
 from dejavu_torch.types import InputError
 
