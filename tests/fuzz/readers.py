@@ -480,7 +480,7 @@ def mutated_checkpoint(random: Random, data: bytes) -> tuple[bytes, bool]:
                 held = old.read(name)
                 if name == chosen:
                     held = random.choice(PICKLES) if random.random() < 0.3 else mutate_bytes(random, held)
-                new.writestr(name, held)
+                new.writestr(zipfile.ZipInfo(name), held)
         return written.getvalue(), True
     held = torch.load(io.BytesIO(data), weights_only=True)
     plain = {name: value for name, value in held.items() if name not in ("state_dict", "optimizer_states")}
@@ -1010,7 +1010,7 @@ def truth_matrices(case: Case) -> None:
         written = io.BytesIO()
         with (
             zipfile.ZipFile(io.BytesIO(data)) as old,
-            zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as new,
+            zipfile.ZipFile(written, "w") as new,
         ):
             for name in old.namelist():
                 held = old.read(name)
@@ -1021,7 +1021,7 @@ def truth_matrices(case: Case) -> None:
                     held = held.replace(
                         b"(30, 12), }" + b" " * len(shape), shape.encode() + b", }" + b" " * 8
                     )
-                new.writestr(name, held)
+                new.writestr(zipfile.ZipInfo(name), held, zipfile.ZIP_DEFLATED)
         data = written.getvalue()
     path.write_bytes(data)
     judge(case, str(path))

@@ -220,6 +220,7 @@ def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: i
             shutil.rmtree(root / "making", ignore_errors=True)
             (root / "making").mkdir()
             folder.parent.mkdir(exist_ok=True)
+            torch.manual_seed(0)
             maker(root / "making")
             (root / "making").rename(folder)
     sys.stderr.flush()
