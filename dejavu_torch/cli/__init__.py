@@ -20,7 +20,7 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "evaluate": "evaluate the matches in a csv, whatever found them",
     "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
     "train": "train features that repeat: fit, validate, test or export",
-    "bench": "speed, or accuracy over bytes, beside what a user would pick instead",
+    "bench": "speed, memory, or accuracy over bytes, beside what a user would pick instead",
     "info": "what is in a map",
 }
 LONGEST = 300  # characters of a message of torch's

@@ -331,19 +331,21 @@ def run_bench(
     whitening: Path | None = None,
     places: Sequence[int] = (),
 ) -> None:
-    """Set this package beside what a user would pick instead: its speed, or its accuracy over bytes.
+    """Set this package beside what a user would pick instead: its speed, memory, or accuracy over bytes.
 
     Args:
-        what: matcher (time of HOG, L1 distances, sequences, filters) or storage (accuracy over bytes)
+        what: matcher (time of HOG, L1 distances, sequences, filters), memory (of learning and localizing) or
+            storage (accuracy over bytes)
         sources: of storage, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
         codebooks: of storage, another route, where codebooks and a whitening are learned that count nothing
         whitening: of storage, a map whose whitening describes all routes; each learns its own if not given
-        places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given
+        places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given. Of memory, frames
+            that are learned; 1000, 10000 and 50000 if not given
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench, frontier
+    from dejavu_torch.experiments import bench, footprint, frontier
 
     if what == "storage":
         given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
@@ -354,15 +356,22 @@ def run_bench(
             _say(line)
         _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
-    if what in bench.BENCHES and (sources or places or map or codebooks or whitening):
+    known = what in bench.BENCHES or what == "memory"
+    if known and (sources or map or codebooks or whitening or (places and what != "memory")):
         raise InputError(
             f"bench {what} takes no sources, maps, codebooks, whitening or places; bench storage does"
         )
-    rows = bench.run_bench(what, out)
-    print(text_table(bench.bench_table(rows)))
+    if what == "memory":
+        rows = footprint.run_memory(out, places)
+        print(text_table(footprint.memory_table(rows)))
+        note = "peak: beyond that of the programs loaded"
+    else:
+        rows = bench.run_bench(what, out)
+        print(text_table(bench.bench_table(rows)))
+        note = "x ours: seconds / those of the fastest dejavu"
     if any("No module" in (row.skipped or "") for row in rows):
         print("what is skipped needs pip install '.[bench]'")
-    _say(f"x ours: seconds / those of the fastest dejavu; next: open {out / 'bench.png'}")
+    _say(f"{note}; next: open {out / 'bench.png'}")
 
 
 def run_info(map: Path, *, features: nn.Module | None = None) -> None:

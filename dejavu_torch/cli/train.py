@@ -20,7 +20,7 @@ from dejavu_torch.cli.commands import print_map
 from dejavu_torch.cli.parser import Parser, refusal
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.files import check_output_folder, make_output_folder, remove_empty_folders, whole_file
-from dejavu_torch.training.checkpoint import CheckpointFiles, taking_over
+from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
@@ -175,7 +175,9 @@ class TrainCLI(LightningCLI):
             raise InputError("trainer.overfit_batches does not fit; expected trainer.limit_train_batches")
         root = Path(self.trainer.default_root_dir)
         check_output_folder(root)
-        resumed = self.config[self.subcommand].get("ckpt_path")
+        resumed = self.config_init[self.subcommand].get("ckpt_path")
+        if resumed:
+            self.before_validate()
         if not asked["fast_dev_run"] and (root / "map.safetensors").exists() and not resumed:
             log.warning("%s holds an earlier run, which this one replaces", root)
 
@@ -186,10 +188,12 @@ class TrainCLI(LightningCLI):
         try:
             with interrupts_raise(), self._taking_over(arguments):
                 self.trainer.fit(**arguments)
-        except InputError:
+        except (InputError, OSError) as error:
             refused = True
             if new:
                 remove_empty_folders(root)
+            if isinstance(error, OSError):
+                raise InputError(f"the training in {root} has failed: {error.strerror or error}") from error
             raise
         finally:
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
@@ -215,7 +219,8 @@ class TrainCLI(LightningCLI):
     def before_validate(self) -> None:
         """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""
         chosen, last = self.config_init[self.subcommand], self._last_checkpoint()
-        if chosen.get("ckpt_path"):
+        if chosen.get("ckpt_path") not in (None, "", "last"):
+            self._check_there(chosen["ckpt_path"])
             return
         if last is None:
             raise InputError(
@@ -225,6 +230,11 @@ class TrainCLI(LightningCLI):
         chosen["ckpt_path"] = str(last)
 
     before_test = before_export = before_validate
+
+    def _check_there(self, path: str) -> None:
+        """Lightning has words for some checkpoints, such as best, which mean none here."""
+        if path in ("best", "hpc") or not Path(path).exists():
+            raise InputError(f"{path} is not there; {EXPECTED}")
 
     def after_validate(self) -> None:
         """Say what the figures are of, and what to do next."""

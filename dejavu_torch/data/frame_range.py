@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
+from dejavu_torch.data.files import LARGEST
 from dejavu_torch.types import InputError, Traverse
 
 
@@ -58,19 +59,21 @@ class FrameRange(Traverse):
     def __init__(self, traverse: Traverse, start: int = 0, stop: int = 0, step: int = 1) -> None:
         length = traverse.length
         stops = stop == 0 or start < stop
-        if start < 0 or step < 1 or not stops or (length is not None and max(start + 1, stop) > length):
+        beyond = max(start, stop) > LARGEST or (length is not None and max(start + 1, stop) > length)
+        if start < 0 or step < 1 or not stops or beyond:
             given = (("start", start, 0), ("stop", stop, 0), ("step", step, 1))
             told = ", ".join(f"{name}={value}" for name, value, default in given if value != default)
             part = f"a part of its {'' if length is None else f'{length} '}frames"
             expected = "a step of at least 1" if step < 1 else part
             raise InputError(f"{traverse.name}: {told}; expected {expected}")
         self.traverse = traverse
-        self.frames = range(start, stop or length or 2**62, step)
+        end = stop or length or LARGEST
+        self.frames = range(start, end, min(step, max(1, end - start)))  # a longer one takes one frame as well
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
         if length is not None:
             self.length = len(self.frames)
         if traverse.place is not None:
-            self.place = traverse.place[start : stop or None : step].contiguous()
+            self.place = traverse.place[start : stop or None : self.frames.step].contiguous()
         self._least = len(self.frames) if stop else 1
 
     def batches(self, size: int) -> Iterator[Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -48,7 +49,7 @@ def open_source(source: str | Path) -> Traverse:
     text = str(source)
     if text.startswith(("sim:", "strip:")):
         address, _, query = text.partition("?")
-    elif "?" in text and not Path(text).exists():
+    elif "?" in text and not os.path.exists(text):  # False also of what can be no path
         address, _, query = text.rpartition("?")
     else:
         address, query = text, ""
@@ -68,8 +69,8 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
     if address.startswith("strip:"):
         return partial(read_strip, Path(address.removeprefix("strip:")))
     path = Path(address)
-    if not path.exists():
-        raise InputError(f"{text} is not there; expected {EXPECTED}")
+    if not address or not os.path.exists(path):
+        raise InputError(f"{text or 'a source without a name'} is not there; expected {EXPECTED}")
     if path.is_dir():
         return partial(ImageFolder, path)
     suffix = path.suffix.lower()
@@ -88,8 +89,9 @@ def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[s
     defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | PART
     given: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
-        if name not in defaults:
-            raise InputError(f"{text}: unknown {name!r}; expected {', '.join(defaults)}")
+        if name not in defaults or name in given:
+            what = "a second" if name in given else "unknown"
+            raise InputError(f"{text}: {what} {name!r}; expected {', '.join(defaults)}")
         default = defaults[name]
         kind = int if default is empty or isinstance(default, bool) else type(default)
         try:

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.files import as_number
 from dejavu_torch.data.folder import read_image
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.types import InputError
@@ -69,8 +70,8 @@ def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: boo
     for _ in range(halve):
         strip = torch.nn.functional.avg_pool2d(strip, 2)
     if rows:
-        first, _, stop = rows.partition(":")
-        if not (first.isdigit() and stop.isdigit() and int(first) < int(stop) <= strip.shape[1]):
+        first, stop = (as_number(part) for part in (rows.partition(":")[0], rows.partition(":")[2]))
+        if first is None or stop is None or first % 1 or stop % 1 or not 0 <= first < stop <= strip.shape[1]:
             raise InputError(f"{path}: rows {rows}; expected first:stop inside 0:{strip.shape[1]}")
         strip = strip[:, int(first) : int(stop)]
     return SlidingWindow(strip, width, name=str(path))

@@ -34,13 +34,15 @@ TRANSFORM_COST = 200  # of a place in a query's inverse transform
 REBUILD_COST = 120  # of a number that is rebuilt for all queries at once
 
 
+@torch.no_grad()
 def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -> Tensor:
     """Whole numbers of steps, those below 1 - `ROUNDING` of a step 0. Same shape, float; no gradient.
 
     Args:
         width: by how much that dead zone is wider for each line, at least 1; see `dead_zone`.
     """
-    levels = lines.sign() * (lines.abs() / step + ROUNDING).floor()
+    # in place: the lines of a long route are large
+    levels = lines.abs().div_(step).add_(ROUNDING).floor_().copysign_(lines)
     return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
 
 

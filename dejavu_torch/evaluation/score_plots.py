@@ -14,6 +14,7 @@ from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas, lab
 
 _OURS = COLOURS["map"]
 _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
+RATIO = "time over that of our fastest; less is better"
 LOWEST, HIGHEST = 0.01, 0.999  # areas, where more and less is drawn as this
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
@@ -214,11 +215,12 @@ def plot_sequences(lines: Mapping[str, Areas], coded: Sequence[Areas], title: st
     return figure, axis
 
 
-def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
-    """Time of each contender over ours, one bar each, one group for each case.
+def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) -> Plot:
+    """A figure of each contender, its time over ours if not said otherwise: one bar each, grouped by case.
 
     Args:
-        cases: at least one: case -> contender -> ratio. Names that start with "dejavu" are ours.
+        cases: at least one: case -> contender -> figure. Names that start with "dejavu" are ours.
+        label: what is drawn.
     """
     bars = [len(ratios) for ratios in cases.values()]
     height = 0.5 + 0.42 * sum(bars) + 0.5 * len(bars)
@@ -229,10 +231,11 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
         for row, name in enumerate(ratios):
             axis.text(0, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
         axis.bar_label(drawn, [f"{ratio:.1f}" for ratio in ratios.values()], padding=3, fontsize=9)
-        axis.axvline(1, color=_OURS, linewidth=0.8, linestyle=":")
+        if label == RATIO:
+            axis.axvline(1, color=_OURS, linewidth=0.8, linestyle=":")
         axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
         axis.set(xlim=(0, 1.15 * max(ratios.values())), ylim=(len(ratios) - 0.6, -0.8), yticks=[])
-    axes[-1, 0].set_xlabel("time over that of our fastest; less is better")
+    axes[-1, 0].set_xlabel(label)
     return figure, axes[:, 0]
 
 

@@ -50,7 +50,7 @@ class SequenceMatcher(SequenceModel):
     def __init__(self, length: int = 11, speeds: Sequence[float] = (1.0,)) -> None:
         super().__init__()
         if not isinstance(length, int) or not 1 <= length <= LONGEST:
-            raise InputError(f"a sequence of {length} queries; expected a whole number, 1 to {LONGEST}")
+            raise InputError(f"a sequence of {length} queries; expected a whole number, at least 1, at most {LONGEST}")
         given = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
         if not given or not all(map(math.isfinite, given)):
             raise InputError(
