@@ -343,6 +343,3 @@ def main(arguments: list[str] | None = None) -> int:
 def _row(name: str, counts: list[int]) -> str:
     cases, accepted, refused, broken = counts
     return f"{name:<20} {cases:5}  {accepted:8}  {refused:7}  {broken:8}"
-
-
-__all__ = ["Wrong", "main", "run", "shares"]
