@@ -475,7 +475,8 @@ in/empty in/a_file in out missing utm:25 in/last.ckpt in/fifo.csv in/fifo.npy in
 --mapper=TemplateMapper --mapper.help --mapper.route_bytes_per_place 1e-9 --features=HOG --features.cell 1000
 --features.help Whitening --whitening.seed -1 --whitening.views=2 --whitening in/fifo.safetensors --config
 --preprocess.grid=[2,2] --threshold=nan --query in/query.npy --config paper --config in/config.yaml
---truth utm --config in/fifo.yaml --tolerance 9223372036854775808 --seed -1 --seed 1180591620717411303424 --batch_size 0
+--truth utm --config in/fifo.yaml --tolerance 9223372036854775808
+--seed -1 --seed 1180591620717411303424 --batch_size 0
 --top 999 --sequence 999 --sequence=3 --filter --speeds [nan] --moves [0,0] --out in/a_file --out out/no/m.csv
 --map in/spectral.safetensors --map in/fifo.safetensors --truth in/fifo.npz --out in/empty
 """
