@@ -220,6 +220,7 @@ def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: i
             shutil.rmtree(root / "making", ignore_errors=True)
             (root / "making").mkdir()
             folder.parent.mkdir(exist_ok=True)
+            torch.manual_seed(0)
             maker(root / "making")
             (root / "making").rename(folder)
     sys.stderr.flush()
@@ -342,6 +343,3 @@ def main(arguments: list[str] | None = None) -> int:
 def _row(name: str, counts: list[int]) -> str:
     cases, accepted, refused, broken = counts
     return f"{name:<20} {cases:5}  {accepted:8}  {refused:7}  {broken:8}"
-
-
-__all__ = ["Wrong", "main", "run", "shares"]
