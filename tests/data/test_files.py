@@ -55,7 +55,7 @@ def test_what_we_refuse_ourselves_stays_and_warnings_are_no_line(tmp_path: Path)
         warnings.simplefilter("error")
         with reading(tmp_path / "a.bin", "is no array", "one"):
             warnings.warn("odd", stacklevel=1)
-    with pytest.raises(InputError, match="^ours$"), reading(tmp_path / "a.bin", "is no array", "one"):
+    with pytest.raises(InputError, match=r"^ours$"), reading(tmp_path / "a.bin", "is no array", "one"):
         raise InputError("ours")
 
 
