@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import errno
+import os
+import struct
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers import refused
 
-from dejavu_torch.data.files import check_output_file, make_output_folder, whole_file
+from dejavu_torch.data.files import (
+    check_output_file,
+    check_regular,
+    make_output_folder,
+    read_text,
+    reading,
+    whole_file,
+)
 from dejavu_torch.types import InputError
 
 
@@ -90,3 +101,43 @@ def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, path: str) -
     (tmp_path / "file").touch()
     with refused("file"):
         make_output_folder(tmp_path / path)
+
+
+def test_messages_are_one_line_whatever_a_name_holds() -> None:
+    message = str(InputError("a\nb\r\x1b[2J\udcff\u202e.png is no image"))
+    assert message == r"a\nb\r\x1b[2J\udcff\u202e.png is no image"
+    assert message.encode()
+    long = str(InputError("seen " + "x" * 10**5 + "; expected less"))
+    assert (len(long) < 2100, long[:5], long[-15:]) == (True, "seen ", "; expected less")
+
+
+@pytest.mark.parametrize("read", [check_regular, read_text])
+def test_what_is_no_regular_file_is_not_waited_for(
+    tmp_path: Path, read: Callable[[Path, str], object]
+) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "device").symlink_to("/dev/zero")
+    for name, seen in (("fifo", "no regular file"), ("device", "no regular file"), (".", "directory")):
+        with refused(seen, "expected lines"):
+            read(tmp_path / name, "lines")
+    for name in ("a\0b", "a" * 5000):
+        with refused("cannot be read", "expected lines"):
+            read(tmp_path / name, "lines")
+
+
+def test_whatever_a_decoder_raises_is_one_refusal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a").touch()
+    for problem in (struct.error("x\ny"), KeyError(3), MemoryError(), OverflowError("big"), RecursionError()):
+        with refused("a is broken", "expected better"), reading(tmp_path / "a", "is broken", "better"):
+            warnings.warn("more lines", UserWarning, stacklevel=1)
+            raise problem
+    with refused("as it is"), reading(tmp_path / "a", "is broken", "better"):
+        raise InputError("as it is")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_text_larger_than_the_memory_is_refused(tmp_path: Path) -> None:
+    with (tmp_path / "a").open("wb") as file:
+        file.truncate(2**40)
+    with refused("the text of", "GB free"):
+        read_text(tmp_path / "a", "lines")
