@@ -120,8 +120,8 @@ class DejaVu(nn.Module):
             raise InputError(
                 f"the mapper is a {type(mapper).__name__}; expected a Mapper such as TemplateMapper"
             )
-        if batch_size < 1:
-            raise InputError(f"batch_size is {batch_size}; expected at least 1")
+        if not isinstance(batch_size, int) or batch_size < 1:
+            raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
         if threshold is not None and not threshold > -math.inf:
             raise InputError(f"the threshold is {threshold}; expected a number")
         self.preprocess = Preprocess() if preprocess is None else preprocess
@@ -712,9 +712,11 @@ def _build(header: Header, name: str, features: nn.Module | None) -> nn.Module |
         return None
     # only learning needs what found the periods: one from elsewhere need not be built
     periods = recipe.init_args.get("periods")
-    if name == "mapper" and isinstance(periods, dict) and periods.get("class_path") not in REGISTRY:
-        plain = recipe._replace(init_args=recipe.init_args | {"periods": None})
-        mapper = build(plain, TemplateMapper, REGISTRY)
-        mapper.periods = ForeignPeriods(*checked(periods, Recipe, "its periods"))
-        return mapper
+    if name == "mapper" and periods is not None:
+        finder = checked(periods, Recipe, "its periods")
+        if finder.class_path not in REGISTRY:
+            plain = recipe._replace(init_args=recipe.init_args | {"periods": None})
+            mapper = build(plain, TemplateMapper, REGISTRY)
+            mapper.periods = ForeignPeriods(*finder)
+            return mapper
     return build(recipe, PARTS[name], REGISTRY, features)

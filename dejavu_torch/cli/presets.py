@@ -48,7 +48,7 @@ def check_config(path: Path) -> None:
     """Refuse what is no YAML file of options, ahead of what makes objects of it.
 
     Raises:
-        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `check_yaml` as well.
+        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `check_yaml`.
     """
     if check_regular(path, EXPECTED) > LARGEST:
         raise InputError(f"{path} is larger than {LARGEST} bytes; expected {EXPECTED}")

@@ -32,8 +32,8 @@ class ArrayTraverse(IndexedTraverse):
         name: what to call it in messages.
 
     Raises:
-        InputError: another shape or type, or no frames; while reading, float frames of an array outside
-            [0, 1] or NaN.
+        InputError: another shape or type, or no frames; while reading a file, float frames outside [0, 1] or
+            NaN.
     """
 
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
@@ -57,12 +57,14 @@ class ArrayTraverse(IndexedTraverse):
             part = part[..., None] if part.ndim == 3 else part
             return part.permute(0, 3, 1, 2).float() / 255
         batch = part if part.dtype == torch.float64 else part.float()
-        if batch.ndim == 4 and not isinstance(self.values, Tensor):  # which a pipeline may have normalised
-            low, high = batch.aminmax()
-            if not (low >= 0 and high <= 1):  # or NaN
-                raise InputError(
-                    f"{self.name} holds float frames from {low:.4g} to {high:.4g}; expected 0 to 1"
-                )
+        if batch.ndim == 4 and isinstance(self.values, np.memmap):  # a tensor is the caller's own affair
+            low, high = batch.flatten(1).aminmax(dim=1)
+            bad = ~((low >= 0) & (high <= 1))  # or NaN
+            if bad.any():
+                at = int(bad.nonzero()[0])
+                seen = f"numbers from {low[at]:.4g} to {high[at]:.4g}"
+                seen = seen if (low[at] - high[at]).isfinite() else "NaN or infinite numbers"
+                raise InputError(f"{self.name}: frame {frames[at]} holds {seen}; expected 0 to 1")
         return batch
 
 

@@ -88,7 +88,7 @@ def check_size(path: Path, width: int, height: int) -> None:
 
 
 def check_pixels(path: Path, rows: int, columns: int) -> None:
-    """Refuse, ahead of any allocation, more pixels of one frame than can be meant, or than there is room for."""
+    """Refuse, ahead of any allocation, more pixels of a frame than can be meant or than there is room for."""
     seen = f"{path} has {rows} x {columns} pixels"
     if rows * columns > MOST_PIXELS:
         raise InputError(f"{seen}; expected at most {MOST_PIXELS}")

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
+MOST_ORIENTATIONS = 360
 Bins = Literal["hard", "linear"]
 Gradient = Literal["central", "sobel"]
 VALUES_AT_ONCE = 2**19  # of the frames of one part, so that what lies between stays in the cache
@@ -196,9 +197,10 @@ class HOG(nn.Module):
     ) -> None:
         super().__init__()
         check_names(bins, gradient)
-        if min(orientations, cell, block) < 1:
+        if min(orientations, cell, block) < 1 or orientations > MOST_ORIENTATIONS:
             raise InputError(
-                f"HOG got orientations={orientations}, cell={cell}, block={block}; expected at least 1 each"
+                f"HOG got orientations={orientations}, cell={cell}, block={block}; expected at least 1 each, "
+                f"and at most {MOST_ORIENTATIONS} orientations"
             )
         if resize is not None:
             check_size(resize, cell * block, "HOG got resize")

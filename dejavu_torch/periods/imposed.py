@@ -52,8 +52,7 @@ class ImposedPeriods(PeriodFinder):
             whole = all(isinstance(period, int) and 2 <= period <= LONGEST for period in periods)
             if not whole or not periods or len(periods) > len(set(periods)):
                 raise InputError(
-                    f"imposed periods are {periods}; expected distinct whole numbers >= 2, in bins, of at most "
-                    f"{LONGEST}"
+                    f"imposed periods are {periods}; expected distinct whole numbers >= 2, <= {LONGEST}"
                 )
         self.periods = None if periods is None else list(periods)
         self.bin = bin

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -146,3 +147,87 @@ def test_frames_between_are_those_frames(start: int, stop: int) -> None:
     clip = torch.rand(200, 1, 2, 2)
     parts = list(ArrayTraverse(clip).between(start, stop))
     assert torch.equal(torch.cat([clip[:0], *parts]), clip[start:stop])
+
+
+def written(path: Path, header: str, body: bytes = bytes(256), version: int = 1) -> Path:
+    """A file with any header."""
+    text = header.encode().ljust(118) + b"\n"
+    length = len(text).to_bytes(2 if version == 1 else 4, "little")
+    path.write_bytes(b"\x93NUMPY" + bytes([version, 0]) + length + text + body)
+    return path
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize(
+    "header",
+    [
+        "(",
+        "'''",
+        "{'descr'",
+        "[" * 9000,
+        "1" * 5000,
+        *(
+            f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}"
+            for kind, shape in [
+                ("'<f4'", "(-1, 4)"),
+                ("'<f4'", "(-4, -4)"),
+                ("'<f4'", "(2**62, 4)"),
+                ("'<f4'", f"({2**62}, 4)"),
+                ("'<f4'", f"({10**40}, 1)"),
+                ("'<f4'", "(9, 9)"),
+                ("'<f4'", "(True, 4)"),
+                ("'<f4'", "(" + "1," * 70 + ")"),
+                ("'V0'", "(4, 4)"),
+                ("'|O'", "(4, 4)"),
+                ("[('a', '<f4')]", "(4, 4)"),
+                ("('<f4', (1000000000000,))", "(4, 4)"),
+                ("{}", "(4, 4)"),
+                ("None", "(4, 4)"),
+            ]
+        ),
+    ],
+)
+def test_a_header_that_no_array_has_is_refused(tmp_path: Path, header: str, version: int) -> None:
+    with refused("a.npy", "expected frames (N,H,W)"):
+        read_array(written(tmp_path / "a.npy", header, version=version))
+
+
+def test_a_header_of_gigabytes_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    with path.open("wb") as file:
+        file.write(b"\x93NUMPY\x02\x00\xff\xff\xff\xff")
+        file.truncate(2**33)
+    with refused("a.npy", "no whole .npy array"):
+        read_array(path)
+
+
+def test_a_frame_larger_than_the_memory_is_refused(tmp_path: Path) -> None:
+    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': (2, {10**6}, {10**6})}}"
+    path = written(tmp_path / "a.npy", header)
+    with path.open("r+b") as file:
+        file.truncate(3 * 10**12)
+    with refused("a frame of", "GB free"):
+        read_array(path)
+
+
+@pytest.mark.parametrize("kind", [">f2", ">f4", ">f8"])
+def test_another_byte_order_is_read(tmp_path: Path, kind: str) -> None:
+    np.save(tmp_path / "a.npy", FEATURES.astype(kind))
+    assert torch.allclose(all_of(read_array(tmp_path / "a.npy")).double(), torch.tensor(FEATURES), atol=1e-3)
+
+
+@pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf, -np.inf])
+def test_float_frames_of_a_file_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
+    frames = FRAMES.copy()
+    frames[5, 0, 1, 1] = bad
+    np.save(tmp_path / "a.npy", frames)
+    traverse = read_array(tmp_path / "a.npy")
+    assert len(next(traverse.batches(5))) == 5
+    with refused("a.npy", "frame 5", "expected 0 to 1"):
+        all_of(traverse, 3)
+
+
+def test_a_fifo_is_no_array(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.npy")
+    with refused("a.npy", "no regular file"):
+        read_array(tmp_path / "a.npy")

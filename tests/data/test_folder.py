@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers import refused
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 from torch import Tensor
 
+from dejavu_torch import memory
 from dejavu_torch.data.folder import ImageFolder, read_image
 from dejavu_torch.types import InputError
 
@@ -228,3 +231,85 @@ def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
 def test_frames_are_called_by_their_files(tmp_path: Path) -> None:
     write(tmp_path, "b10.png", "b9.png")
     assert [ImageFolder(tmp_path).frame_name(i) for i in range(2)] == ["b9.png", "b10.png"]
+
+
+def png(rows: int, columns: int) -> bytes:
+    """A black image in colour, whatever its size in a few bytes: what it says is not what it holds."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        check = zlib.crc32(kind + content).to_bytes(4, "big")
+        return len(content).to_bytes(4, "big") + kind + content + check
+
+    header = columns.to_bytes(4, "big") + rows.to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
+    parts = (
+        chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(bytes(1 + min(3 * columns, 9999))))
+        + chunk(b"IEND", b"")
+    )
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+@pytest.mark.parametrize("size", [(9000, 9000), (13_000, 13_000), (60_000, 60_000), (2, 2**27)])
+def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(
+    tmp_path: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Image.Image, "load", lambda _: pytest.fail("it was decoded"))
+    (tmp_path / "a.png").write_bytes(png(*size))
+    with refused("a.png", "expected"):
+        read_image(tmp_path / "a.png")
+
+
+def test_an_image_that_the_memory_does_not_hold_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
+    (tmp_path / "a.png").write_bytes(png(1000, 1000))
+    with refused("1000 x 1000 pixels", "0.01 GB free"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif"])
+def test_only_the_formats_of_the_suffixes_are_read(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("a program was started"))
+    (tmp_path / name).write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\n")
+    with refused(name, "cannot be read as an image"):
+        read_image(tmp_path / name)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -0.1, 1.5])
+def test_float_images_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
+    pixels = np.linspace(0, 1, 20, dtype=np.float32).reshape(4, 5)
+    Image.fromarray(pixels).save(tmp_path / "a.tif")
+    assert torch.equal(read_image(tmp_path / "a.tif")[0], torch.tensor(pixels))
+    pixels[2, 3] = bad
+    Image.fromarray(pixels).save(tmp_path / "a.tif")
+    with refused("a.tif", "expected 0 to 1"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("bad", [-5, 70_000])
+def test_whole_numbers_beyond_16_bits_are_refused(tmp_path: Path, bad: int) -> None:
+    Image.fromarray(np.full((4, 5), bad, np.int32)).save(tmp_path / "a.tif")
+    with refused("a.tif", "expected 0 to 1"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("name", [b"a\nb.png", b"a\x1b[2Jb.png", b"\xff.png"])
+def test_a_name_of_any_bytes_is_one_line(tmp_path: Path, name: bytes) -> None:
+    (tmp_path / os.fsdecode(name)).write_bytes(b"no image")
+    with pytest.raises(InputError) as caught:
+        all_of(ImageFolder(tmp_path))
+    assert str(caught.value).isprintable()
+    folder = tmp_path / "folder\nof lines"
+    folder.mkdir()
+    write(folder, "1.png")
+    assert ImageFolder(folder).name.isprintable()
+
+
+@pytest.mark.parametrize("given", [(10**12, 0), (0, 10**30), (10**5, 10**5)])
+def test_a_size_beyond_reason_is_refused(tmp_path: Path, given: tuple[int, int]) -> None:
+    write(tmp_path, "1.png")
+    with refused("expected at most"):
+        all_of(ImageFolder(tmp_path, *given))

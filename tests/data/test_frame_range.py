@@ -72,8 +72,11 @@ def test_large_frames_are_read_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) 
     assert frames.batch_size(64) == 64
     monkeypatch.setattr(types, "BATCH_NUMBERS", 3 * 20 + 1)
     assert frames.batch_size(64) == 3
-    monkeypatch.setattr(types, "BATCH_NUMBERS", 1)
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 20)
     assert frames.batch_size(64) == 1
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 19)
+    with refused("frames of 1 x 4 x 5 numbers", "expected at most 19"):
+        frames.batch_size(64)
 
 
 def test_a_traverse_without_names_has_empty_ones() -> None:

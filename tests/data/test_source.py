@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import av
@@ -253,3 +254,53 @@ def test_a_part_of_a_reference_keeps_its_positions() -> None:
     known = found >= 0
     assert known.any()
     assert ((reference.place[found] - query.place).abs()[known] <= 1).all()
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["", "?", "?width=3", "a" * 5000, "a" * 300, "a\0b", "a\0b?width=3", "\udcff", "b/" * 3000, "?" * 5000],
+)
+def test_what_can_be_no_path_is_not_there(source: str) -> None:
+    with refused("is not there"):
+        open_source(source)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.mp4", "a.png"])
+def test_a_fifo_is_not_waited_for(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    for source in (f"{tmp_path / name}", f"strip:{tmp_path / name}?width=3"):
+        with refused(name):
+            open_source(source)
+
+
+HUGE = "1" + "0" * 30
+
+
+@pytest.mark.parametrize("part", [f"start={HUGE}", f"stop={HUGE}", f"stop={2**62}", f"start={2**63}"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_part_of_more_frames_than_there_can_be_is_refused(
+    sources: dict[str, str], kind: str, part: str
+) -> None:
+    address = sources[kind]
+    with refused("expected a part of its"):
+        all_of(open_source(f"{address}{'&' if '?' in address else '?'}{part}"))
+
+
+@pytest.mark.parametrize("step", [HUGE, 2**63 - 1, 12])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_step_beyond_the_end_takes_one_frame(sources: dict[str, str], kind: str, step: int) -> None:
+    address = sources[kind]
+    source = open_source(f"{address}{'&' if '?' in address else '?'}step={step}")
+    torch.testing.assert_close(all_of(source), all_of(open_source(address))[:1])
+    assert source.place is None or len(source.place) == 1
+
+
+@pytest.mark.parametrize("rows", ["²:5", f"{'9' * 5000}:5", ":", "0:17", "-1:3", "nan:3", "1.5:3", "3:1e400"])
+def test_rows_of_a_strip_are_whole_numbers_inside_it(sources: dict[str, str], rows: str) -> None:
+    with refused("expected first:stop inside 0:16"):
+        open_source(f"{sources['strip']}&rows={rows}")
+
+
+def test_an_option_is_given_once(sources: dict[str, str]) -> None:
+    with refused("a second 'frames'"):
+        open_source("sim:aerial?frames=3&frames=4")
