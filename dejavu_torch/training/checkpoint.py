@@ -83,16 +83,18 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             if packed or sum(record.file_size for record in records) > path.stat().st_size:
                 raise InputError(f"{path} claims more bytes than it holds; {EXPECTED}")
             damaged = archive.testzip()  # torch does not look at checksums
+            if damaged is not None:
+                raise InputError(f"{path} is damaged: {damaged} does not have its checksum; {EXPECTED}")
             pickled = [archive.read(one) for one in records if one.filename.endswith("data.pkl")]
         if any(b"cbuiltins\nbytearray\n" in one for one in pickled):  # of any size, which torch would make
             raise InputError(f"{path} claims more bytes than it holds; {EXPECTED}")
-        if damaged is not None:
-            raise InputError(f"{path} is damaged: {damaged} does not have its checksum; {EXPECTED}")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except BadZipFile as error:
         raise InputError(f"the checkpoint cannot be read: {path} is none, or damaged; {EXPECTED}") from error
-    except (InputError, OSError):
+    except InputError:
         raise
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}; {EXPECTED}") from error
     except Exception as error:  # whatever a file can make of zipfile and torch
         told = "it is of more than tensors and plain data"
         told = told if isinstance(error, UnpicklingError) else cause_of(error)

@@ -1,0 +1,379 @@
+"""Checkpoint files: no code of theirs is run, damage and claims are refused, and they are written whole."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from pytorch_lightning.plugins import AsyncCheckpointIO, TorchCheckpointIO
+from small_training import backbone, data_of, mapper, new_task, train, trainer
+
+from dejavu_torch import DejaVu
+from dejavu_torch.training.checkpoint import CheckpointFiles, read_checkpoint
+from dejavu_torch.training.export import LastCheckpoint
+from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
+
+HUGE = 10**12
+EVIL = """
+from pathlib import Path
+Path("executed").touch()
+class Net: pass
+"""
+
+
+@pytest.fixture
+def last(made: Path) -> Path:
+    return made / "run" / "checkpoints" / "last.ckpt"
+
+
+def changed(last: Path, path: Path, keys: tuple[Any, ...], value: Any) -> Path:
+    """The checkpoint with another value, or without it where the value is `...`."""
+    whole = place = torch.load(last, weights_only=True)
+    for key in keys[:-1]:
+        place = place[key]
+    if value is ...:
+        del place[keys[-1]]
+    else:
+        place[keys[-1]] = value
+    torch.save(whole, path)
+    return path
+
+
+def refusal(capfd: pytest.CaptureFixture[str], command: str, *options: object) -> str:
+    """The one line with which a command refuses."""
+    with pytest.raises(SystemExit) as stop:
+        train(command, *options)
+    error = capfd.readouterr().err
+    assert (stop.value.code, error.count("\n")) == (2, 1), error
+    assert error.startswith("dejavu: ")
+    return error
+
+
+# no code -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["fit", "validate", "test", "export"])
+def test_settings_in_a_checkpoint_import_nothing(
+    folder: Path, last: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """Lightning's command line would take them, and import a module of the current folder."""
+    settings = {"backbone": {"class_path": "evil_of_a_checkpoint.Net"}}
+    bad = changed(last, tmp_path / "bad.ckpt", ("hyper_parameters",), settings)
+    for name in ("one.npy", "two.npy", "train.yaml"):
+        shutil.copy(folder / name, tmp_path)
+    (tmp_path / "evil_of_a_checkpoint.py").write_text(EVIL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    train(command, "--ckpt_path", bad, "--data.query", "two.npy")
+    assert not (tmp_path / "executed").exists()
+
+
+def test_loading_a_task_imports_nothing(last: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"_instantiator": "another_evil.Net"}
+    bad = changed(last, tmp_path / "bad.ckpt", ("hyper_parameters",), settings)
+    (tmp_path / "another_evil.py").write_text(EVIL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    task = PlaceRecognitionTask.load_from_checkpoint(bad, backbone=backbone(), mapper=mapper())
+    assert torch.equal(task.log_temperature, read_checkpoint(last)["state_dict"]["log_temperature"])
+    assert not (tmp_path / "executed").exists()
+
+
+class Touch:
+    """Runs code where it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (Path("executed"),)
+
+
+def test_a_pickle_runs_nothing_whatever_the_config_says(
+    folder: Path, last: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bad = changed(last, tmp_path / "bad.ckpt", ("more",), Touch())
+    for command in ("fit", "validate"):
+        line = refusal(capfd, command, "--ckpt_path", bad, "--weights_only", "false")
+        assert "more than tensors and plain data" in line
+    assert not (folder / "executed").exists()
+
+
+# what is no checkpoint -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path, last: None, ["is not there"]),
+        (lambda path, last: path.mkdir(), ["is a folder"]),
+        (lambda path, last: os.mkfifo(path), ["is no file"]),
+        (lambda path, last: path.touch(), ["cannot be read"]),
+        (lambda path, last: path.write_text("no checkpoint"), ["cannot be read"]),
+        (lambda path, last: shutil.copy(last.parents[1] / "map.safetensors", path), ["cannot be read"]),
+        (lambda path, last: torch.save([1, 2], path), ["is of type list"]),
+        (lambda path, last: torch.save({"epoch": 1}, path), ["no pytorch-lightning_version"]),
+        (
+            lambda path, last: torch.save({"epoch": 1}, path, _use_new_zipfile_serialization=False),
+            ["cannot be read"],
+        ),
+    ],
+)
+def test_what_is_no_checkpoint(
+    tmp_path: Path, last: Path, make: Callable[[Path, Path], object], words: list[str]
+) -> None:
+    make(tmp_path / "bad.ckpt", last)
+    with refused("bad.ckpt", *words, "expected a checkpoint that `dejavu train fit` wrote"):
+        read_checkpoint(tmp_path / "bad.ckpt")
+
+
+@pytest.mark.parametrize("word", ["best", "hpc", "registry:model", "http://127.0.0.1/last.ckpt"])
+@pytest.mark.parametrize("command", ["fit", "validate"])
+def test_a_word_is_a_file_name(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str, word: str
+) -> None:
+    line = refusal(capfd, command, "--ckpt_path", word, "--trainer.default_root_dir", tmp_path / "run")
+    assert "is not there" in line
+
+
+@pytest.mark.parametrize("command", ["fit", "validate", "export"])
+def test_last_is_the_last_of_the_folder(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str
+) -> None:
+    """And never untrained weights."""
+    line = refusal(capfd, command, "--ckpt_path", "last", "--trainer.default_root_dir", tmp_path / "run")
+    assert "there is no checkpoint in" in line
+
+
+# damage --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("record", ["data.pkl", "data/0", "data/5"])
+def test_one_flipped_bit_is_noticed(tmp_path: Path, last: Path, record: str) -> None:
+    """torch itself does not look at the checksums."""
+    with zipfile.ZipFile(last) as archive:
+        name = next(one for one in archive.namelist() if one.endswith(record))
+        content = archive.read(name)
+    data = bytearray(last.read_bytes())
+    data[data.index(content) + len(content) // 2] ^= 16
+    (tmp_path / "bad.ckpt").write_bytes(data)
+    with refused("bad.ckpt is damaged", record, "checksum"):
+        read_checkpoint(tmp_path / "bad.ckpt")
+
+
+def test_damage_is_refused_or_harms_nothing(tmp_path: Path, last: Path) -> None:
+    """Anywhere in the file: what is read is what was written."""
+    data, chance, refusals = last.read_bytes(), random.Random(0), 0
+    expected = written(torch.load(last, weights_only=True))
+    for _ in range(150):
+        at, some = chance.randrange(len(data)), bytearray(data)
+        kind = chance.choice(["flip", "flip", "cut", "fill", "insert"])
+        if kind == "flip":
+            some[at] ^= 1 << chance.randrange(8)
+        elif kind == "cut":
+            some = some[:at]
+        elif kind == "fill":
+            some[at : at + 64] = bytes(len(some[at : at + 64]))
+        else:
+            some[at:at] = bytes(chance.randrange(256) for _ in range(9))
+        (tmp_path / "bad.ckpt").write_bytes(some)
+        try:
+            assert written(read_checkpoint(tmp_path / "bad.ckpt")) == expected
+        except Exception as error:
+            with refused("bad.ckpt"):
+                raise error from None
+            refusals += 1
+    assert refusals > 75
+
+
+def written(content: Any) -> bytes:
+    buffer = BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+STEP = ("loops", "fit_loop", "epoch_loop.automatic_optimization.optim_progress", "optimizer", "step", "total")
+MOMENTS = ("optimizer_states", 0, "state", 0)
+GROUP = ("optimizer_states", 0, "param_groups", 0)
+ODD: list[tuple[tuple[Any, ...], Any, list[str]]] = [
+    (("state_dict",), [1], ["state_dict is of type list"]),
+    (("state_dict", "log_temperature"), "x", ["log_temperature", "no tensor"]),
+    (("state_dict", "log_temperature"), torch.tensor(float("nan")), ["state_dict has NaN"]),
+    (("state_dict", "log_temperature"), ..., ["of another model", "log_temperature"]),
+    (("state_dict", "dejavu.map.templates"), torch.zeros(1).expand(HUGE), ["more numbers than the file"]),
+    (("state_dict", "dejavu.map.templates"), torch.empty(HUGE, device="meta"), ["more numbers"]),
+    (("state_dict", "dejavu._extra_state"), {"frame_shape": torch.ones(3)}, ["_extra_state", "plain"]),
+    (("state_dict", "dejavu._extra_state"), {"frame_shape": float("nan")}, ["_extra_state", "plain"]),
+    (("state_dict", "dejavu._extra_state"), {}, ["cannot be taken over", "frame_shape"]),
+    (("global_step",), "4", ["global_step is of type str"]),
+    (("global_step",), -1, ["global_step is -1"]),
+    (("global_step",), 2**62, ["global_step is 4611686018427387904"]),
+    (("stage",), 10**9, ["in stage 1000000000 of 1"]),
+    (("stage",), True, ["stage is of type bool"]),
+    (("stages",), [3], ["stages is no list of names"]),
+    (("began",), 5, ["began at step 5 of 4"]),
+    (("trained",), ..., ["has no trained"]),
+    (("pytorch-lightning_version",), "x", ["another version"]),
+    (("pytorch-lightning_version",), "0.9.0", ["another version"]),
+]
+ODD_TO_RESUME: list[tuple[tuple[Any, ...], Any, list[str]]] = [
+    (("loops",), None, ["resumed", "loops"]),
+    (("loops", "fit_loop"), ..., ["resumed", "loops"]),
+    ((*STEP, "completed"), "x", ["resumed", "step.total.completed"]),
+    ((*STEP, "completed"), -(10**18), ["resumed", "step.total.completed"]),
+    ((*STEP, "completed"), 2, ["of step 4", "at 2"]),
+    (("optimizer_states",), ..., ["resumed", "optimizer_states"]),
+    (("optimizer_states",), [], ["resumed", "optimizer_states"]),
+    ((*GROUP, "betas"), ("x", 0.9), ["resumed", "betas"]),
+    ((*GROUP, "betas"), (2.0, 0.9), ["betas", "2.0", "0.999"]),
+    ((*GROUP, "lr"), "x", ["resumed", "lr"]),
+    (MOMENTS, {}, ["resumed", "optimizer is not of this run"]),
+    ((*MOMENTS, "exp_avg"), torch.zeros(3), ["exp_avg of parameter 0"]),
+    ((*MOMENTS, "exp_avg_sq"), -torch.ones(()), ["exp_avg_sq of parameter 0"]),
+    ((*MOMENTS, "step"), torch.tensor(-1.0), ["step of parameter 0"]),
+    (("lr_schedulers",), ..., ["resumed", "lr_schedulers"]),
+    (("lr_schedulers", 0, "step"), 3, ["resumed", "lr_schedulers.0"]),
+    (("callbacks",), 3, ["does not fit this training"]),
+]
+
+
+@pytest.mark.parametrize(("keys", "value", "words"), ODD, ids=str)
+def test_an_odd_value_is_refused(
+    folder: Path,
+    last: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    keys: tuple[Any, ...],
+    value: Any,
+    words: list[str],
+) -> None:
+    bad = changed(last, tmp_path / "bad.ckpt", keys, value)
+    for command in ("export", "validate"):
+        line = refusal(
+            capfd,
+            command,
+            "--ckpt_path",
+            bad,
+            "--trainer.default_root_dir",
+            tmp_path,
+            "--trainer.logger",
+            "false",
+        )
+        assert [word for word in [*words, "bad.ckpt"] if word not in line] == [], line
+
+
+@pytest.mark.parametrize(("keys", "value", "words"), ODD_TO_RESUME, ids=str)
+def test_what_cannot_be_resumed_is_refused(
+    folder: Path,
+    last: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    keys: tuple[Any, ...],
+    value: Any,
+    words: list[str],
+) -> None:
+    bad = changed(last, tmp_path / "bad.ckpt", keys, value)
+    if keys[:4] == MOMENTS and keys[-1] == "exp_avg_sq":
+        like = torch.load(last, weights_only=True)["optimizer_states"][0]["state"][0]["exp_avg"]
+        bad = changed(last, bad, keys, value.expand(like.shape).clone())
+    options = ["--ckpt_path", bad, "--trainer.default_root_dir", tmp_path, "--trainer.logger", "false"]
+    line = refusal(capfd, "fit", *options, "--trainer.max_steps", 6)
+    assert [word for word in words if word not in line] == [], line
+
+
+# claims --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [3 * 10**8, HUGE])
+def test_a_pickle_makes_no_more_than_its_file(tmp_path: Path, size: int) -> None:
+    """torch would make an array of any size that a pickle asks for."""
+    number = size.to_bytes(8, "little")
+    pickle = b"\x80\x02cbuiltins\nbytearray\n(\x8a\x08" + number + b"tR."
+    with zipfile.ZipFile(tmp_path / "bad.ckpt", "w") as archive:
+        archive.writestr("archive/data.pkl", pickle)
+        archive.writestr("archive/version", "3\n")
+    with refused("bad.ckpt claims more bytes than it holds"):
+        read_checkpoint(tmp_path / "bad.ckpt")
+
+
+def test_a_packed_archive_is_not_unpacked(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "bad.ckpt", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02]." + bytes(10**6))
+    with refused("bad.ckpt claims more bytes than it holds"):
+        read_checkpoint(tmp_path / "bad.ckpt")
+
+
+# writing -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("size", "lost"), [(500, "config.yaml"), (20_000, "last.ckpt")])
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(
+    folder: Path, tmp_path: Path, size: int, lost: str
+) -> None:
+    """A limit on the size of files is a disk that is full after so many bytes."""
+    shutil.copytree(folder / "run", tmp_path / "run")
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    options = [
+        "--config",
+        "train.yaml",
+        "--trainer.default_root_dir",
+        str(tmp_path / "run"),
+        "--seed_everything=9",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "dejavu_torch.cli", "train", "fit", *options],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
+        capture_output=True,
+        text=True,
+    )
+    warning, error = done.stderr.splitlines()
+    assert "holds an earlier run" in warning
+    assert (done.returncode, f"{lost} was not written" in error) == (2, True), error
+    assert {path: path.read_bytes() for path in before} == before
+    new = {path.name for path in (tmp_path / "run").rglob("*") if path.is_file()} - {p.name for p in before}
+    assert new == set()
+
+
+class Own(TorchCheckpointIO):
+    """A user's own way to keep checkpoints."""
+
+
+@pytest.mark.parametrize(
+    ("plugins", "expected"),
+    [([], CheckpointFiles), ([Own()], Own), ([AsyncCheckpointIO()], AsyncCheckpointIO)],
+)
+def test_the_plugin_of_a_user_is_kept(tmp_path: Path, plugins: list[Any], expected: type) -> None:
+    task, running = new_task(), trainer(tmp_path, LastCheckpoint(), plugins=plugins)
+    running.fit(task, data_of())
+    assert type(running.strategy.checkpoint_io) is expected
+    again = new_task()
+    load_weights(again, tmp_path / "checkpoints" / "last.ckpt")
+    assert torch.equal(again.route.templates, DejaVu.load(tmp_path / "map.safetensors").map.templates)
+
+
+def test_a_plugin_that_wraps_another_wraps_ours(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved: list[Path] = []
+
+    def kept(self: CheckpointFiles, checkpoint: Any, path: Any, **_: Any) -> None:
+        saved.append(Path(path))
+
+    monkeypatch.setattr(CheckpointFiles, "save_checkpoint", kept)
+    train("fit", "--trainer.plugins", "AsyncCheckpointIO", "--trainer.default_root_dir", tmp_path)
+    assert saved == [tmp_path / "checkpoints" / "last.ckpt"]
+
+
+def test_the_same_training_leaves_the_same_checkpoint(folder: Path, last: Path, tmp_path: Path) -> None:
+    """Byte for byte, and from process to process: no clock is in it."""
+    train("fit", "--trainer.default_root_dir", tmp_path)
+    assert (tmp_path / "checkpoints" / "last.ckpt").read_bytes() == last.read_bytes()
