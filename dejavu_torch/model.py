@@ -156,8 +156,8 @@ class DejaVu(nn.Module):
 
         Returns:
             self, with the map in `self.map`. A route in which nothing repeats gives a template map without
-            layers, on which every place scores +inf. Memory does not grow with the frames: features
-            beyond `concatenate`'s share of it spill to a temporary file.
+            layers, on which every place scores +inf. Features beyond `concatenate`'s share of the memory
+            spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes.
