@@ -400,16 +400,9 @@ def test_a_drive(data_dir: Path) -> None:
     assert next(Video(video.path).batches(1)).shape == (1, 3, 540, 960)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "ffconcat version 1.0\nfile {}\n",
-        "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{}\n#EXT-X-ENDLIST\n",
-    ],
-)
-def test_a_list_of_other_files_is_no_video(tmp_path: Path, text: str) -> None:
-    other = clip(tmp_path / "a.mkv", pictures(3))
-    (tmp_path / "list.mp4").write_text(text.format(other))
+def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
+    clip(tmp_path / "a.mkv", pictures(3))
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile a.mkv\n")
     with refused("list.mp4", "cannot be read as a video"):
         Video(tmp_path / "list.mp4")
 
