@@ -6,9 +6,10 @@ import inspect
 import logging
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +19,9 @@ from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.database.mapfile import map_size, read_map, write_map
-from dejavu_torch.database.place_map import Mapper, PlaceMap
+from dejavu_torch.database.place_map import EXTRA, Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
+from dejavu_torch.database.schema import checked, checked_fields
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
@@ -39,7 +41,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
-from dejavu_torch.types import InputError, Match, SequenceModel, Training, Traverse
+from dejavu_torch.types import BATCH_NUMBERS, InputError, Match, SequenceModel, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -70,7 +72,6 @@ PARTS: dict[str, type[nn.Module]] = {
     "mapper": Mapper,
     "velocity": GroundOdometry,
 }
-OPTIONAL = ("whitening", "velocity")
 
 
 class DejaVu(nn.Module):
@@ -121,15 +122,15 @@ class DejaVu(nn.Module):
             )
         if batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; expected at least 1")
-        if threshold is not None and math.isnan(threshold):
-            raise InputError("the threshold is NaN; expected a number")
+        if threshold is not None and not threshold > -math.inf:
+            raise InputError(f"the threshold is {threshold}; expected a number")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
         self.mapper = SpectralMapper() if mapper is None else mapper
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self.threshold = threshold
+        self.threshold = None if threshold == math.inf else threshold
         self.batch_size = batch_size
         self.velocity = velocity
         self.map: PlaceMap = self.mapper.empty()
@@ -450,7 +451,9 @@ class DejaVu(nn.Module):
 
     def _features(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """What whitening takes: features of a traverse in batches (B,D), without gradients."""
-        return feature_batches(traverse, self.pipeline, self.batch_size, self.map.positions.device, progress)
+        pixels = math.prod(getattr(self.features, "resize", None) or (1,))  # that a frame is brought to
+        at_once = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
+        return feature_batches(traverse, self.pipeline, at_once, self.map.positions.device, progress)
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
         """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""
@@ -499,42 +502,45 @@ class DejaVu(nn.Module):
         Raises:
             InputError: missing, truncated, foreign or newer file, or other features than the map's.
         """
-        tensors, header = read_map(Path(path))
-        try:
-            check_kind(header["map"])
-            model = cls(
-                **_build_parts(header, features),
-                **{n: header[n] for n in inspect.signature(cls).parameters if n not in PARTS},
-            )
-            model.set_extra_state({name: header[name] for name in model.get_extra_state()})
+        with opened(Path(path)) as (tensors, header):
+            parts = _build_parts(header, features, tensors)
+            model = cls(**parts, threshold=header.threshold, batch_size=header.batch_size)
+            model.frame_shape, model.step, model.trained = header.frame_shape, header.step, header.trained
             own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("map.")}
-            packed = {name.removeprefix("map."): tensor for name, tensor in own.items()}
-            unpacked = model.map.unpacked(packed)
-            state: dict[str, Any] = {**tensors, "map._extra_state": header["map"]}
-            state |= {f"map.{name}": tensor for name, tensor in unpacked.items()}
-            loaded = model.load_state_dict(state, strict=False)
-            missing = [
-                name for name in loaded.missing_keys if name.startswith(("map.", "features.", "whitening."))
-            ]
+            model.map.load_state_dict(_map_state(model.map, own, header))
+            loaded = model.load_state_dict(tensors, strict=False)
+            missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
-            frames = len(model.map.positions) or model.map.places
-            if model.frame_names and len(model.frame_names) != frames:
-                raise InputError(f"it names {len(model.frame_names)} frames; expected {frames}")
-            resampled = model.velocity is not None and isinstance(model.step, float) and model.step > 0
-            if (len(model.map.positions) > 0) != resampled or (model.step is not None) != resampled:
-                raise InputError(f"it has step {model.step!r} and {len(model.map.positions)} frame positions")
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        except (AttributeError, KeyError, RuntimeError, TypeError) as error:
-            what = "fit its modules" if isinstance(error, RuntimeError) else "hold what a map holds"
-            raise InputError(f"{path} does not {what}: {' '.join(str(error).split())}") from error
+            if header.names is not None:
+                model.frame_names = decode_names(header.names, len(model.map.positions) or model.map.places)
+            model.check()
         return model.eval()
+
+    def check(self) -> None:
+        """Refuse parts of a model that do not fit together.
+
+        Raises:
+            InputError: naming them.
+        """
+        positions, step, shape = self.map.positions, self.step, self.frame_shape
+        resampled = self.velocity is not None and step is not None and step > 0
+        if (len(positions) > 0) != resampled or (step is not None) != resampled:
+            raise InputError(f"it has step {step} and {len(positions)} frame positions")
+        whitening = self.whitening
+        if whitening is not None and whitening.learned and whitening.dimension != self.map.dimension:
+            raise InputError(
+                f"its whitening makes {whitening.dimension} numbers; expected the map's {self.map.dimension}"
+            )
+        if shape is not None and (
+            len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > BATCH_NUMBERS
+        ):
+            raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         parts = {name: getattr(self, name) for name in PARTS}
         header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
-        header |= {name: value for name, value in self.settings().items() if name not in PARTS}
+        header |= {"threshold": self.threshold, "batch_size": self.batch_size}
         header |= self.get_extra_state()
         header["map"] = self.map.get_extra_state()
         tensors = {f"map.{name}": tensor for name, tensor in self.map.packed().items()}
@@ -563,11 +569,15 @@ class DejaVu(nn.Module):
         return {"frame_shape": self.frame_shape, "step": self.step, "trained": trained, "names": names}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take over what `get_extra_state` gave."""
-        shape, trained = state["frame_shape"], state["trained"]
-        self.frame_shape, self.step = shape and tuple(shape), state["step"]
-        self.trained = trained and Training(**trained)
-        self.frame_names = [] if state["names"] is None else decode_names(state["names"])
+        """Take over what `get_extra_state` gave.
+
+        Raises:
+            InputError: a state of other entries, or of other types.
+        """
+        kinds = {name: HEADER_TYPES[name] for name in self.get_extra_state()}
+        checked = checked_fields(state, kinds, "the model's state")
+        self.frame_shape, self.step, self.trained = (checked[n] for n in ("frame_shape", "step", "trained"))
+        self.frame_names = [] if checked["names"] is None else decode_names(checked["names"])
 
     def _require_map(self) -> None:
         if not self.map.places:
@@ -593,14 +603,48 @@ def _count(traverse: Traverse) -> int:
     return sum(map(len, traverse.batches(64))) if traverse.length is None else traverse.length
 
 
-def check_kind(state: dict[str, Any]) -> None:
-    """Refuse a map of a kind that this version does not know.
+class Header(NamedTuple):
+    """What the header of a map file says: the arguments of DejaVu, each part as a recipe, and its state.
+
+    map: the state of the map, by whose `kind` it is checked further; see `PlaceMap.state`.
+    """
+
+    preprocess: Recipe
+    features: Recipe
+    whitening: Recipe | None
+    mapper: Recipe
+    velocity: Recipe | None
+    threshold: float | None
+    batch_size: int
+    frame_shape: tuple[int, ...] | None
+    step: float | None
+    trained: Training | None
+    names: str | None
+    map: dict[str, Any]
+
+
+HEADER_TYPES = get_type_hints(Header)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], Header]]:
+    """Tensors and header of a map file; what is refused of them within the block names the file.
 
     Raises:
-        InputError: naming the kinds that it knows.
+        InputError: as `DejaVu.load`.
     """
-    if state["kind"] not in KINDS:
-        raise InputError(f"a map of kind {state['kind']!r}; this version knows {', '.join(KINDS)}")
+    tensors, values = read_map(path)
+    try:
+        header = checked(values, Header, "its header")
+        if header.map.get("kind") not in KINDS:
+            known = ", ".join(KINDS)
+            raise InputError(f"a map of kind {header.map.get('kind')!r:.40}; this version knows {known}")
+        yield tensors, header
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (RuntimeError, RecursionError) as error:  # what torch does not fit in, or nested without end
+        problem = " ".join(str(error).split())
+        raise InputError(f"{path} does not fit its modules: {problem}") from error
 
 
 def read_place_map(path: Path) -> PlaceMap:
@@ -609,47 +653,68 @@ def read_place_map(path: Path) -> PlaceMap:
     Raises:
         InputError: as `DejaVu.load`.
     """
-    tensors, header = read_map(path)
-    try:
-        check_kind(header["map"])
+    with opened(path) as (tensors, header):
         mapper = _build(header, "mapper", None)
         assert isinstance(mapper, Mapper)
         route = mapper.empty()
-        own = {
-            name.removeprefix("map."): tensor for name, tensor in tensors.items() if name.startswith("map.")
-        }
-        route.load_state_dict({**route.unpacked(own), "_extra_state": header["map"]})
-    except (InputError, RuntimeError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from error
+        own = {name: tensor for name, tensor in tensors.items() if name.startswith("map.")}
+        route.load_state_dict(_map_state(route, own, header))
     return route
 
 
-def _build_parts(header: dict[str, Any], features: nn.Module | None) -> dict[str, Any]:
+def _map_state(route: PlaceMap, tensors: dict[str, Tensor], header: Header) -> dict[str, Any]:
+    """The state of a map, from the tensors that a file holds of it."""
+    checked(header.map, route.state, "its map")
+    packed = {name.removeprefix("map."): tensor for name, tensor in tensors.items()}
+    state = {**route.unpacked(packed), EXTRA: header.map}
+    missing = route.state_dict().keys() - state.keys()
+    if missing:
+        raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
+    return state
+
+
+def _check_weights(header: Header, tensors: dict[str, Tensor], given: nn.Module | None) -> None:
+    """Refuse, before they are made, features of other sizes than the file's weights."""
+    with torch.device("meta"):
+        probe = _build(header, "features", given)
+    assert probe is not None
+    if probe is given:
+        return
+    for name, own in probe.state_dict().items():
+        stored = tensors.get(f"features.{name}")
+        if isinstance(own, Tensor) and (stored is None or stored.shape != own.shape):
+            seen = "missing" if stored is None else tuple(stored.shape)
+            raise InputError(f"it does not fit: features.{name} is {seen}; expected {tuple(own.shape)}")
+
+
+def _build_parts(header: Header, features: nn.Module | None, tensors: dict[str, Tensor]) -> dict[str, Any]:
     """The modules that a map's header names, by the names of `PARTS`.
 
     Args:
         features: the module that made the map's features, needed where it is not one of this package.
+        tensors: of the file, which hold its weights.
 
     Raises:
         InputError: modules that cannot be built, or other features than the map's.
     """
     if features is not None:
-        own, stored = recipe_of(features, REGISTRY), Recipe(**header["features"])
-        if own not in with_parts(stored):
-            raise InputError(f"it was learned with {difference(stored, own)}")
+        own = recipe_of(features, REGISTRY)
+        if own not in with_parts(header.features):
+            raise InputError(f"it was learned with {difference(header.features, own)}")
+    _check_weights(header, tensors, features)
     parts = {name: _build(header, name, features) for name in PARTS}
     return parts | {"whitening": parts["whitening"] or "none"}
 
 
-def _build(header: dict[str, Any], name: str, features: nn.Module | None) -> nn.Module | None:
-    if header[name] is None and name in OPTIONAL:
+def _build(header: Header, name: str, features: nn.Module | None) -> nn.Module | None:
+    recipe: Recipe | None = getattr(header, name)
+    if recipe is None:
         return None
-    recipe = Recipe(**header[name])
     # only learning needs what found the periods: one from elsewhere need not be built
     periods = recipe.init_args.get("periods")
     if name == "mapper" and isinstance(periods, dict) and periods.get("class_path") not in REGISTRY:
         plain = recipe._replace(init_args=recipe.init_args | {"periods": None})
         mapper = build(plain, TemplateMapper, REGISTRY)
-        mapper.periods = ForeignPeriods(**periods)
+        mapper.periods = ForeignPeriods(*checked(periods, Recipe, "its periods"))
         return mapper
     return build(recipe, PARTS[name], REGISTRY, features)

@@ -2,8 +2,30 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 from torch.nn.functional import interpolate
+
+from dejavu_torch.types import InputError
+
+MOST_PIXELS = 2**26  # of a frame: a number in a file or an option can be any
+
+
+def check_size(size: tuple[int, int], least: int, what: str) -> None:
+    """Refuse what is no size in pixels, (height, width).
+
+    Args:
+        least: pixels of each side. what: the message begins with, up to the =.
+
+    Raises:
+        InputError: not two numbers, one below the least, or more than 2^26 pixels.
+    """
+    if len(size) != 2 or min(size) < least or math.prod(size) > MOST_PIXELS:
+        raise InputError(
+            f"{what}={tuple(size)}; expected (height, width) in pixels, at least {least} each "
+            f"and {MOST_PIXELS} in all"
+        )
 
 
 def resize_frames(frames: Tensor, size: tuple[int, int] | None) -> Tensor:

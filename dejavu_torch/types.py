@@ -13,18 +13,10 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.text import printable
+
 BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least one: 256 MB
 LONGEST_MESSAGE = 2000  # characters
-
-
-def printable(text: object) -> str:
-    """A text as one line that can be printed anywhere: what cannot, such as a line break in a name, escaped.
-
-    Example:
-        >>> print(printable("a\\nb.png"))
-        a\\nb.png
-    """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 class InputError(ValueError):
@@ -146,6 +138,12 @@ class FrequencyLayer:
             )
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
+        a, b = self.period.as_integer_ratio()
+        if max(self.stop * b, a * self.phases) >= 2**63:
+            raise InputError(
+                f"a layer has period {self.period}, {self.phases} phases and the end {self.stop}; "
+                "expected numbers whose products are below 2^63"
+            )
         ascending = all(a < b for a, b in pairwise(self.features))
         if not self.features or self.features[0] < 0 or not ascending:
             raise InputError(
@@ -182,11 +180,10 @@ class Match(NamedTuple):
 class Training(NamedTuple):
     """How a map was trained; None of it where it was learnt by eq. 1.
 
-    steps: of the optimiser. seconds: they took. seed: of the run, None where none was set.
+    steps: of the optimiser. seed: of the run, None where none was set.
     """
 
     steps: int
-    seconds: float
     seed: int | None
 
 

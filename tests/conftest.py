@@ -21,7 +21,8 @@ settings.load_profile("repeatable")
 
 # whole commands, trainings, real footage and notebooks: not in a developer's inner loop
 SLOW = (
-    *("training", "experiments", "motion", "test_cli", "test_readme", "test_real_routes"),
+    *("training", "experiments", "motion", "fuzz", "test_cli", "test_faults", "test_readme"),
+    "test_real_routes",
     *(
         "test_periods_on_real_data",
         "test_spectral_model",

@@ -14,8 +14,9 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"types", "resize"},
-    {"memory"},
+    {"text"},
+    {"types"},
+    {"resize", "memory"},
     {"features", "periods", "data"},
     {"database"},
     {"recognition"},
@@ -30,18 +31,21 @@ RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
 ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all to their left
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
+    "types": "text",
     "memory": "types",
-    "data": "types memory resize",
+    "resize": "types",
+    "data": "types text memory resize",
     "features": "types resize",
     "periods": "types memory",
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "types data",
     "model": "types data features periods database recognition motion",
-    "evaluation": "types resize data features periods database recognition motion model",
+    "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types resize data features periods database recognition motion model evaluation",
-    "experiments": "types data features periods database recognition motion model evaluation",
-    "cli": "types data features periods database recognition motion model evaluation training experiments",
+    "experiments": "types text data features periods database recognition motion model evaluation",
+    "cli": "types text data features periods database recognition motion model evaluation training "
+    "experiments",
 }
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 import os
-import shlex
-import signal
 import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NoReturn
 
 from dejavu_torch import __version__
+from dejavu_torch.cli import process
+from dejavu_torch.text import printable
 
 COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of commands.py, or train.py
     "demo": "learn the built-in route, localize a second traverse of it, report",
@@ -21,9 +20,10 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "evaluate": "evaluate the matches in a csv, whatever found them",
     "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
     "train": "train features that repeat: fit, validate, test or export",
-    "bench": "speed, or accuracy over bytes, beside what a user would pick instead",
+    "bench": "speed, memory, or accuracy over bytes, beside what a user would pick instead",
     "info": "what is in a map",
 }
+LONGEST = 300  # characters of a message of torch's
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -33,30 +33,51 @@ def main(arguments: Sequence[str] | None = None) -> None:
         they sleep while they wait for each other: spinning, which is the default of most builds, takes the
         cores from other programs.
     """
+    if arguments is None:
+        process.take_over()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
-    logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING)
-    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # what it says of an image is in the one line
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments is None:  # so that temporary files are removed
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a user's own classes, as `python -m` finds them
     try:
-        run(given)
-    except KeyboardInterrupt:
-        print("dejavu: interrupted", file=sys.stderr)
-        raise SystemExit(130) from None
+        run(sys.argv[1:] if arguments is None else arguments)
+    except SystemExit as error:
+        if not error.code:
+            _check_output()
+        raise
+    except BaseException as error:
+        process.end_if_interrupted(error)
+        raise
+    finally:
+        process.let_go()
 
 
 def run(given: Sequence[str]) -> None:
     """Run a command line; what it gets wrong is one line on stderr and exit status 2."""
+    try:
+        _run(given)
+    except (MemoryError, RuntimeError, ImportError, OSError) as error:
+        shortage = _shortage(error)
+        if shortage is None:
+            raise
+        fail(shortage)
+    _check_output()
+
+
+def _run(given: Sequence[str]) -> None:
     if not given or given[0] not in COMMANDS:
         overview(given[0] if given else "--help")
+    _log_to_stderr()
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:  # some libraries would end the process
+        fail("the current folder does not exist any more; expected one that does")
+    if here not in sys.path:
+        sys.path.append(here)  # a user's own classes, as `python -m` finds them
     from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
     from dejavu_torch.cli.parser import COMMAND, UsageError, parse
     from dejavu_torch.cli.presets import with_configs
+    from dejavu_torch.data.output import remove_temporaries
     from dejavu_torch.types import InputError
 
+    process.cleanup[:] = [remove_temporaries]
     try:
         name, words = given[0], with_configs(given[1:])
         if name == "train":  # Lightning's own command line
@@ -67,6 +88,8 @@ def run(given: Sequence[str]) -> None:
         function = getattr(commands, f"run_{name}")
         chosen = parse(name, function, _config_first(_spelt_out(words)))
         if COMMAND in function.__annotations__:
+            import shlex
+
             chosen[COMMAND] = shlex.join(["dejavu", *given])
         function(**chosen)
     except UsageError as error:
@@ -74,6 +97,36 @@ def run(given: Sequence[str]) -> None:
         fail(f"{error} (with --config {' --config '.join(config)})" if config else f"{error} (see --help)")
     except (InputError, OSError) as error:
         fail(str(error))
+
+
+def _log_to_stderr() -> None:
+    import logging
+
+    class OneLine(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            return printable(one_line(super().format(record)))
+
+    handler = logging.StreamHandler()
+    handler.setFormatter(OneLine("dejavu: %(message)s"))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # what it says of an image is in the one line
+
+
+def _shortage(error: Exception) -> str | None:
+    """What a failure says where it is one of memory, or of what was nested too deeply; else None."""
+    text = one_line(str(error))
+    if isinstance(error, RecursionError):
+        return f"nested too deeply: {text}"
+    told = ("can't allocate memory", "annot allocate memory", "out of memory")
+    if not isinstance(error, MemoryError) and not any(words in text for words in told):
+        return None
+    return f"not enough memory: {text.rpartition('DefaultCPUAllocator: ')[2][:LONGEST] or 'it ran out'}"
+
+
+def _check_output() -> None:
+    problem = process.output_problem()
+    if problem is not None:
+        fail(f"what was printed is not whole: {problem}")
 
 
 def overview(word: str) -> NoReturn:
@@ -86,7 +139,7 @@ def overview(word: str) -> NoReturn:
             print(f"  {name:<10}  {text}")
         print("\n`dejavu COMMAND --help` shows its options, `dejavu --version` the version.")
     else:
-        fail(f"{word} is no command; expected one of {', '.join(COMMANDS)} (see --help)")
+        fail(f"{word!r} is no command; expected one of {', '.join(COMMANDS)} (see --help)")
     raise SystemExit(0)
 
 
@@ -116,5 +169,10 @@ def _config_first(words: Sequence[str]) -> list[str]:
 
 def fail(message: str) -> NoReturn:
     """One line on stderr, exit status 2."""
-    print(f"dejavu: {' '.join(message.split())}", file=sys.stderr)
+    print(f"dejavu: {printable(one_line(message))}", file=sys.stderr)
     raise SystemExit(2)
+
+
+def one_line(text: str) -> str:
+    """A text without line breaks."""
+    return " ".join(text.split())

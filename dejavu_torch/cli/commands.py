@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
-from dejavu_torch.data.files import check_output_file, check_output_folder, make_output_folder
+from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
@@ -23,6 +23,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def run_demo(
         ["compare", "MORNING", "EVENING", "--out", "report"],
     )
     for words in tries:
-        print(f"or try: {shlex.join(['dejavu', *words])}")
+        _say(f"or try: {shlex.join(['dejavu', *words])}")
 
 
 def run_learn(
@@ -163,7 +164,7 @@ def run_localize(
         print("the map holds no layers: no place can be reported")
     elif threshold is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
-    print(f"{total} queries, {accepted} accepted; written to {out}")
+    _say(f"{total} queries, {accepted} accepted; written to {out}")
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
@@ -265,14 +266,15 @@ def run_evaluate(
         query: as --reference, of the queries
         map: says how many frames there are, and which place each of them is where the map's are resampled
     """
-    from dejavu_torch.evaluation.report import write_report
+    from dejavu_torch.evaluation.report import report_folder, write_report
     from dejavu_torch.experiments.evaluate import evaluate_file
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
     _check_report_folder(out, reference, query)
     result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map)
-    make_output_folder(out)
-    write_report(out, result.report, result.pictures, f"{matches} evaluated by {truth}", command)
+    with report_folder(out) as folder:
+        title = f"{matches} evaluated by {truth}"
+        write_report(folder, result.report, result.pictures, title, command)
     _print_scores(result.report, out)
 
 
@@ -287,7 +289,7 @@ def run_reproduce(
         seed: which routes
         tolerance: right within this many places, inclusive
     """
-    from dejavu_torch.evaluation.report import text_table, write_index, write_report
+    from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
     from dejavu_torch.experiments.paper_tables import (
         FOOTAGE,
         PUBLISHED,
@@ -305,17 +307,18 @@ def run_reproduce(
     for name in names:
         print(f"{name}: a second traverse, the database itself, chunks of other lengths", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
-        make_output_folder(out / name)
         run, title = result.run, f"dejavu reproduce: {name}"
         plan = str(run.model.summary())
-        write_report(out / name, result.report, result.pictures, title, command, plan)
-        _write_matches(out / name / "matches.csv", [run.match], run.query, run.model)
+        with report_folder(out / name) as folder:
+            write_report(folder, result.report, result.pictures, title, command, plan)
+            _write_matches(folder / "matches.csv", [run.match], run.query, run.model)
         reports[name] = result.report
     rows, notes = section_five(reports), [*route_lines(reports), *boundary_lines(reports), FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
-    write_index(out, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
+    with whole_folder(out) as folder:
+        write_index(folder, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
     print("\n".join([text_table(rows), *notes]))
-    print(f"right within {tolerance} places; next: open {out / 'index.html'}")
+    _say(f"right within {tolerance} places; next: open {out / 'index.html'}")
 
 
 def run_bench(
@@ -328,38 +331,47 @@ def run_bench(
     whitening: Path | None = None,
     places: Sequence[int] = (),
 ) -> None:
-    """Set this package beside what a user would pick instead: its speed, or its accuracy over bytes.
+    """Set this package beside what a user would pick instead: its speed, memory, or accuracy over bytes.
 
     Args:
-        what: matcher (time of HOG, L1 distances, sequences, filters) or storage (accuracy over bytes)
+        what: matcher (time of HOG, L1 distances, sequences, filters), memory (of learning and localizing) or
+            storage (accuracy over bytes)
         sources: of storage, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
         codebooks: of storage, another route, where codebooks and a whitening are learned that count nothing
         whitening: of storage, a map whose whitening describes all routes; each learns its own if not given
-        places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given
+        places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given. Of memory, frames
+            that are learned; 1000, 10000 and 50000 if not given
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench, frontier
+    from dejavu_torch.experiments import bench, footprint, frontier
 
     if what == "storage":
         given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
         found = frontier.run_storage(out, sources, places, codebooks, given, shared, progress=True)
         for title, table in frontier.storage_tables(found):
-            print(*[title] * bool(title), text_table(table), "", sep="\n")
+            print(*[printable(title)] * bool(title), text_table(table), "", sep="\n")
         for line in frontier.skipped_lines(found):
-            print(line)
-        print(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
+            _say(line)
+        _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
-    if what in bench.BENCHES and (sources or places or map or codebooks or whitening):
+    known = what in bench.BENCHES or what == "memory"
+    if known and (sources or map or codebooks or whitening or (places and what != "memory")):
         raise InputError(
             f"bench {what} takes no sources, maps, codebooks, whitening or places; bench storage does"
         )
-    rows = bench.run_bench(what, out)
-    print(text_table(bench.bench_table(rows)))
+    if what == "memory":
+        rows = footprint.run_memory(out, places)
+        print(text_table(footprint.memory_table(rows)))
+        note = "peak: beyond that of the programs loaded"
+    else:
+        rows = bench.run_bench(what, out)
+        print(text_table(bench.bench_table(rows)))
+        note = "x ours: seconds / those of the fastest dejavu"
     if any("No module" in (row.skipped or "") for row in rows):
         print("what is skipped needs pip install '.[bench]'")
-    print(f"x ours: seconds / those of the fastest dejavu; next: open {out / 'bench.png'}")
+    _say(f"{note}; next: open {out / 'bench.png'}")
 
 
 def run_info(map: Path, *, features: nn.Module | None = None) -> None:
@@ -370,6 +382,7 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
         features: class of the map's features, if not ours
     """
     from dejavu_torch.database.l1 import l1_backend
+    from dejavu_torch.database.mapfile import FORMAT
     from dejavu_torch.periods.stft import BACKEND
 
     model = DejaVu.load(map, features)
@@ -385,8 +398,9 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
         if part in parts[:3] or part.extra_repr():
             print(f"{type(part).__name__}: {part.extra_repr()}")
     if model.trained is not None:
-        steps, seconds, seed = model.trained
-        print(f"trained for {steps} steps in {seconds:.0f} s, seed {seed}")
+        steps, seed = model.trained
+        print(f"trained for {steps} steps, seed {seed}")
+    print(f"map format {FORMAT}, its checksums agree")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
     _print_next("localize", map, "QUERY", "--out", "matches.csv")
 
@@ -467,7 +481,12 @@ def print_map(model: DejaVu) -> None:
 
 
 def _print_next(*words: str | Path) -> None:
-    print(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
+    _say(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
+
+
+def _say(text: str) -> None:
+    """A line with names in it."""
+    print(printable(text))
 
 
 def _publish(
@@ -484,21 +503,21 @@ def _publish(
         given: file of the map, where it was not learned.
         top: how many candidates of each query to write; None writes the matches.
     """
-    from dejavu_torch.evaluation.report import write_report
+    from dejavu_torch.evaluation.report import report_folder, write_report
 
     run, kept = result.run, out / "map.safetensors"
     print_map(run.model)
     if run.truth is None:
         print("nothing tells which places are right, see --truth: matches and pictures, no scores")
-    make_output_folder(out)
-    if given is None or given.resolve() != kept.resolve():
-        run.model.save(kept)
     match = run.match
     if top is not None:
         first = Candidates(*(column[:, :top] for column in result.candidates))
         match = first.as_match(run.model.threshold_of(run.sequence))
-    _write_matches(out / "matches.csv", [match], run.query, run.model, top)
-    write_report(out, result.report, result.pictures, title, command, str(run.model.summary()))
+    with report_folder(out) as folder:
+        if given is None or given.resolve() != kept.resolve():
+            run.model.save(folder / kept.name)
+        _write_matches(folder / "matches.csv", [match], run.query, run.model, top)
+        write_report(folder, result.report, result.pictures, title, command, str(run.model.summary()))
     _print_scores(result.report, out)
 
 
@@ -521,5 +540,5 @@ def _print_scores(report: Report, out: Path) -> None:
     for rows in (score_table(report), sequence_table(report)):
         if rows:
             print(text_table(rows))
-    print(summary(report))
-    print(f"next: open {out / 'index.html'}")
+    _say(summary(report))
+    _say(f"next: open {out / 'index.html'}")

@@ -6,21 +6,24 @@ import logging
 import shlex
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
+from lightning_fabric.plugins import CheckpointIO
 from lightning_fabric.utilities.exceptions import MisconfigurationException
-from pytorch_lightning import Trainer
+from pytorch_lightning import LightningModule, Trainer
 from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
-from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
+from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from dejavu_torch.cli.commands import print_map
 from dejavu_torch.cli.parser import Parser, refusal
-from dejavu_torch.data.files import check_output_folder, make_output_folder, remove_empty_folders
+from dejavu_torch.cli.process import interrupts_raise
+from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
+from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import LastCheckpoint, MapExport, load_weights
-from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask
+from dejavu_torch.training.export import LastCheckpoint, MapExport
+from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
 
 EVERY = 500  # steps between two validations, and between two checkpoints
@@ -44,7 +47,6 @@ PARTS: dict[str, dict[str, Any]] = {
     "model.preprocess": {"class_path": "dejavu_torch.Preprocess"},
     "data.augmentation": {"class_path": "dejavu_torch.features.augmentation.Augmentation"},
 }
-EXPECTED = "expected one that `dejavu train fit` wrote"
 QUIET = (  # what Lightning warns of and needs no action
     "args parameter is intended",
     "num_workers",
@@ -124,6 +126,10 @@ class TrainCLI(LightningCLI):
         self.words = list(args)
         super().parse_arguments(parser, args)
 
+    def _parse_ckpt_path(self) -> None:
+        """Settings come from the config alone: Lightning would take some from the checkpoint, and import the
+        classes that it names."""
+
     def before_instantiate_classes(self) -> None:
         """Validation is by steps, unless it is asked for by epochs or otherwise."""
         trainer = self.config[self.subcommand]["trainer"]
@@ -141,8 +147,7 @@ class TrainCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A trainer with our callbacks; what Lightning refuses, in one line."""
         asked = self.config_init[self.subcommand]["trainer"]
-        own = asked["callbacks"] or []
-        own = [*own] if isinstance(own, list) else [own]
+        own = _listed(asked["callbacks"])
         root = Path(asked["default_root_dir"])
         for callback in own:
             if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
@@ -151,6 +156,9 @@ class TrainCLI(LightningCLI):
             own.append(MapExport())
             chosen = asked["enable_checkpointing"] is False or any(isinstance(c, Checkpoint) for c in own)
             own += [] if chosen else [LastCheckpoint(EVERY)]
+        for plugin in _listed(asked["plugins"]):
+            if isinstance(plugin, CheckpointIO) and getattr(plugin, "checkpoint_io", plugin) is None:
+                plugin.checkpoint_io = CheckpointFiles()  # type: ignore[attr-defined]  # what it wraps
         try:
             return super().instantiate_trainer(callbacks=own, **kwargs)
         except (ImportError, ValueError) as error:
@@ -167,7 +175,9 @@ class TrainCLI(LightningCLI):
             raise InputError("trainer.overfit_batches does not fit; expected trainer.limit_train_batches")
         root = Path(self.trainer.default_root_dir)
         check_output_folder(root)
-        resumed = self.config[self.subcommand].get("ckpt_path")
+        resumed = self.config_init[self.subcommand].get("ckpt_path")
+        if resumed:
+            self.before_validate()
         if not asked["fast_dev_run"] and (root / "map.safetensors").exists() and not resumed:
             log.warning("%s holds an earlier run, which this one replaces", root)
 
@@ -176,11 +186,14 @@ class TrainCLI(LightningCLI):
         root = Path(self.trainer.default_root_dir)
         new, refused = not root.exists(), False
         try:
-            self.trainer.fit(**arguments)
-        except InputError:
+            with interrupts_raise(), self._taking_over(arguments):
+                self.trainer.fit(**arguments)
+        except (InputError, OSError) as error:
             refused = True
             if new:
                 remove_empty_folders(root)
+            if isinstance(error, OSError):
+                raise InputError(f"the training in {root} has failed: {error.strerror or error}") from error
             raise
         finally:
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
@@ -190,10 +203,24 @@ class TrainCLI(LightningCLI):
             if self.trainer.interrupted and last is not None and not refused:
                 print(f"to go on: {shlex.join(['dejavu', 'train', *self.words, '--ckpt_path', str(last)])}")
 
+    def validate(self, **arguments: Any) -> None:
+        """Figures of a checkpoint."""
+        with self._taking_over(arguments):
+            self.trainer.validate(**arguments)
+
+    def test(self, **arguments: Any) -> None:
+        """Figures of a checkpoint on the query."""
+        with self._taking_over(arguments):
+            self.trainer.test(**arguments)
+
+    def _taking_over(self, arguments: dict[str, Any]) -> AbstractContextManager[None]:
+        return taking_over(arguments.get("ckpt_path"), lambda: self.model.resumed is not None)
+
     def before_validate(self) -> None:
         """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""
         chosen, last = self.config_init[self.subcommand], self._last_checkpoint()
-        if chosen.get("ckpt_path"):
+        if chosen.get("ckpt_path") not in (None, "", "last"):
+            self._check_there(chosen["ckpt_path"])
             return
         if last is None:
             raise InputError(
@@ -203,6 +230,11 @@ class TrainCLI(LightningCLI):
         chosen["ckpt_path"] = str(last)
 
     before_test = before_export = before_validate
+
+    def _check_there(self, path: str) -> None:
+        """Lightning has words for some checkpoints, such as best, which mean none here."""
+        if path in ("best", "hpc") or not Path(path).exists():
+            raise InputError(f"{path} is not there; {EXPECTED}")
 
     def after_validate(self) -> None:
         """Say what the figures are of, and what to do next."""
@@ -224,6 +256,26 @@ class TrainCLI(LightningCLI):
     def _last_checkpoint(self) -> Path | None:
         found = self._checkpoints.glob("*.ckpt")
         return max(found, key=lambda path: path.stat().st_mtime, default=None)
+
+
+class ConfigFile(SaveConfigCallback):
+    """Keeps the config of a run beside its figures, whole or not at all."""
+
+    def __init__(self, parser: LightningArgumentParser, config: Any, **_: Any) -> None:
+        super().__init__(parser, config, save_to_log_dir=False)
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Write it."""
+        folder = Path(trainer.log_dir or trainer.default_root_dir)
+        make_output_folder(folder)
+        with whole_file(folder / self.config_filename) as temporary:
+            # with what is null, as the fourth argument says, whose name changed
+            self.parser.save(self.config, temporary, "yaml", False, overwrite=True, multifile=False)
+
+
+def _listed(given: Any) -> list[Any]:
+    """One, several or none, as Lightning takes callbacks and plugins."""
+    return [*given] if isinstance(given, list) else [] if given is None else [given]
 
 
 def print_written(export: MapExport, data: RouteData) -> None:
@@ -260,23 +312,15 @@ def run_train(arguments: Sequence[str]) -> None:
             args=list(arguments),
             parser_kwargs={"prog": "dejavu train", "description": "Train features that repeat, end to end."},
             seed_everything_default=0,
-            save_config_kwargs={"overwrite": True},
+            save_config_callback=ConfigFile,
         )
     except RuntimeError as error:
         problem = " ".join(str(error).split())[:300]
-        if "loading state_dict" in problem:
-            problem = f"the checkpoint is of another model than the config's: {problem}"
-        elif "Early stopping conditioned" not in problem:
+        if "Early stopping conditioned" not in problem:
             raise
         raise InputError(problem) from error
-    except KeyError as error:
-        if "pytorch-lightning_version" not in str(error):
-            raise
-        raise InputError(f"the checkpoint is none of a training; {EXPECTED}") from error
     except MisconfigurationException as error:
         raise InputError(str(error)) from error
-    except UnpicklingError as error:
-        raise InputError(f"the checkpoint cannot be read; {EXPECTED}") from error
     except SystemExit as error:
         if isinstance(error.__context__, KeyboardInterrupt):  # Lightning would have it be a failure
             raise KeyboardInterrupt from error

@@ -13,7 +13,8 @@ from torch import Tensor
 from dejavu_torch.data.files import LARGEST, reading
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
-from dejavu_torch.types import InputError, Traverse, printable
+from dejavu_torch.text import printable
+from dejavu_torch.types import InputError, Traverse
 
 UNNAMED = "the array"
 HEADER = 2**14  # bytes; numpy parses no longer header
@@ -31,8 +32,8 @@ class ArrayTraverse(IndexedTraverse):
         name: what to call it in messages.
 
     Raises:
-        InputError: another shape or type, or no frames; while reading a file, float frames outside [0, 1] or
-            NaN.
+        InputError: another shape or type, or no frames; while reading, float frames of an array outside
+            [0, 1] or NaN.
     """
 
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
@@ -56,7 +57,7 @@ class ArrayTraverse(IndexedTraverse):
             part = part[..., None] if part.ndim == 3 else part
             return part.permute(0, 3, 1, 2).float() / 255
         batch = part if part.dtype == torch.float64 else part.float()
-        if batch.ndim == 4 and isinstance(self.values, np.memmap):  # a tensor is the caller's own affair
+        if batch.ndim == 4 and not isinstance(self.values, Tensor):  # which a pipeline may have normalised
             low, high = batch.flatten(1).aminmax(dim=1)
             bad = ~((low >= 0) & (high <= 1))  # or NaN
             if bad.any():

@@ -1,8 +1,7 @@
-"""Text files read, and files written whole or not at all."""
+"""Files read, whatever they hold."""
 
 from __future__ import annotations
 
-import os
 import stat
 import warnings
 from collections.abc import Iterator
@@ -13,7 +12,6 @@ from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError
 
 LARGEST = 2**53  # beyond it a float does not hold every whole number
-
 BYTES_A_CHARACTER = 64  # that the lines of a table take once they are read
 
 
@@ -92,80 +90,3 @@ def as_number(text: str) -> float | None:
     except ValueError:
         return None
     return value if abs(value) < LARGEST else None
-
-
-def check_output_file(path: Path) -> None:
-    """Refuse early, before long work, a file that could not be written.
-
-    Raises:
-        InputError: the parent folder is missing or not writable, or the path is a folder.
-    """
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; expected a file to write")
-    if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: the folder {path.parent} does not exist")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError(f"{path} cannot be written: no permission to write in {path.parent}")
-
-
-def check_output_folder(path: Path) -> None:
-    """Refuse early, before long work, a folder that could not be made or written in.
-
-    Raises:
-        InputError: a file is in the way, or there is no permission.
-    """
-    there = next(folder for folder in (path, *path.parents) if folder.exists())
-    if not there.is_dir():
-        raise InputError(f"{path} cannot be made a folder: {there} is a file; expected a new path")
-    if not os.access(there, os.W_OK):
-        raise InputError(f"no permission to write in the folder {there}")
-
-
-def make_output_folder(path: Path) -> None:
-    """Create the folder and its parents.
-
-    Raises:
-        InputError: see `check_output_folder`, or the system refuses it.
-    """
-    check_output_folder(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path} cannot be made a folder: {error.strerror}; expected a new path") from error
-
-
-def remove_empty_folders(path: Path) -> None:
-    """Remove a folder that holds nothing but folders; files, and the folders they lie in, stay."""
-    for folder, _, _ in os.walk(path, topdown=False):
-        if not os.listdir(folder):
-            os.rmdir(folder)
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place only when the block ends well.
-
-    Example:
-        >>> import tempfile
-        >>> target = Path(tempfile.mkdtemp()) / "note.txt"
-        >>> with whole_file(target) as temporary:
-        ...     _ = temporary.write_text("all of it")
-        >>> target.read_text()
-        'all of it'
-    """
-    check_output_file(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())  # some writers make private files
-        temporary.replace(path)
-    except OSError as error:
-        raise InputError(f"{path} was not written: {error.strerror or error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -13,12 +13,12 @@ from torch import Tensor
 from dejavu_torch.data.files import LARGEST, reading
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
-from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import InputError, printable
+from dejavu_torch.resize import MOST_PIXELS, resize_frames
+from dejavu_torch.text import printable
+from dejavu_torch.types import InputError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")  # and no other, such as one that starts a program
-MOST_PIXELS = 2**26  # of an image or a frame; a small file can claim any number
 BYTES_A_PIXEL = 24  # that reading takes at most: decoded, as an array, and as floats
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from itertools import accumulate, pairwise
 from typing import Any
 
+from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse
 
 LONGEST = 4096  # characters of a name, as of a path
@@ -46,16 +47,26 @@ def encode_names(names: Sequence[str]) -> str:
     return base64.b64encode(zlib.compress(json.dumps(value, separators=(",", ":")).encode(), 9)).decode()
 
 
-def decode_names(code: str) -> list[str]:
+def decode_names(code: str, count: int | None = None) -> list[str]:
     """The names that `encode_names` gave.
 
+    Args:
+        count: how many there have to be; None takes any.
+
     Raises:
-        InputError: no such code.
+        InputError: no such code, or one of another number of names.
     """
     try:
         text = zlib.decompressobj().decompress(base64.b64decode(code, validate=True), MOST)
+        check_room(8 * len(text), "the names of frames")  # as objects
         value = json.loads(text)
-        names = _names(value) if isinstance(value, dict) else value
+        columns = value["columns"] if isinstance(value, dict) else None
+        seen = len(value) if columns is None else len(columns[0]) - 1
+        if count not in (None, seen):
+            raise InputError(f"it names {seen} frames; expected {count}")
+        names = value if columns is None else _names(value)
+    except InputError:
+        raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, RecursionError, zlib.error) as error:
         raise InputError(f"the names of frames cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -82,6 +93,10 @@ def _names(numbered: dict[str, Any]) -> list[str]:
     first, *rest = numbered["texts"]
     if any(not 1 <= width <= WIDEST for width, *_ in numbered["columns"]):
         raise ValueError("a number in them is too wide")
+    if sum(map(len, numbered["texts"])) > LONGEST:
+        raise ValueError("a text in them is too long")
+    if any(not 0 <= n < 10**WIDEST for _, *changes in numbered["columns"] for n in accumulate(changes)):
+        raise ValueError("a number in them is out of range")
     columns = [[str(n).zfill(width) for n in accumulate(changes)] for width, *changes in numbered["columns"]]
     rows = zip(*columns, strict=True)
     return [first + "".join(n + text for n, text in zip(row, rest, strict=True)) for row in rows]

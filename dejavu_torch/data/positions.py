@@ -28,12 +28,17 @@ def shown_frames(positions: Tensor) -> Tensor:
     """
     positions = positions.double()
     furthest = positions.cummax(0).values + NEAR
-    places = torch.arange(int(furthest[-1]) + 1, dtype=torch.float64, device=positions.device)
+    places = torch.arange(count_places(positions), dtype=torch.float64, device=positions.device)
     high = torch.searchsorted(furthest, places).clamp(max=len(positions) - 1)
     low = (high - 1).clamp(min=0)
     # also after a reversal the frame before the first to reach a place lies short of it
     step = (positions[high] - positions[low]).clamp(min=1e-12)
     return torch.where((places - positions[low]) / step < 0.5, low, high)
+
+
+def count_places(positions: Tensor) -> int:
+    """How many places frames at such positions (F,) reach."""
+    return int(float(positions.double().max()) + NEAR) + 1
 
 
 def borders(positions: Tensor) -> Tensor:

@@ -10,7 +10,8 @@ from torch import Tensor
 from dejavu_torch.data.files import as_number
 from dejavu_torch.data.folder import read_image
 from dejavu_torch.data.frame_range import IndexedTraverse
-from dejavu_torch.types import InputError, printable
+from dejavu_torch.text import printable
+from dejavu_torch.types import InputError
 
 
 class SlidingWindow(IndexedTraverse):

@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import check_regular, reading
-from dejavu_torch.data.folder import MOST_PIXELS, check_pixels, check_size, fitted_size
+from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
-from dejavu_torch.types import InputError, Traverse, printable
+from dejavu_torch.resize import MOST_PIXELS
+from dejavu_torch.text import printable
+from dejavu_torch.types import InputError, Traverse
 
 if TYPE_CHECKING:
     from av import VideoFrame

@@ -20,6 +20,7 @@ from dejavu_torch.types import InputError
 Ints = NDArray[np.integer[Any]]
 
 ESCAPE = -128  # stands for a level that int8 does not hold
+LEVELS_PER_BYTE, LEVELS_AT_LEAST = 2**13, 2**22  # of a stream, at most
 LEVEL = 16  # bytes that a level takes while it is decoded
 MOST = 15  # a magnitude counts for no more in what is near
 
@@ -34,7 +35,7 @@ SPAN, BYTE = 56, 48  # bits of the coder's interval at first, and at least
 
 
 class Stream(NamedTuple):
-    """bytes: (n,) uint8, compressed. checksum: of the levels, CRC-32."""
+    """bytes: (n,) uint8, compressed. checksum: of the levels and their shape, CRC-32."""
 
     bytes: Tensor
     checksum: int
@@ -66,8 +67,8 @@ def encode(levels: Tensor) -> Stream:
         while span < 1 << BYTE:
             low, span = _shift(packed, low), span << 8
     _shift(packed, low + (1 << BYTE) - 1)  # a number in the interval whose further bytes are 0
-    checksum = zlib.crc32(whole.tobytes())
-    return Stream(torch.from_numpy(np.frombuffer(bytes(packed), np.uint8).copy()), checksum)
+    check_work(len(_filled(whole)), whole.shape[1], len(packed))
+    return Stream(torch.from_numpy(np.frombuffer(bytes(packed), np.uint8).copy()), _checksum(whole))
 
 
 def coded_bytes(levels: Tensor) -> int:
@@ -101,10 +102,12 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
     levels = np.zeros((rows, columns), np.int8)
     try:
         _decode(stream.bytes.numpy().tobytes(), levels)
+    except InputError:
+        raise
     except (MemoryError, OverflowError, ValueError) as error:
         problem = str(error)
-    if problem or zlib.crc32(levels.tobytes()) != stream.checksum:
-        seen = problem or f"levels of checksum {zlib.crc32(levels.tobytes())}"
+    if problem or _checksum(levels) != stream.checksum:
+        seen = problem or f"levels of checksum {_checksum(levels)}"
         raise InputError(
             f"the coded lines are truncated or altered: {seen}; expected {levels.size} levels of "
             f"{stream.checksum}"
@@ -124,11 +127,37 @@ def check_claim(rows: int, columns: int) -> None:
         )
 
 
+def check_work(rows: int, columns: int, size: int) -> None:
+    """Refuse a stream that takes far longer to decode than its bytes are worth: zeros cost next to nothing.
+
+    Args:
+        rows: up to the last that is not 0. size: of the stream, bytes.
+
+    Raises:
+        InputError: naming the numbers.
+    """
+    if rows * columns > LEVELS_AT_LEAST + LEVELS_PER_BYTE * size:
+        raise InputError(
+            f"{rows} x {columns} levels in {size} bytes are next to nothing but zeros; "
+            "expected more bytes per place"
+        )
+
+
+def _checksum(levels: Ints) -> int:
+    return zlib.crc32(levels.tobytes(), zlib.crc32(repr(levels.shape).encode()))
+
+
+def _filled(levels: Ints) -> Ints:
+    """The rows up to the last that is not 0."""
+    filled = np.flatnonzero(levels.any(1))
+    return levels[: int(filled[-1]) + 1 if len(filled) else 0]
+
+
 def _decisions(levels: Ints) -> Iterator[list[tuple[Ints, Ints, Ints]]]:
     """All bits that `encode` codes, a block of rows at a time: contexts, what they are, what sorts them."""
-    filled = np.flatnonzero(levels.any(1))
-    rows, columns = int(filled[-1]) + 1 if len(filled) else 0, levels.shape[1]
-    sums = _summed(levels[:rows])
+    filled = _filled(levels)
+    rows, columns = len(filled), levels.shape[1]
+    sums = _summed(filled)
     ends = min(rows + 1, len(levels))
     step = max(1, BLOCK // columns)
     for start in range(0, ends, step):
@@ -193,6 +222,7 @@ def _decode(packed: bytes, levels: Ints) -> None:
     for r in range(rows):
         if bit(END):
             break
+        check_work(r + 1, columns, len(packed))
         row, before = [0] * columns, signs[r % 2]
         for f, near in enumerate(_near(sums, np.array([r]))[0].tolist()):
             context, length = LENGTH + near, 0

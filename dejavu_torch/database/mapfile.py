@@ -1,42 +1,72 @@
-"""One safetensors file for a map: tensors, and JSON that says what they are. No pickle, no code."""
+"""One safetensors file for a map: tensors, JSON that says what they are, and checksums of both.
+
+No pickle, no code.
+"""
 
 from __future__ import annotations
 
 import json
+from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from dejavu_torch.data.files import whole_file
+from dejavu_torch.data.output import whole_file
 from dejavu_torch.types import InputError
 
-FORMAT = 6
+FORMAT = 7
 NAME = "dejavu_torch-map"
 EXPECTED = "a map file, as DejaVu.save writes"
+HEADER = "header"  # the part that is no tensor
 
 
-def metadata_of(header: dict[str, Any]) -> dict[str, str]:
-    """The file's metadata: the format and its version, and the header as JSON under `config`."""
-    return {"format": NAME, "version": str(FORMAT), "config": json.dumps(header)}
+class Contents(NamedTuple):
+    """tensors: by name, the part that each belongs to ahead of the first dot. header: JSON values."""
+
+    tensors: dict[str, Tensor]
+    header: dict[str, Any]
+
+
+def seal(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, str]:
+    """The file's metadata: version, header and a checksum of each part, as JSON.
+
+    It is one entry, since safetensors writes several in no fixed order.
+    """
+    sums = checksums(tensors, header)
+    text = json.dumps({"version": FORMAT, "checksums": sums, HEADER: header}, allow_nan=False)
+    return {NAME: text}
+
+
+def checksums(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, str]:
+    """A digest of each part of a map file: of all names, types, shapes and bytes, and of all JSON values."""
+    sums = {HEADER: blake2b(json.dumps(header).encode(), digest_size=8)}
+    for name, tensor in sorted(tensors.items()):
+        part = sums.setdefault(name.partition(".")[0], blake2b(digest_size=8))
+        part.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        part.update(tensor.contiguous().view(-1).view(torch.uint8).numpy().data)
+    return {part: digest.hexdigest() for part, digest in sums.items()}
 
 
 def map_size(tensors: dict[str, Tensor], header: dict[str, Any]) -> int:
     """Bytes of the file that `write_map` writes."""
-    return len(safetensors.torch.save(_plain(tensors), metadata_of(header)))
+    plain = _plain(tensors)
+    return len(safetensors.torch.save(plain, seal(plain, header)))
 
 
 def write_map(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-    """Write the file whole or not at all.
+    """Write the file whole or not at all; the same tensors and header give the same bytes.
 
     Raises:
         InputError: the file cannot be written.
     """
+    plain = _plain(tensors)
     with whole_file(path) as temporary:
         try:
-            safetensors.torch.save_file(_plain(tensors), temporary, metadata_of(header))
+            safetensors.torch.save_file(plain, temporary, seal(plain, header))
         except SafetensorError as error:
             raise InputError(f"{path} was not written: {error}") from error
 
@@ -55,11 +85,11 @@ def _plain(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return plain
 
 
-def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header of a map file.
+def read_map(path: Path) -> Contents:
+    """Tensors and header of a map file, as they were written.
 
     Raises:
-        InputError: missing, truncated, foreign, or of another format.
+        InputError: missing, truncated, foreign, damaged, or of another format.
     """
     if path.is_dir():
         raise InputError(f"{path} is a folder; expected {EXPECTED}")
@@ -68,17 +98,43 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            if metadata.get("format") != NAME:
+            if NAME not in metadata and metadata.get("format") != NAME:
                 raise InputError(f"{path} is no map of dejavu_torch; expected {EXPECTED}")
-            version = int(metadata["version"])
-            if version != FORMAT:
-                newer = "a newer dejavu_torch is needed" if version > FORMAT else "learn the route again"
-                raise InputError(f"{path} has map format {version}; this version reads {FORMAT}: {newer}")
-            header = json.loads(metadata["config"])
-            if not isinstance(header, dict):
-                raise ValueError("the header is no mapping")
-            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118
+            # before format 7 the version stood by itself
+            sealed: dict[str, Any] = (
+                _json(metadata[NAME]) if NAME in metadata else {"version": int(metadata["version"])}
+            )
+            _check_version(path, sealed["version"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        header, seen = sealed[HEADER], checksums(tensors, sealed[HEADER])
     except InputError:
         raise
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
+    sums = sealed.get("checksums")
+    if seen != sums:
+        known = sums if isinstance(sums, dict) else {}
+        damaged = sorted(part for part in {*seen, *known} if seen.get(part) != known.get(part))
+        raise InputError(
+            f"{path} is damaged: its {' and '.join(damaged)}; expected the file as it was written"
+        )
+    return Contents(tensors, header)
+
+
+def _json(text: str) -> dict[str, Any]:
+    value = json.loads(text, parse_constant=_no_number)
+    if not isinstance(value, dict) or not isinstance(value.get(HEADER), dict):
+        raise ValueError("the header is no mapping")
+    return value
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no number")
+
+
+def _check_version(path: Path, version: object) -> None:
+    if type(version) is not int:
+        raise ValueError(f"its version is {version!r:.40}")
+    if version != FORMAT:
+        newer = "a newer dejavu_torch is needed" if version > FORMAT else "learn the route again"
+        raise InputError(f"{path} has map format {version}; this version reads {FORMAT}: {newer}")

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.positions import borders, look_up, place_of, shown_frames
+from dejavu_torch.data.files import LARGEST
+from dejavu_torch.data.positions import borders, count_places, look_up, place_of, shown_frames
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.types import InputError, SequenceModel
 
@@ -24,6 +25,7 @@ class PlaceMap(nn.Module, ABC):
 
     Attributes:
         kind: a name of the kind, stored with the map.
+        state: type of what `get_extra_state` gives, by which a file is checked: a NamedTuple of its entries.
         places: N, the number of places. dimension: D, features per frame. Plain ints.
         positions: (F,) float32, how many even steps each reference frame lies from the first place, where
             frames were resampled (section IV-B); (0,) where place i is reference frame i.
@@ -36,6 +38,7 @@ class PlaceMap(nn.Module, ABC):
     """
 
     kind: ClassVar[str]
+    state: ClassVar[Any] = dict[str, Any]
     positions: Tensor
 
     def __init__(self, places: int = 0, dimension: int = 0) -> None:
@@ -124,8 +127,8 @@ class PlaceMap(nn.Module, ABC):
             positions.ndim == 1 and positions.is_floating_point() and positions.isfinite().all()
         ):
             problem = f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)"
-        if not problem and len(positions) and len(shown_frames(positions)) != self.places:
-            problem = f"positions of {len(shown_frames(positions))} places; expected {self.places}"
+        if not problem and len(positions) and count_places(positions) != self.places:
+            problem = f"positions of {count_places(positions)} places; expected {self.places}"
         if problem:
             raise InputError(f"the map does not fit together: {problem}")
 
@@ -146,7 +149,7 @@ class PlaceMap(nn.Module, ABC):
             if state.get(name) != value:
                 raise InputError(f"the map's {name} is {state.get(name)!r}; expected {value!r}")
         sizes = state.get("places"), state.get("dimension")
-        if not all(isinstance(size, int) and size >= 0 for size in sizes):
+        if not all(type(size) is int and 0 <= size < LARGEST for size in sizes):
             raise InputError(
                 f"the map has {sizes[0]!r} places of {sizes[1]!r} features; expected whole numbers"
             )

@@ -5,10 +5,11 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from torch import nn
 
+from dejavu_torch.database.schema import checked, checked_fields
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.types import InputError
 
@@ -50,7 +51,7 @@ def inner_recipes(recipe: Recipe) -> Iterator[tuple[str, Recipe]]:
     """The parts that a recipe names, by argument."""
     for name, value in recipe.init_args.items():
         if isinstance(value, dict) and "class_path" in value:
-            yield name, Recipe(**value)
+            yield name, checked(value, Recipe, name)
 
 
 def with_parts(recipe: Recipe) -> list[Recipe]:
@@ -66,7 +67,7 @@ def build(recipe: Recipe, kind: type[M], registry: Registry, given: nn.Module | 
         given: a module from elsewhere, used where the recipe, or a part of it, is its own.
 
     Raises:
-        InputError: a class outside the registry, one that is no `kind`, or arguments it does not take.
+        InputError: a class outside the registry, one that is no `kind`, or arguments that are not its own.
     """
     name = recipe.class_path
     if isinstance(given, kind) and recipe_of(given, registry) == recipe:
@@ -79,11 +80,11 @@ def build(recipe: Recipe, kind: type[M], registry: Registry, given: nn.Module | 
     cls = registry[name]
     if not issubclass(cls, kind):
         raise InputError(f"the map names {name}, which is no {kind.__name__}")
+    hints = get_type_hints(cls.__init__)
+    kinds = {key: hints[key] for key in inspect.signature(cls).parameters}
+    arguments = checked_fields(recipe.init_args, kinds, f"the map's {name}")
     parts = {key: build(part, nn.Module, registry, given) for key, part in inner_recipes(recipe)}
-    try:
-        return cls(**recipe.init_args | parts)
-    except TypeError as error:
-        raise InputError(f"the map names {name}, which cannot be built: {error}") from error
+    return cls(**arguments | parts)
 
 
 def difference(stored: Recipe, given: Recipe) -> str:

@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Callable
 from fractions import Fraction
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -34,13 +34,15 @@ TRANSFORM_COST = 200  # of a place in a query's inverse transform
 REBUILD_COST = 120  # of a number that is rebuilt for all queries at once
 
 
+@torch.no_grad()
 def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -> Tensor:
     """Whole numbers of steps, those below 1 - `ROUNDING` of a step 0. Same shape, float; no gradient.
 
     Args:
         width: by how much that dead zone is wider for each line, at least 1; see `dead_zone`.
     """
-    levels = lines.sign() * (lines.abs() / step + ROUNDING).floor()
+    # in place: the lines of a long route are large
+    levels = lines.abs().div_(step).add_(ROUNDING).floor_().copysign_(lines)
     return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
 
 
@@ -59,6 +61,18 @@ def dead_zone(lines: Tensor, lengths: list[int], resolution: float, transform: T
     halves = [torch.arange(n) if transform == "dct" else (torch.arange(n) + 1) // 2 * 2 for n in lengths]
     inverse = torch.cat([r / (2 * n) for r, n in zip(halves, lengths, strict=True)]).to(lines)
     return (1 + (resolution * inverse).square())[:, None]
+
+
+class SpectralState(NamedTuple):
+    """What the header of a map file says of a spectral map; see its arguments."""
+
+    kind: Literal["spectral"]
+    places: int
+    dimension: int
+    metric: SpectralMetric
+    transform: Transform
+    chunk: int | Literal["route"]
+    resolution: float
 
 
 class SpectralMap(PlaceMap):
@@ -98,6 +112,7 @@ class SpectralMap(PlaceMap):
     """
 
     kind = "spectral"
+    state = SpectralState
 
     levels: Tensor
     escapes: Tensor
@@ -164,6 +179,8 @@ class SpectralMap(PlaceMap):
         self.bounds: list[int] = torch.searchsorted(rows.contiguous(), bounds).tolist()
         norms = [torch.linalg.vector_norm(self.rebuilt(g), dim=1) for g in range(len(self.chunks))]
         self.norms = torch.cat(norms) if norms else self.steps.new_zeros(0)
+        if not (self.norms.isfinite().all() and self.value.isfinite().all()):
+            raise InputError("the map does not fit together: its descriptors are not finite")
         heard = self.norms > SILENT * self.norms.square().mean().sqrt()
         self.per_norm = torch.where(heard, 1 / self.norms, 0)
         self.silent = int((~heard).sum())
@@ -266,20 +283,29 @@ class SpectralMap(PlaceMap):
 
     def unpacked(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """As `PlaceMap.unpacked`: the levels decoded."""
+        expected = {
+            "lengths": (torch.int64, 1),
+            "stream_table": (torch.int64, 2),
+            "streams": (torch.uint8, 1),
+            "mean": (torch.bfloat16, 1),
+        }
+        for name, (dtype, ndim) in expected.items():
+            tensor = tensors.get(name, torch.zeros(()))
+            if tensor.dtype != dtype or tensor.ndim != ndim:
+                seen = f"is {tuple(tensor.shape)} {tensor.dtype}" if name in tensors else "is missing"
+                raise InputError(f"the map's {name} {seen}; expected {dtype} of {ndim} dimensions")
         state = dict(tensors)
         table, streams = state.pop("stream_table"), state.pop("streams")
         lengths, columns = state["lengths"], len(state["mean"])
-        if lengths.dtype != torch.int64 or table.dtype != torch.int64:
-            raise InputError(
-                f"the table of chunks has {lengths.dtype} and {table.dtype}; expected whole numbers"
-            )
-        if table.shape != (len(lengths), 2) or not len(lengths) or streams.dtype != torch.uint8:
+        if tuple(table.shape) != (len(lengths), 2) or not len(lengths):
             raise InputError(
                 f"a stream table {tuple(table.shape)} for {len(lengths)} chunks; expected a row each"
             )
+        if int(lengths.min()) < 1:
+            raise InputError(f"a chunk of {int(lengths.min())} places; expected at least 1")
         sizes = table[:, 0].tolist()
-        if min(sizes) < 0 or sum(sizes) != len(streams) or int(lengths.min()) < 1:
-            raise InputError(f"the coded lines are {len(streams)} bytes; the table claims {sum(sizes)}")
+        if min(sizes) < 0 or sum(sizes) != len(streams):
+            raise InputError(f"the coded lines are {len(streams)} bytes; the table claims {sizes}"[:200])
         check_claim(sum(lengths.tolist()), columns)
         parts = zip(streams.split(sizes), lengths.tolist(), table[:, 1].tolist(), strict=True)
         state["levels"] = torch.cat([decode(Stream(part, sum_), rows, columns) for part, rows, sum_ in parts])

@@ -16,12 +16,25 @@ from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.summary import MapSummary, summarise
 from dejavu_torch.database.templates import PhaseTemplates
 from dejavu_torch.database.trajectories import LayerSums
+from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel
 
 Reduction = Literal["mean", "sum"]
 TRAINABLE = ("templates", "weights")
+PLACE_BYTES = 32  # that a place of a layer takes while its phases are worked out, and while it is scored
+
+
+class TemplateState(NamedTuple):
+    """What the header of a map file says of a template map; see its arguments."""
+
+    kind: Literal["templates"]
+    places: int
+    dimension: int
+    metric: Literal["l1", "l2", "cosine"]
+    reduction: Reduction
+    temperature: float | None
 
 
 class Segment(NamedTuple):
@@ -112,6 +125,7 @@ class TemplateMap(PlaceMap):
     """
 
     kind = "templates"
+    state = TemplateState
 
     layers: Tensor
     feature_ptr: Tensor
@@ -187,6 +201,9 @@ class TemplateMap(PlaceMap):
                 f"feature {outside[0].features[-1]}; expected it inside {self.places} places of "
                 f"{self.dimension} features"
             )
+        # before the phase of every place is worked out: no tensor of a file is as long as the route
+        covered = sum(layer.stop - layer.start for layer in self.plan)
+        check_room(PLACE_BYTES * (self.places + covered), f"a map of {self.places} places")
         self.segments = segments(self.plan, self.places)
         phases = [layer.place_phases for layer in self.plan]
         self.place_phases = torch.cat(phases).to(self.layers.device) if phases else self.layers.new_zeros(0)

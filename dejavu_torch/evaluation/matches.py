@@ -11,8 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import as_number, read_text, whole_file
-from dejavu_torch.types import InputError, Match, printable
+from dejavu_torch.data.files import as_number, read_text
+from dejavu_torch.data.output import whole_file
+from dejavu_torch.text import printable
+from dejavu_torch.types import InputError, Match
 
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
 EXPECTED = "columns query,place,score and, if wanted, accepted and rank"

@@ -37,7 +37,7 @@ from dejavu_torch.evaluation.match_plots import (
     score_matrix,
 )
 from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
-from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture
+from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture, label
 from dejavu_torch.evaluation.score_plots import (
     Areas,
     Stored,
@@ -192,7 +192,7 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
 
 def _name(traverse: Traverse, frame: Tensor) -> str:
     """A query or a place by what matches.csv calls it: the frame of its source, and the frame's name."""
-    return f"frame {frame} {source_of(traverse).frame_name(int(frame))}".strip()
+    return label(f"frame {frame} {source_of(traverse).frame_name(int(frame))}".strip())
 
 
 def draw_coverage(
@@ -490,7 +490,7 @@ def draw_motion(run: Localization) -> dict[str, Picture]:
     frame, odometry = frame_at(reference, reference.length // 2), reference.odometry
     pair = (("reference", reference), ("query", run.query))
     distances = {
-        f"{role}: {one.name}": one.positions * one.step
+        label(f"{role}: {one.name}"): one.positions * one.step
         for role, one in pair
         if isinstance(one, ResampledTraverse)
     }

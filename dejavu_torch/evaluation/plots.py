@@ -15,6 +15,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dejavu_torch.text import printable
+
 Plot = tuple[Figure, Any]
 
 WIDTH = 4.0  # inches; a phone shows about 85 pixels an inch, so 9 points are the smallest letters
@@ -37,6 +39,11 @@ class Picture(NamedTuple):
     heading: str
     caption: str
     numbers: Mapping[str, Any] = MappingProxyType({})
+
+
+def label(name: str) -> str:
+    """A name that others gave, as a picture shows it: of one line, and its dollars are no formulas."""
+    return printable(name).replace("$", r"\$")
 
 
 def empty(height: float) -> Figure:

@@ -6,15 +6,17 @@ import base64
 import io
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
 
 import jinja2
 
-from dejavu_torch.data.files import whole_file
+from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.text import printable
 
 PICTURES = (
     *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "sequences"),
@@ -215,6 +217,15 @@ def summary(report: Report) -> str:
     return ". ".join(lines) + "."
 
 
+def report_folder(path: Path) -> AbstractContextManager[Path]:
+    """`whole_folder` for a report and what lies beside it; pictures of an earlier report are removed.
+
+    Raises:
+        InputError: the folder cannot be made or written in.
+    """
+    return whole_folder(path, [f"{name}.png" for name in PICTURES])
+
+
 def write_report(
     folder: Path,
     report: Report,
@@ -226,20 +237,18 @@ def write_report(
     """Write report.json, one PNG for each picture, and index.html with all of it inside.
 
     Args:
-        pictures: by file name without ending, one of `PICTURES`; those of an earlier report are removed.
+        folder: one that exists, as `report_folder` gives.
+        pictures: by file name without ending, one of `PICTURES`.
         title: heading of the page. command: what made it.
         plan: the plan and summary of the map in lines; None where there is no map.
     """
     pngs = {name: as_png(picture) for name, picture in pictures.items()}
     for name, data in pngs.items():
-        with whole_file(folder / f"{name}.png") as temporary:
-            temporary.write_bytes(data)
-    for name in set(PICTURES) - set(pictures):
-        (folder / f"{name}.png").unlink(missing_ok=True)
+        (folder / f"{name}.png").write_bytes(data)
     facts = report.facts
     _write_page(
         folder,
-        title=title,
+        title=printable(title),
         lead=headline(report),
         notes=[summary(report)],
         rows=score_table(report),
@@ -254,10 +263,10 @@ def write_report(
         colours=[colour_of(one) for one in report.shown()],
         pictures=[(picture, _embedded(pngs[name])) for name, picture in pictures.items()],
         plan=plan,
-        made_by=f"{command}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
+        made_by=f"{printable(command)}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
     )
-    with whole_file(folder / "report.json") as temporary:
-        temporary.write_text(json.dumps(report.as_json(), indent=1) + "\n", encoding="utf-8")
+    text = json.dumps(report.as_json(), indent=1) + "\n"
+    (folder / "report.json").write_text(text, encoding="utf-8")
 
 
 def write_index(
@@ -272,17 +281,18 @@ def write_index(
     """Write index.html over several reports, with one table and one picture, and links to their pages.
 
     Args:
+        folder: one that exists.
         rows: of the table, the header first. notes: what a reader should know of it, a line each.
         pages: what each link says -> where it leads.
     """
     _write_page(
         folder,
-        title=title,
+        title=printable(title),
         notes=notes,
         links=pages,
         rows=rows,
         pictures=[(picture, _embedded(as_png(picture)))],
-        made_by=command,
+        made_by=printable(command),
     )
 
 
@@ -301,5 +311,5 @@ def _write_page(folder: Path, **parts: Any) -> None:
     loader = jinja2.PackageLoader("dejavu_torch", "evaluation")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     text = environment.get_template("report.html.j2").render(parts)
-    with whole_file(folder / "index.html") as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    # names may hold what is no text
+    (folder / "index.html").write_text(text, encoding="utf-8", errors="backslashreplace")

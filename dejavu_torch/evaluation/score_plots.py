@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas
+from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas, label
 
 _OURS = COLOURS["map"]
 _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
+RATIO = "time over that of our fastest; less is better"
 LOWEST, HIGHEST = 0.01, 0.999  # areas, where more and less is drawn as this
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
@@ -76,10 +77,10 @@ def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
     Args:
         contenders: by key, which gives the colour; HOG is dashed, nulls are dotted.
     """
-    names = {key: one.name for key, one in contenders.items()}
+    names = {key: label(one.name) for key, one in contenders.items()}
     for key, one in contenders.items():
         silent = one.curve is not None and len(one.curve.recall) == 0
-        names[key] = fill(f"{one.name} (reports nothing)" if silent else one.name, LETTERS - 8)
+        names[key] = fill(f"{names[key]} (reports nothing)" if silent else names[key], LETTERS - 8)
     lines = sum(1 + name.count("\n") for name in names.values())
     figure, axis = canvas(3.4 + 1.1 * LINE * lines)
     for key, one in reversed(list(contenders.items())):  # the first on top
@@ -103,7 +104,7 @@ def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
 
 def plot_auc(contenders: Mapping[str, Contender]) -> Plot:
     """Area under the curve of each contender that has scores, as a bar in the colour of its curve."""
-    areas = {key: (one.name, one.scores.auc) for key, one in contenders.items() if one.scores}
+    areas = {key: (label(one.name), one.scores.auc) for key, one in contenders.items() if one.scores}
     figure, axis = canvas(0.9 + 0.55 * len(areas))
     bars = axis.barh(range(len(areas)), [area for _, area in areas.values()], height=0.42)
     for row, (bar, (key, (name, area))) in enumerate(zip(bars, areas.items(), strict=True)):
@@ -214,11 +215,12 @@ def plot_sequences(lines: Mapping[str, Areas], coded: Sequence[Areas], title: st
     return figure, axis
 
 
-def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
-    """Time of each contender over ours, one bar each, one group for each case.
+def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) -> Plot:
+    """A figure of each contender, its time over ours if not said otherwise: one bar each, grouped by case.
 
     Args:
-        cases: at least one: case -> contender -> ratio. Names that start with "dejavu" are ours.
+        cases: at least one: case -> contender -> figure. Names that start with "dejavu" are ours.
+        label: what is drawn.
     """
     bars = [len(ratios) for ratios in cases.values()]
     height = 0.5 + 0.42 * sum(bars) + 0.5 * len(bars)
@@ -229,10 +231,11 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]]) -> Plot:
         for row, name in enumerate(ratios):
             axis.text(0, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
         axis.bar_label(drawn, [f"{ratio:.1f}" for ratio in ratios.values()], padding=3, fontsize=9)
-        axis.axvline(1, color=_OURS, linewidth=0.8, linestyle=":")
+        if label == RATIO:
+            axis.axvline(1, color=_OURS, linewidth=0.8, linestyle=":")
         axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
         axis.set(xlim=(0, 1.15 * max(ratios.values())), ylim=(len(ratios) - 0.6, -0.8), yticks=[])
-    axes[-1, 0].set_xlabel("time over that of our fastest; less is better")
+    axes[-1, 0].set_xlabel(label)
     return figure, axes[:, 0]
 
 
@@ -270,7 +273,7 @@ def plot_frontiers(
         axis.minorticks_off()
         _area_axis(axis)
         title = re.sub(r"[^ :]*/", "", case)  # sources without their folders
-        axis.set_title(fill(title, LETTERS - 10), loc="left", fontsize=10, weight="bold")
+        axis.set_title(fill(label(title), LETTERS - 10), loc="left", fontsize=10, weight="bold")
         axis.set_xlabel("route bytes per place")
         if case in whitenings:
             _plot_whitenings(next(column), whitenings[case])

@@ -21,11 +21,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
-from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
+from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.template_map import TemplateMap
+from dejavu_torch.evaluation.plots import Plot
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.hog import hog
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -62,7 +63,8 @@ class Row(NamedTuple):
     loaded and compiled for it. ratio_to_ours: seconds over those of our fastest. peak_bytes: most
     memory held during a run beyond what was held before. bytes: of the result. difference: largest to
     our result. measured_rows: where only a part of the case was run: seconds and bytes are scaled up
-    from it, seconds_first and peak_bytes are its own. skipped: why there are no figures.
+    from it, seconds_first and peak_bytes are its own. skipped: why there are no figures. recall_at_1: share
+    of queries that were found, where the case is to find places.
     """
 
     case: str
@@ -76,6 +78,7 @@ class Row(NamedTuple):
     difference: float | None = None
     measured_rows: int | None = None
     skipped: str | None = None
+    recall_at_1: float | None = None
 
 
 def bench_matcher(
@@ -326,19 +329,19 @@ def peak_memory(run: Callable[[], object]) -> int | None:
     """Most bytes of memory during a run beyond those before it; None where the system has no /proc."""
     if not MEMORY.exists():
         return None
-    before = most = _resident()
+    before = most = resident()
     done = threading.Event()
 
     def watch() -> None:
         nonlocal most
         while not done.wait(0.002):
-            most = max(most, _resident())
+            most = max(most, resident())
 
     watcher = threading.Thread(target=watch)
     watcher.start()
     try:
         result = run()
-        last = _resident()  # with the result: a run that keeps Python's lock stops the watcher
+        last = resident()  # with the result: a run that keeps Python's lock stops the watcher
         del result
     finally:
         done.set()
@@ -346,7 +349,8 @@ def peak_memory(run: Callable[[], object]) -> int | None:
     return max(most, last) - before
 
 
-def _resident() -> int:
+def resident() -> int:
+    """Bytes of memory that this process holds now."""
     return int(MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -360,19 +364,19 @@ def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> lis
         InputError: an unknown bench, or a folder that cannot be made or written in.
     """
     if what not in BENCHES:
-        raise InputError(f"bench {what!r} is unknown; expected {', '.join(BENCHES)} or storage")
+        raise InputError(f"bench {what!r} is unknown; expected {', '.join(BENCHES)}, memory or storage")
     check_output_folder(out)  # before the long work
     rows = BENCHES[what](frames, repeats)
-    make_output_folder(out)
-    write_bench(out, rows)
+    with whole_folder(out) as folder:
+        write_bench(folder, rows)
     return rows
 
 
-def write_bench(folder: Path, rows: Sequence[Row]) -> None:
+def write_bench(folder: Path, rows: Sequence[Row], picture: Plot | None = None) -> None:
     """Write bench.json and bench.png into a folder that exists.
 
-    Raises:
-        InputError: the folder cannot be written in.
+    Args:
+        picture: None draws the seconds over ours.
     """
     facts = {
         "rows": [row._asdict() for row in rows],
@@ -381,15 +385,19 @@ def write_bench(folder: Path, rows: Sequence[Row]) -> None:
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "versions": {"dejavu_torch": dejavu_torch.__version__} | {name: _version(name) for name in COMPARED},
     }
+    figure, _ = picture or plot_ratios(bars(rows, lambda row: row.ratio_to_ours))
+    figure.savefig(folder / "bench.png")
+    (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+def bars(rows: Sequence[Row], height: Callable[[Row], float | None]) -> dict[str, dict[str, float]]:
+    """A figure of each row that has it, by case and contender, as `plot_ratios` draws it."""
     cases: dict[str, dict[str, float]] = {}
     for row in rows:
-        if row.ratio_to_ours is not None:
-            cases.setdefault(row.case, {})[row.contender] = row.ratio_to_ours
-    figure, _ = plot_ratios(cases)
-    with whole_file(folder / "bench.png") as temporary:
-        figure.savefig(temporary)
-    with whole_file(folder / "bench.json") as temporary:
-        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        value = height(row)
+        if value is not None:
+            cases.setdefault(row.case, {})[row.contender] = value
+    return cases
 
 
 def _version(package: str) -> str | None:

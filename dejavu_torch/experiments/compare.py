@@ -332,7 +332,7 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any
     """What report.json holds of the run beside its scores; nothing is learned where the map is given."""
     model, reference, query = run.model, run.reference, run.query
     facts = {
-        "seconds_learn": model.trained.seconds if model.trained else seconds["learn"],
+        "seconds_learn": seconds["learn"],
         "seconds_localize": seconds["localize"],
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,

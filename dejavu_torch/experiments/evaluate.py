@@ -30,6 +30,7 @@ from dejavu_torch.evaluation.pictures import draw_coverage, draw_curves
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.model import read_place_map
+from dejavu_torch.text import printable
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 RANKS = (5, 10)  # among so many candidates a right place is looked for
@@ -101,7 +102,7 @@ def evaluate_file(
         "matches": str(matches),
         "places": places,
     }
-    ours = contend(matches.name, match, known, tolerance)
+    ours = contend(printable(matches.name), match, known, tolerance)
     seen = places or 1 + max(int(table.max()) for table in (match.index, known.positives))
     borders = torch.tensor([seen]) if place_map is None else place_map.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")

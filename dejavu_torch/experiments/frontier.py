@@ -15,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
-from dejavu_torch.data.files import check_output_folder, make_output_folder, whole_file
+from dejavu_torch.data.output import check_output_folder, whole_file, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.coded_video import CodedVideo
@@ -556,10 +556,9 @@ def run_storage(
     check_output_folder(out)
     rows: list[Row] = []
     for row in bench_storage(sources, places, codebooks, given, whitening, progress=progress):
-        if not rows:
-            make_output_folder(out)  # what fails before leaves none
         rows = _with_ratios([*rows, row])
-        write_rows(out, rows)
+        with whole_folder(out) as folder:  # what fails before leaves none
+            write_rows(folder, rows)
     figure, _ = plot_frontiers(pictured(rows), whitenings(rows))
     with whole_file(out / "bench.png") as temporary:
         figure.savefig(temporary)
@@ -578,7 +577,7 @@ def _with_ratios(rows: Sequence[Row]) -> list[Row]:
 
 
 def write_rows(folder: Path, rows: Sequence[Row]) -> None:
-    """Write bench.json into a folder that exists, whole or not at all."""
+    """Write bench.json into a folder that exists."""
     facts = {
         "rows": [row._asdict() for row in rows],
         "equal_auc": equal_areas(rows),
@@ -586,8 +585,7 @@ def write_rows(folder: Path, rows: Sequence[Row]) -> None:
         "threads": torch.get_num_threads(),
         "version": dejavu_torch.__version__,
     }
-    with whole_file(folder / "bench.json") as temporary:
-        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float]]]]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from dejavu_torch.resize import resize_frames
+from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
 FLAT = 2 / 255  # contrast below which nothing is blown up
@@ -85,10 +85,11 @@ class SmallCNN(nn.Module):
         cell: int = 8,
     ) -> None:
         super().__init__()
-        sizes = [dimension, channels, squeeze, *resize, *widths]
-        if len(resize) != 2 or not widths or min(sizes) < 1 or cell < 0:
+        check_size(resize, 1, "SmallCNN got resize")
+        sizes = [dimension, channels, squeeze, *widths]
+        if not widths or min(sizes) < 1 or cell < 0:
             raise InputError(
-                f"SmallCNN got dimension={dimension}, channels={channels}, resize={tuple(resize)}, "
+                f"SmallCNN got dimension={dimension}, channels={channels}, "
                 f"widths={tuple(widths)}, squeeze={squeeze}, cell={cell}; expected at least 1 each, "
                 "cell 0 or more"
             )

@@ -11,8 +11,10 @@ from dejavu_torch.features.cnn import local_contrast
 from dejavu_torch.features.extract import in_mode
 from dejavu_torch.features.preprocess import select_channel
 from dejavu_torch.features.whitening import learned_whitening
-from dejavu_torch.resize import resize_frames
+from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
+
+WIDEST = 256  # cells along a side of a grid
 
 
 class Coder(nn.Module):
@@ -139,12 +141,13 @@ class Embedding(nn.Module):
         kept: int = 128,
     ) -> None:
         super().__init__()
-        sizes = [grid, *resize, *([] if dimension is None else [dimension])]
-        if len(resize) != 2 or min(sizes) < 1 or channels not in (1, 3) or min(cell, hidden) < 0:
+        check_size(resize, 1, "Embedding got resize")
+        least = min(grid, 1 if dimension is None else dimension)
+        if least < 1 or grid > WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
             raise InputError(
-                f"Embedding got dimension={dimension}, channels={channels}, resize={tuple(resize)}, "
-                f"grid={grid}, cell={cell}, hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 "
-                "or more, the others at least 1"
+                f"Embedding got dimension={dimension}, channels={channels}, grid={grid}, cell={cell}, "
+                f"hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 or more, a grid of 1 to "
+                f"{WIDEST}, a dimension of at least 1"
             )
         if dimension is None and hidden:
             raise InputError(f"Embedding got hidden={hidden}, but no dimension; expected both, or neither")
@@ -157,7 +160,8 @@ class Embedding(nn.Module):
         self.hidden = hidden
         self.noise = noise
         self.kept = kept
-        black = torch.zeros(1, channels, *self.resize)
+        weights = next(network.parameters(), None)
+        black = torch.zeros(1, channels, *self.resize, device=None if weights is None else weights.device)
         try:
             with torch.no_grad(), in_mode(network, False):
                 output = network(black)

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.resize import resize_frames
+from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
 Bins = Literal["hard", "linear"]
@@ -200,10 +200,8 @@ class HOG(nn.Module):
             raise InputError(
                 f"HOG got orientations={orientations}, cell={cell}, block={block}; expected at least 1 each"
             )
-        if resize is not None and (len(resize) != 2 or min(resize) < cell * block):
-            raise InputError(
-                f"HOG got resize={resize}; expected (height, width), at least {cell * block} pixels each"
-            )
+        if resize is not None:
+            check_size(resize, cell * block, "HOG got resize")
         self.orientations = orientations
         self.cell = cell
         self.block = block

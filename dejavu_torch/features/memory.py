@@ -13,6 +13,7 @@ from torch import Tensor
 from dejavu_torch.types import InputError
 
 IN_MEMORY = 2**29  # bytes
+BLOCK = 2**26  # bytes: so large a tensor goes back to the system once it is freed, a batch may not
 
 
 def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor:
@@ -34,8 +35,9 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor
         [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]
     """
     parts: list[Tensor] = []
+    blocks: list[Tensor] = []  # of the parts before these
     file: IO[bytes] | None = None
-    like, held, rows = None, 0, 0
+    like, held, joined, rows = None, 0, 0, 0
     for batch in batches:
         like = batch[:0] if like is None else like
         if batch.shape[1:] != like.shape[1:] or batch.dtype != like.dtype:
@@ -47,13 +49,21 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor
         rows += len(batch)
         held += batch.numel() * batch.element_size()
         if held > in_memory:
-            file = _spill(parts, file)
-            parts, held = [], 0
+            file = _spill([*blocks, *parts], file)
+            parts, blocks, held, joined = [], [], 0, 0
+        elif held - joined > BLOCK:
+            blocks.append(torch.cat(parts))
+            parts, joined = [], held
     if like is None:
         raise InputError("there are no features; expected at least one batch")
     if file is None:
-        return torch.cat(parts)
-    _spill(parts, file)
+        whole, start = like.new_empty(rows, like.shape[1]), 0  # torch.cat would hold all of them twice
+        while blocks or parts:
+            part = (blocks or parts).pop(0)
+            whole[start : start + len(part)] = part
+            start += len(part)
+        return whole
+    _spill([*blocks, *parts], file)
     # copy on write: the tensor may be written to, the file never is
     return torch.from_numpy(np.memmap(file, like.cpu().numpy().dtype, "c", shape=(rows, like.shape[1])))
 

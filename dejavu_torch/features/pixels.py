@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from dejavu_torch.features.preprocess import FLAT, check_frames
-from dejavu_torch.resize import resize_frames
+from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
 
@@ -33,8 +33,9 @@ class PatchPixels(nn.Module):
 
     def __init__(self, size: tuple[int, int] = (32, 64), patch: int = 8) -> None:
         super().__init__()
-        if patch < 2 or min(size) < patch:
-            raise InputError(f"patches of {patch} pixels in frames of {size}; expected at least 2, and one")
+        if patch < 2:
+            raise InputError(f"patches of {patch} pixels; expected at least 2")
+        check_size(size, patch, "PatchPixels got size")
         self.size, self.patch = size, patch
 
     def forward(self, frames: Tensor) -> Tensor:

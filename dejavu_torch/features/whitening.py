@@ -14,7 +14,7 @@ from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
 
-ROWS = 8192  # in double precision at a time
+ROWS = 1024  # in double precision at a time
 SAMPLED = 4096  # rows that principal components are found in
 NUMBERS = 128  # of a descriptor, unless said otherwise
 PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
@@ -210,6 +210,11 @@ class Whitening(nn.Module):
     def learned(self) -> bool:
         """Whether there is a projection."""
         return self.projection.numel() > 0
+
+    @property
+    def dimension(self) -> int:
+        """Numbers of a whitened descriptor, once there is a projection."""
+        return len(self.scale) + len(self.length)
 
     def forward(self, descriptors: Tensor) -> Tensor:
         if not self.learned:

@@ -7,25 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
-import torch
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
 from dejavu_torch.model import DejaVu
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
-
-
-def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
-    """Give a task what a checkpoint of it holds.
-
-    Raises:
-        InputError: a checkpoint of other settings.
-    """
-    checkpoint = torch.load(path, map_location=task.device, weights_only=True)
-    task.on_load_checkpoint(checkpoint)
-    task.load_state_dict(checkpoint["state_dict"])
 
 
 class MapExport(Callback):
@@ -59,9 +47,7 @@ class MapExport(Callback):
         if best is not None and not Path(best).is_file():
             log.warning("%s is gone: the map is of the last step", best)
         elif best is not None:
-            seconds = pl_module.seconds  # of the whole run, not up to there
             load_weights(pl_module, best)
-            pl_module.seconds = seconds
         self.write(pl_module, Path(trainer.default_root_dir))
 
     def on_exception(

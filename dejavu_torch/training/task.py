@@ -6,13 +6,13 @@ import copy
 import logging
 import math
 import os
-import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import pytorch_lightning as pl
 import torch
+from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -29,6 +29,7 @@ from dejavu_torch.features.whitening import STRENGTHS, Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
+from dejavu_torch.training.checkpoint import CheckpointFiles, check_resumable, read_checkpoint, taking_over
 from dejavu_torch.training.datamodule import Batch, RouteData
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
@@ -155,8 +156,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.began = 0  # the step at which it began
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
         self.metric: PlaceRecognition | None = None  # `setup` makes it
-        self.steps, self.seconds = 0, 0.0  # of the training that a checkpoint comes from
-        self._clock: float | None = None
+        self.steps = 0  # of the training that a checkpoint comes from
+        self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
         self._callbacks: list[pl.Callback] = []
 
     @property
@@ -196,7 +197,12 @@ class PlaceRecognitionTask(pl.LightningModule):
         return None if self.dejavu.preprocess.contrast else getattr(self.dejavu.features, "resize", None)
 
     def setup(self, stage: str) -> None:
-        """Get ready for a route; the first map is made later, where no checkpoint brings one."""
+        """Get ready for a route; the first map is made later, where no checkpoint brings one.
+
+        Convention: checkpoints are `CheckpointFiles`, unless the trainer was given another plugin for them.
+        """
+        if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
+            self.trainer.strategy.checkpoint_io = CheckpointFiles()
         reference = self.data.sets["reference"]
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
@@ -271,7 +277,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             mapper.trainable = False
         steps = 0 if self._trainer is None else self.trainer.global_step
         seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
-        model.trained = Training(steps or self.steps, self._elapsed(), int(seed) if seed else None)
+        model.trained = Training(steps or self.steps, int(seed) if seed else None)
         return model
 
     def require_map(self) -> None:
@@ -310,13 +316,18 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.index, self.began = self.index + 1, step
 
     def on_fit_start(self) -> None:
-        """Start the clock; callbacks that watch a figure wait for the last stage."""
-        self._clock = time.perf_counter()
+        """Refuse what cannot be resumed; callbacks that watch a figure wait for the last stage."""
+        if self.resumed is not None:
+            check_resumable(self.resumed, self.trainer)
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
             self.trainer.callbacks = [  # type: ignore[attr-defined]
                 callback for callback in self._callbacks if getattr(callback, "monitor", None) is None
             ]
+
+    def on_train_start(self) -> None:
+        """What a checkpoint held is taken over."""
+        self.resumed = None
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Where the steps of a stage are over, the next one begins, with its own optimizer.
@@ -360,22 +371,16 @@ class PlaceRecognitionTask(pl.LightningModule):
             module.eval()
         return self
 
-    def on_train_end(self) -> None:
-        """Stop the clock."""
-        self.seconds, self._clock = self._elapsed(), None
-
     def teardown(self, stage: str) -> None:
         """Give the trainer back its callbacks."""
         if self._callbacks:
             self.trainer.callbacks, self._callbacks = self._callbacks, []  # type: ignore[attr-defined]
 
-    def _elapsed(self) -> float:
-        return self.seconds + (0.0 if self._clock is None else time.perf_counter() - self._clock)
-
     # validation and test
 
     def on_validation_epoch_start(self) -> None:
         """A map of the present features, where there is none yet."""
+        self.resumed = None
         if self.trainer.state.fn != "fit":
             self.require_map()
         if self.in_last_stage and not self.map.places:
@@ -407,11 +412,29 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     # checkpoints
 
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: str | Path, *, weights_only: bool = True, **settings: Any
+    ) -> PlaceRecognitionTask:
+        """A task with the weights of a checkpoint.
+
+        Lightning's own also takes settings from the checkpoint, and for that imports what it names.
+
+        Args:
+            weights_only: accepted, as Lightning has it; no code of a checkpoint is ever run.
+            settings: those of the constructor that the checkpoint was trained with.
+
+        Raises:
+            InputError: a damaged checkpoint, or one of other settings.
+        """
+        task = cls(**settings)
+        load_weights(task, checkpoint_path)
+        return task
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the stage, the clock, and what is trained; a map that is made is made anew."""
+        """Keep the stage, and what is trained; a map that is made is made anew."""
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
-        checkpoint |= {"seconds": self._elapsed()}
         if self.made:
             checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
 
@@ -430,10 +453,14 @@ class PlaceRecognitionTask(pl.LightningModule):
         if checkpoint.get("stages") != stages:
             seen = checkpoint.get("stages", "no training")
             raise InputError(f"the checkpoint is of {seen}; expected one of the stages {stages}")
+        if self._trainer is not None:
+            self.resumed = checkpoint
+            if self.trainer.state.fn != "fit":
+                checkpoint.pop("loops", None)  # nothing goes on
         if not self.made:
             self._take_templates(checkpoint["state_dict"])
         self.index, self.began = checkpoint["stage"], checkpoint["began"]
-        self.steps, self.seconds = checkpoint["global_step"], checkpoint["seconds"]
+        self.steps = checkpoint["global_step"]
         other = sorted(set(self._trained()) ^ set(checkpoint["trained"]))
         if other:
             raise InputError(
@@ -466,6 +493,19 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"the map is of {places} places, {self.data.reference.name} has {len(reference)}; expected "
                 "the route that it was made of"
             )
+
+
+def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
+    """Give a task what a checkpoint of it holds.
+
+    Raises:
+        InputError: a damaged checkpoint, or one of other settings.
+    """
+    checkpoint = read_checkpoint(path)
+    with taking_over(path):
+        task.on_load_checkpoint(checkpoint)
+        task.load_state_dict(checkpoint["state_dict"])
+    task.resumed = None
 
 
 def _layers(plan: Plan) -> str:

@@ -163,3 +163,22 @@ def test_a_claim_beyond_the_memory_is_refused_before_anything_is_made(
         decode(stream, 10**10, 10**4)
     monkeypatch.setattr(codec, "free_memory", lambda: math.inf)
     assert decode(stream, 200, 7).shape == (200, 7)
+
+
+def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codec, "LEVELS_AT_LEAST", 2**12)
+    zeros = Stream(torch.zeros(3, dtype=torch.uint8), 0)
+    with refused("next to nothing but zeros"):
+        decode(zeros, 10**5, 128)
+    sparse = torch.zeros(10**4, 16, dtype=torch.int8)
+    assert torch.equal(decode(encode(sparse), 10**4, 16), sparse)
+    sparse[-1, -1] = 1
+    with refused("next to nothing but zeros", "more bytes per place"):  # nothing is written that is not read
+        encode(sparse)
+
+
+def test_the_shape_is_part_of_what_a_stream_says() -> None:
+    """Behind its last bit that counts a stream goes on in zeros."""
+    stream = encode(torch.zeros(10, 4, dtype=torch.int8))
+    with refused("altered"):
+        decode(stream, 11, 4)

@@ -19,7 +19,8 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.mapfile import FORMAT
+from dejavu_torch.data.names import encode_names
+from dejavu_torch.database.mapfile import FORMAT, NAME, write_map
 from dejavu_torch.database.recipe import Recipe
 from dejavu_torch.database.recipe import recipe_of as recipe_in
 from dejavu_torch.database.template_map import TemplateMapper
@@ -108,25 +109,31 @@ def backbone_bytes(model: DejaVu) -> int:
     return model.summary().fixed.get("backbone", 0)
 
 
-def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors of a map file, and what its one entry of metadata says."""
     with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
+        assert list(file.metadata()) == [NAME]
+        return {name: file.get_tensor(name) for name in file.keys()}, json.loads(file.metadata()[NAME])  # noqa: SIM118
 
 
 def craft(
     path: Path,
-    tensors: dict[str, Tensor] | None = None,
-    metadata: dict[str, str | None] | None = None,
-    **config: Any,
+    tensors: dict[str, Tensor | None] | None = None,
+    **header: Any,
 ) -> None:
-    """Change a map file: tensors, metadata (None takes an entry away), or entries of its config."""
-    old_tensors, old_metadata = contents(path)
-    header = json.loads(old_metadata["config"]) | config
-    new = {**old_metadata, "config": json.dumps(header), **(metadata or {})}
+    """Write a map file anew, sealed as it should be, with other tensors (None takes one away) or entries of
+    its header."""
+    old_tensors, sealed = contents(path)
+    new = {**old_tensors, **(tensors or {})}
     path.unlink()
-    safetensors.torch.save_file(
-        old_tensors | (tensors or {}), path, {name: text for name, text in new.items() if text is not None}
-    )
+    write_map(path, {name: one for name, one in new.items() if one is not None}, sealed["header"] | header)
+
+
+def with_metadata(path: Path, metadata: dict[str, str] | None) -> None:
+    """Give a map file other metadata, and leave its tensors as they are."""
+    tensors, _ = contents(path)
+    path.unlink()
+    safetensors.torch.save_file(tensors, path, metadata)
 
 
 # what comes back
@@ -176,7 +183,7 @@ def test_a_fractional_period_survives(path: Path) -> None:
     assert torch.equal(again.map.plan[0].place_phases, layer.place_phases)
 
 
-@pytest.mark.parametrize("threshold", [None, 0.0, 0.7, float("inf")])
+@pytest.mark.parametrize("threshold", [None, 0.0, 0.7])
 def test_the_threshold_is_stored(path: Path, threshold: float | None) -> None:
     model = template_model(periods=WINDOW, threshold=threshold).learn(waves())
     model.save(path)
@@ -230,11 +237,12 @@ def test_the_claimed_size_holds_with_any_features(path: Path, features: nn.Modul
     assert DejaVu.load(path, features).summary().map_bytes == model.summary().map_bytes
 
 
-def test_metadata_names_format_version_and_config(saved: Path) -> None:
-    tensors, metadata = contents(saved)
-    assert (metadata["format"], int(metadata["version"])) == ("dejavu_torch-map", FORMAT)
+def test_metadata_names_version_checksums_and_header(saved: Path) -> None:
+    tensors, sealed = contents(saved)
+    assert sealed["version"] == FORMAT
+    assert sealed["checksums"].keys() == {"header", "map"}
     assert tensors["map.layers"].tolist() == [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
-    config = json.loads(metadata["config"])
+    config = sealed["header"]
     assert config["features"]["class_path"] == "HOG"
     assert config["mapper"]["init_args"]["periods"]["init_args"]["window"] == 64
     assert (config["map"]["kind"], config["map"]["metric"], config["threshold"]) == ("templates", "l1", None)
@@ -325,19 +333,19 @@ def test_a_missing_file_and_a_folder_are_refused(path: Path) -> None:
 
 
 def test_a_newer_format_is_refused(saved: Path) -> None:
-    craft(saved, metadata={"version": str(FORMAT + 1)})
+    with_metadata(saved, {NAME: json.dumps(contents(saved)[1] | {"version": FORMAT + 1})})
     with refused(str(saved), f"format {FORMAT + 1}", f"reads {FORMAT}", "newer"):
         DejaVu.load(saved)
 
 
 def test_a_map_of_an_unreleased_format_is_refused(saved: Path) -> None:
-    craft(saved, metadata={"version": "3"})
+    with_metadata(saved, {"format": NAME, "version": "3", "config": "{}"})  # as it was before format 7
     with refused(str(saved), "format 3", f"reads {FORMAT}", "learn"):
         DejaVu.load(saved)
 
 
 def test_a_map_of_a_kind_that_is_not_known_is_refused(saved: Path) -> None:
-    kind = json.loads(contents(saved)[1]["config"])["map"] | {"kind": "holographic"}
+    kind = contents(saved)[1]["header"]["map"] | {"kind": "holographic"}
     craft(saved, map=kind)
     for read in (DejaVu.load, read_place_map):
         with refused(str(saved), "holographic", "templates"):
@@ -363,16 +371,26 @@ def test_a_map_that_is_half_evenly_spaced_is_refused(
 
 
 @pytest.mark.parametrize(
-    "metadata", [{"version": None}, {"config": None}, {"config": "{"}, {"config": "[]"}, {"config": "{}"}]
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "{}",
+        "[" * 100_000,
+        '{"version": 7}',
+        '{"version": 7, "header": []}',
+        '{"version": "one", "header": {}}',
+        '{"version": true, "header": {}}',
+        '{"version": 7.0, "header": {}}',
+        '{"version": 7, "checksums": {}, "header": {}}',
+        '{"version": 7, "checksums": 3, "header": {"threshold": NaN}}',
+        '{"version": 7, "checksums": 3, "header": {"threshold": ' + "1" * 5000 + "}}",
+    ],
+    ids=lambda text: text[:50],
 )
-def test_damaged_metadata_is_refused(saved: Path, metadata: dict[str, str | None]) -> None:
-    craft(saved, metadata=metadata)
-    with refused(str(saved)):
-        DejaVu.load(saved)
-
-
-def test_a_version_that_is_no_number_is_refused(saved: Path) -> None:
-    craft(saved, metadata={"version": "one"})
+def test_damaged_metadata_is_refused(saved: Path, text: str) -> None:
+    with_metadata(saved, {NAME: text})
     with refused(str(saved)):
         DejaVu.load(saved)
 
@@ -487,16 +505,227 @@ def test_buffers_of_another_type_are_refused(saved: Path, name: str, value: Tens
 
 @pytest.mark.parametrize("name", ["layers", "feature_ptr", "feature_index", "templates", "weights"])
 def test_a_missing_buffer_is_refused(saved: Path, name: str) -> None:
-    tensors, metadata = contents(saved)
-    del tensors[f"map.{name}"]
-    safetensors.torch.save_file(tensors, saved, metadata)
-    with refused():
+    craft(saved, {f"map.{name}": None})
+    with refused(str(saved), "does not hold", name):
         DejaVu.load(saved)
 
 
 def test_a_tensor_too_many_is_refused(saved: Path) -> None:
     craft(saved, {"features.weight": torch.zeros(3)})
     with refused(str(saved), "features.weight"):
+        DejaVu.load(saved)
+
+
+# damage, and claims that no tensor of the file bears out
+
+
+@pytest.fixture(scope="module")
+def whole_maps(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A map of each kind, the spectral one with whitening, weights and names."""
+    folder = tmp_path_factory.mktemp("maps")
+    torch.manual_seed(0)
+    template_model(periods=WINDOW).learn(waves()).save(folder / "templates.safetensors")
+    spectral = DejaVu(SmallCNN(dimension=12, channels=1, resize=(16, 16), widths=(2,), squeeze=2))
+    spectral.learn(torch.rand(64, 1, 24, 24))
+    spectral.frame_names = [f"{i:03}.png" for i in range(64)]
+    spectral.save(folder / "spectral.safetensors")
+    return sorted(folder.iterdir())
+
+
+def test_any_flipped_bit_is_noticed(whole_maps: list[Path], path: Path) -> None:
+    for whole in whole_maps:
+        content = whole.read_bytes()
+        places = torch.randperm(8 * len(content), generator=torch.Generator().manual_seed(0))[:300].tolist()
+        for bit in places:
+            damaged = bytearray(content)
+            damaged[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(damaged)
+            for read in (DejaVu.load, read_place_map):
+                with refused(str(path)):
+                    read(path)
+
+
+@pytest.mark.parametrize("part", ["header", "map", "features", "whitening"])
+def test_damage_is_told_by_its_part(whole_maps: list[Path], path: Path, part: str) -> None:
+    tensors, sealed = contents(whole_maps[0])
+    if part == "header":
+        sealed["header"]["batch_size"] += 1
+    else:
+        name = next(name for name, tensor in tensors.items() if name.startswith(part) and tensor.numel())
+        tensors[name].view(-1).view(torch.uint8)[0] ^= 1
+    safetensors.torch.save_file(tensors, path, {NAME: json.dumps(sealed)})
+    with refused(f"{path} is damaged: its {part};", "as it was written"):
+        DejaVu.load(path)
+
+
+def test_a_checksum_that_is_missing_is_damage(saved: Path) -> None:
+    sealed = contents(saved)[1]
+    for sums in ({}, None, {**sealed["checksums"], "other": "0"}, {"map": sealed["checksums"]["map"]}):
+        with_metadata(saved, {NAME: json.dumps(sealed | {"checksums": sums})})
+        with refused("is damaged"):
+            DejaVu.load(saved)
+
+
+def test_the_same_model_gives_the_same_bytes(whole_maps: list[Path], path: Path) -> None:
+    for whole in whole_maps:
+        for _ in range(4):
+            DejaVu.load(whole).save(path)
+            assert path.read_bytes() == whole.read_bytes()
+
+
+def spectral(path: Path, whole_maps: list[Path]) -> Path:
+    path.write_bytes(whole_maps[0].read_bytes())
+    return path
+
+
+HUGE = 2**62
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"batch_size": HUGE},
+        {"batch_size": True},
+        {"threshold": 1e300},
+        {"step": 1e300},
+        {"frame_shape": [1, 10**9, 10**9]},
+        {"frame_shape": [1, -4, 4]},
+        {"frame_shape": 64},
+        {"frame_shape": [64.0]},
+        {"trained": {"steps": HUGE, "seed": 0}},
+        {"trained": {"steps": "many", "seed": 0}},
+        {"names": "x" * 100},
+        {"names": 7},
+        {"surprise": 1},
+        {"map": [1]},
+    ],
+    ids=str,
+)
+def test_header_values_out_of_range_are_refused(
+    path: Path, whole_maps: list[Path], header: dict[str, Any]
+) -> None:
+    craft(spectral(path, whole_maps), **header)
+    with refused(str(path)):
+        DejaVu.load(path)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes"),
+    [
+        ("features", {"widths": [10**6]}),
+        ("features", {"widths": [HUGE]}),
+        ("features", {"dimension": 10**9}),
+        ("features", {"squeeze": 10**9}),
+        ("features", {"resize": [10**9, 10**9]}),
+        ("features", {"resize": [16]}),
+        ("features", {"widths": "wide"}),
+        ("features", {"surprise": 1}),
+        ("whitening", {"power": "nan"}),
+        ("whitening", {"bits": 4.0}),
+        ("whitening", {"strengths": {"gain": HUGE}}),
+        ("mapper", {"chunk": "all"}),
+        ("mapper", {"resolution": -1.0}),
+        ("mapper", {"route_bytes_per_place": [5]}),
+        ("map", {"places": 10**12}),
+        ("map", {"places": HUGE}),
+        ("map", {"dimension": 10**12}),
+        ("map", {"kind": "templates"}),
+        ("map", {"metric": "l2"}),
+        ("map", {"temperature": 1.0}),
+    ],
+    ids=str,
+)
+def test_claims_of_a_header_are_refused(
+    path: Path, whole_maps: list[Path], part: str, changes: dict[str, Any]
+) -> None:
+    header = contents(spectral(path, whole_maps))[1]["header"][part]
+    if part == "map":
+        craft(path, map=header | changes)
+    else:
+        craft(path, **{part: header | {"init_args": header["init_args"] | changes}})
+    with refused(str(path)):
+        DejaVu.load(path)
+
+
+def test_a_header_nested_without_end_is_refused(path: Path, whole_maps: list[Path]) -> None:
+    header = contents(spectral(path, whole_maps))[1]["header"]
+    nested = header["features"]
+    init_args = {"dimension": 4, "channels": 1, "resize": [8, 8], "grid": 1, "cell": 0, "hidden": 0}
+    for _ in range(150):
+        arguments = {"network": nested, **init_args, "noise": 1.0, "kept": 128}
+        nested = {"class_path": "Embedding", "init_args": arguments}
+    craft(path, features=nested)
+    with refused(str(path)):
+        DejaVu.load(path)
+
+
+def test_names_of_another_number_are_refused_before_they_are_made(path: Path, whole_maps: list[Path]) -> None:
+    many = encode_names([f"{i:05}.png" for i in range(10_000)])
+    craft(spectral(path, whole_maps), names=many)
+    with refused(str(path), "10000 frames; expected 64"):
+        DejaVu.load(path)
+
+
+def test_a_whitening_of_another_size_is_refused(path: Path, whole_maps: list[Path]) -> None:
+    tensors, _ = contents(spectral(path, whole_maps))
+    scale, offset = (tensors[f"whitening.{name}"] for name in ("scale", "offset"))
+    craft(
+        path,
+        {
+            "whitening.projection": torch.zeros(12, (len(scale) + 2) // 2, dtype=torch.uint8),
+            "whitening.scale": torch.cat([scale, scale[:1]]),
+            "whitening.offset": torch.cat([offset, offset[:1]]),
+        },
+    )
+    with refused("whitening makes", f"the map's {len(scale)}"):
+        DejaVu.load(path)
+
+
+def test_places_that_no_memory_holds_are_refused(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No tensor of a template map is as long as its route."""
+    state = contents(saved)[1]["header"]["map"]
+    craft(saved, map=state | {"places": 10**12})
+    for read in (DejaVu.load, read_place_map):
+        with refused("a map of 1000000000000 places takes", "free"):
+            read(saved)
+
+
+def test_a_position_far_off_is_refused(path: Path) -> None:
+    model = template_model(periods=WINDOW, velocity=GroundOdometry()).learn_features(waves())
+    model.map.positions, model.step = torch.arange(64.0), 1.0
+    model.save(path)
+    DejaVu.load(path)
+    craft(path, {"map.positions": torch.tensor([*range(63), 2.0**50])})
+    with refused(str(path), f"positions of {2**50 + 1} places; expected 64"):
+        DejaVu.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("lengths", torch.tensor([10**12]), ("claims 1000000000000 x",)),
+        ("lengths", torch.tensor([-64]), ("a chunk of -64 places",)),
+        ("lengths", torch.tensor([64.0]), ("lengths is (1,) torch.float32",)),
+        ("lengths", None, ("lengths is missing",)),
+        ("streams", torch.zeros(2, 2, dtype=torch.uint8), ("streams is (2, 2)",)),
+        ("stream_table", torch.tensor([[-1, 0]]), ("the table claims [-1]",)),
+        ("stream_table", torch.zeros(0, 2, dtype=torch.int64), ("(0, 2) for 1 chunks",)),
+        ("steps", torch.tensor([3e38]), ("not finite",)),
+        ("steps", torch.tensor([float("nan")]), ("finite numbers above 0",)),
+    ],
+)
+def test_crafted_lines_are_refused(
+    path: Path, whole_maps: list[Path], name: str, value: Tensor | None, words: tuple[str, ...]
+) -> None:
+    craft(spectral(path, whole_maps), {f"map.{name}": value})
+    for read in (DejaVu.load, read_place_map):
+        with refused(str(path), *words):
+            read(path)
+
+
+def test_a_layer_beyond_exact_integers_is_refused(saved: Path) -> None:
+    craft(saved, {"map.layers": torch.tensor([[2**60, 1, 8, 0, 64], [9, 1, 9, 0, 64]])})
+    with refused(str(saved), "below 2^63"):
         DejaVu.load(saved)
 
 
@@ -675,7 +904,7 @@ def trained(path: Path) -> DejaVu:
     with torch.no_grad():
         model.map.templates.add_(0.1)
     model.map.freeze()
-    model.trained = Training(steps=12, seconds=3.5, seed=4)
+    model.trained = Training(steps=12, seed=4)
     model.save(path)
     return model
 
@@ -685,15 +914,15 @@ def test_a_trained_map_comes_back(path: Path, trained: DejaVu) -> None:
     assert torch.equal(again(query), trained(query))
     assert again.map.weights.tolist() == [0.5, 2.0]
     assert again.map.temperature == 0.07
-    assert again.trained == Training(12, 3.5, 4)
+    assert again.trained == Training(12, 4)
     assert isinstance(again.trained, Training)
     assert path.stat().st_size == trained.summary().map_bytes == again.summary().map_bytes
     assert torch.equal(read_place_map(path).weights, again.map.weights)
 
 
 def test_the_header_tells_of_training(path: Path, trained: DejaVu, tmp_path: Path) -> None:
-    config = json.loads(contents(path)[1]["config"])
-    assert config["trained"] == {"steps": 12, "seconds": 3.5, "seed": 4}
+    config = contents(path)[1]["header"]
+    assert config["trained"] == {"steps": 12, "seed": 4}
     assert config["map"]["temperature"] == 0.07
     trained.learn(waves())  # by eq. 1 again
     trained.save(tmp_path / "learnt.safetensors")
@@ -703,9 +932,9 @@ def test_the_header_tells_of_training(path: Path, trained: DejaVu, tmp_path: Pat
 
 @pytest.mark.parametrize("seed", [None, 0])
 def test_training_of_any_seed_comes_back(path: Path, trained: DejaVu, seed: int | None) -> None:
-    trained.trained = Training(0, 0.0, seed)
+    trained.trained = Training(0, seed)
     trained.save(path)
-    assert DejaVu.load(path).trained == Training(0, 0.0, seed)
+    assert DejaVu.load(path).trained == Training(0, seed)
 
 
 # no file names code to import

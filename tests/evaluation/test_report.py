@@ -18,6 +18,7 @@ from dejavu_torch.evaluation.report import (
     PICTURES,
     Report,
     headline,
+    report_folder,
     score_table,
     sequence_table,
     summary,
@@ -46,7 +47,8 @@ def picture(heading: str = "a heading") -> Picture:
 
 
 def written(folder: Path, one: Report, **pictures: Picture) -> str:
-    write_report(folder, one, pictures, "a title", "dejavu demo", "the plan")
+    with report_folder(folder) as temporary:
+        write_report(temporary, one, pictures, "a title", "dejavu demo", "the plan")
     return (folder / "index.html").read_text(encoding="utf-8")
 
 

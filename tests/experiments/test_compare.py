@@ -104,7 +104,7 @@ def trained(model: DejaVu) -> DejaVu:
         model.map.templates.mul_(0.9)
     model.map.freeze()
     model.map.temperature = 0.1
-    model.trained = Training(steps=30, seconds=1000.0, seed=3)
+    model.trained = Training(steps=30, seed=3)
     return model
 
 
@@ -117,14 +117,14 @@ def test_a_map_that_is_there_is_evaluated_as_it_is(trained: DejaVu) -> None:
     for one, other in zip(result.run.match, expected, strict=True):
         assert torch.equal(one, other)
     report = result.report.as_json()
-    assert report["trained"] == {"steps": 30, "seconds": 1000.0, "seed": 3}
-    assert report["seconds_learn"] == 1000
+    assert report["trained"] == {"steps": 30, "seed": 3}
+    assert report["seconds_learn"] == 0
     assert report["map_bytes"] == trained.summary().map_bytes
     # the area tells them apart: this map's is not that of one learned anew
     fresh = with_mapper(trained, trained.mapper)
     anew = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=fresh).report.as_json()
     assert anew["trained"] is None
-    assert anew["seconds_learn"] < 100
+    assert anew["seconds_learn"] > 0
     assert anew["auc"] != report["auc"]
 
 

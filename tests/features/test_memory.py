@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import tempfile
 import weakref
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dejavu_torch.features import memory
 from dejavu_torch.features.memory import concatenate
 
 
@@ -34,6 +37,28 @@ def test_spilled_rows_keep_their_type_and_can_be_changed_without_harm(dtype: tor
     spilled[0] = 7
     assert torch.equal(spilled[1:], features[1:])
     assert spilled[0].eq(7).all()
+
+
+@given(rows=st.integers(1, 40), batch=st.integers(1, 9), block=st.integers(0, 300))
+def test_blocks_change_nothing(rows: int, batch: int, block: int) -> None:
+    features = torch.randn(rows, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(memory, "BLOCK", block)
+        assert torch.equal(concatenate(features.split(batch)), features)
+        assert torch.equal(concatenate(features.split(batch), in_memory=200), features)
+
+
+def test_what_fits_is_not_held_twice() -> None:
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("no /proc")
+    code = (
+        "import torch; from dejavu_torch.experiments.bench import peak_memory\n"
+        "from dejavu_torch.features.memory import concatenate\n"
+        "print(peak_memory(lambda: concatenate(torch.ones(64, 2048) for _ in range(700))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    held = 700 * 64 * 2048 * 4  # 367 MB, over five blocks
+    assert held < int(done.stdout) < 1.5 * held
 
 
 def test_memory_holds_no_more_than_its_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

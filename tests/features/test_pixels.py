@@ -44,7 +44,7 @@ def test_frames_are_made_small_and_small_ones_stay(shape: tuple[int, int], pixel
 def test_what_holds_no_patch_is_refused() -> None:
     with refused("7 x 40", "8 x 8"):
         PatchPixels()(torch.rand(1, 1, 7, 40))
-    with refused("patches of 9", "(8, 64)"):
+    with refused("size=(8, 64)", "at least 9"):
         PatchPixels((8, 64), 9)
 
 

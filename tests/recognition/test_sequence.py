@@ -140,7 +140,7 @@ def test_convention_2_a_place_that_nothing_covers_is_not_reported() -> None:
 
 
 def test_settings_that_make_no_sequence_are_refused() -> None:
-    with refused("a sequence of 0 queries", "at least 1"):
+    with refused("a sequence of 0 queries", "expected a whole number, at least 1"):
         SequenceMatcher(0)
     with refused("speeds are []", "finite"):
         SequenceMatcher(3, [])

@@ -14,6 +14,7 @@ from test_stages import coded
 
 from dejavu_torch import DejaVu, ImposedPeriods
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.types import Training
 
 
 def train(folder: Path, **settings: Any) -> Path:
@@ -29,15 +30,10 @@ def last(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_resumed_run_goes_on(tmp_path: Path, last: Path) -> None:
-    spent = torch.load(last, weights_only=True)["seconds"]
-    assert spent > 0
     again, running = new_task(), trainer(tmp_path, max_steps=6)
     running.fit(again, data_of(), ckpt_path=last)
     assert running.global_step == 6
-    assert again.seconds > spent
-    trained = DejaVu.load(tmp_path / "map.safetensors").trained
-    assert trained is not None
-    assert trained[:2] == (6, again.seconds)
+    assert DejaVu.load(tmp_path / "map.safetensors").trained == Training(steps=6, seed=None)
 
 
 @pytest.mark.parametrize("settings", [{}, {"feature_weights": True}], ids=str)

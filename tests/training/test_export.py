@@ -14,7 +14,8 @@ from small_training import Stop, data_of, footage, new_task, trainer, warned
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.training.export import LastCheckpoint, load_weights
+from dejavu_torch.training.export import LastCheckpoint
+from dejavu_torch.training.task import load_weights
 
 
 class Wreck(Callback):
@@ -42,7 +43,6 @@ def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Pa
     assert not torch.equal(model.map.templates, last["dejavu.map.templates"])
     assert model.trained is not None
     assert model.trained.steps == running.global_step
-    assert model.trained.seconds == task.seconds
 
 
 def test_without_a_step_there_is_no_map(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

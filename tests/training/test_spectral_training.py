@@ -35,10 +35,10 @@ from dejavu_torch.evaluation.baselines import baselines_of
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.export import LastCheckpoint, load_weights
+from dejavu_torch.training.export import LastCheckpoint
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.stages import CodeStage, DescriptorStage, WhiteningStage
-from dejavu_torch.training.task import PlaceRecognitionTask, start_from
+from dejavu_torch.training.task import PlaceRecognitionTask, load_weights, start_from
 
 EVERY = {"val_check_interval": 2, "check_val_every_n_epoch": None}
 

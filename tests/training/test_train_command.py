@@ -99,7 +99,6 @@ def test_it_resumes(folder: Path, tmp_path: Path) -> None:
     train("fit", *options, "--trainer.max_steps", 6)
     after = torch.load(last, weights_only=True)
     assert (before["global_step"], after["global_step"]) == (4, 6)
-    assert after["seconds"] > before["seconds"]
 
 
 def test_a_seed_repeats_a_map(folder: Path, tmp_path: Path) -> None:

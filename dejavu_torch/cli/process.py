@@ -1,0 +1,124 @@
+"""The command as a process: its standard streams, and the signals that end it.
+
+Little is imported here, so that signals are in hand before what takes time.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import sys
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from types import FrameType
+    from typing import NoReturn
+
+    from _typeshed import ReadableBuffer
+
+INTERRUPTED = "dejavu: interrupted\n"
+ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+cleanup: list[Callable[[], None]] = []  # what is done before the process ends at once
+_state = {"process": 0, "interrupted": 0}  # the number of the command's process; whether Ctrl-C was raised
+
+
+class Stream(io.FileIO):
+    """A standard stream that falls silent where nobody takes more of it: a command still writes its files."""
+
+    problem: OSError | None = None
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        """Write, or, once that has failed, do nothing."""
+        if self.problem is None:
+            try:
+                return super().write(data)
+            except OSError as error:
+                self.problem = error
+        return memoryview(data).nbytes
+
+
+def take_over() -> None:
+    """Handle signals and standard streams, where the command is the process and no call among others."""
+    _state["process"] = os.getpid()
+    for number in ENDING:
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup, or a shell's &, has it
+            signal.signal(number, stop)
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:  # closed: the number must not become that of a file
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+        if name != "stdin" and stream is getattr(sys, f"__{name}__"):
+            lines = stream is None or stream.line_buffering or stream.write_through
+            encoding = "utf-8" if stream is None else stream.encoding
+            buffer = io.BufferedWriter(Stream(number, "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=lines))
+
+
+def output_problem() -> str | None:
+    """Why what was printed did not arrive, where it is not that nobody reads on."""
+    sys.stdout.flush()
+    problem = getattr(getattr(getattr(sys.stdout, "buffer", None), "raw", None), "problem", None)
+    return None if problem is None or isinstance(problem, BrokenPipeError) else problem.strerror
+
+
+def let_go() -> None:
+    """What is left is the end of the interpreter: no Ctrl-C interrupts it."""
+    if _state["process"]:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in ENDING[1:]:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def stop(number: int, frame: FrameType | None = None) -> NoReturn:
+    """Handle a signal: end here and now, after Ctrl-C with one line.
+
+    An exception instead would pass through imports, extensions and destructors, which turn it into others or
+    swallow it.
+    """
+    if os.getpid() != _state["process"]:  # a worker that was forked
+        os._exit(128 + number)
+    for one in ENDING:
+        signal.signal(one, signal.SIG_IGN)
+    for work in cleanup:
+        work()
+    if number == signal.SIGINT:
+        with suppress(OSError):
+            os.write(2, b"\n" * os.isatty(2) + INTERRUPTED.encode())  # below ^C or a progress bar
+    for one in ENDING:  # a flush may wait for who reads
+        signal.signal(one, signal.SIG_DFL)
+    with suppress(Exception):  # as in the middle of a print
+        sys.stdout.flush()
+    os._exit(128 + number)
+
+
+@contextmanager
+def interrupts_raise() -> Iterator[None]:
+    """In the block Ctrl-C is a KeyboardInterrupt, for work that keeps what it has when interrupted."""
+    kept = signal.getsignal(signal.SIGINT)
+    if kept != stop:
+        yield
+        return
+    signal.signal(signal.SIGINT, _raise)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, stop)
+
+
+def _raise(number: int, frame: FrameType | None) -> NoReturn:
+    signal.signal(number, stop)  # where this is swallowed, the next one counts
+    _state["interrupted"] = 1
+    raise KeyboardInterrupt
+
+
+def end_if_interrupted(error: BaseException) -> None:
+    """End as Ctrl-C does where an exception is one, or came behind one, which extensions turn into others."""
+    if not isinstance(error, KeyboardInterrupt) and not _state["interrupted"]:
+        return
+    if _state["process"]:
+        stop(signal.SIGINT)
+    sys.stderr.write(INTERRUPTED)
+    raise SystemExit(128 + signal.SIGINT) from None

@@ -1,0 +1,20 @@
+"""Text that others wrote, such as the names of files, as part of ours."""
+
+from __future__ import annotations
+
+from unicodedata import category
+
+
+def printable(text: object) -> str:
+    """A text of one line: each character that is neither printable nor a space, as a line break, is escaped.
+
+    Bytes of a file name that are no text in the system's encoding count among them.
+
+    Example:
+        >>> printable("two\\nlines")
+        'two\\\\nlines'
+    """
+    return "".join(
+        c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode()
+        for c in str(text)
+    )

@@ -1,0 +1,312 @@
+"""Output files: whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import refused
+
+from dejavu_torch.data.output import (
+    check_output_file,
+    check_output_folder,
+    make_output_folder,
+    whole_file,
+    whole_folder,
+)
+from dejavu_torch.types import InputError
+
+HOLD = "; print(flush=True); import sys; sys.stdin.read()"
+WRITER = "from pathlib import Path; from dejavu_torch.data.output import {0}; context = {0}(Path({1!r})); \
+part = context.__enter__(); (part / 'a' if part.is_dir() else part).write_text('half')"
+
+
+def full_disk(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_new_file_appears_whole(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    with whole_file(target) as temporary:
+        temporary.write_text("first half, ")
+        assert not target.exists()
+        temporary.write_text("all of it")
+    assert target.read_text() == "all of it"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_the_temporary_file_has_the_name_of_its_target_in_a_folder_beside_it(tmp_path: Path) -> None:
+    target = tmp_path / ("a" * 251 + ".png")  # no name could be longer
+    with whole_file(target) as temporary:
+        assert (temporary.parent.parent, temporary.name) == (tmp_path, target.name)
+        temporary.touch()
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("before", ["", "old"])
+@pytest.mark.parametrize("problem", [RuntimeError("bug"), KeyboardInterrupt(), InputError("bad")])
+def test_an_exception_leaves_what_was_there(tmp_path: Path, before: str, problem: BaseException) -> None:
+    target = tmp_path / "a.txt"
+    if before:
+        target.write_text(before)
+
+    def write_half() -> None:
+        with whole_file(target) as temporary:
+            temporary.write_text("half")
+            raise problem
+
+    with pytest.raises(type(problem)):
+        write_half()
+    assert [file.read_text() for file in tmp_path.iterdir()] == [before] * bool(before)
+
+
+def test_a_full_disk_while_writing_is_one_line(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+    with refused(str(target), "No space left on device"), whole_file(target) as temporary:
+        temporary.write_text("half")
+        full_disk()
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.txt": "old"}
+
+
+def test_a_full_disk_while_renaming_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+    monkeypatch.setattr(Path, "replace", full_disk)
+    with refused(str(target), "No space left on device"), whole_file(target) as temporary:
+        temporary.write_text("new")
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.txt": "old"}
+
+
+@pytest.mark.parametrize("check", [check_output_file, lambda path: whole_file(path).__enter__()])
+def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path, check: object) -> None:
+    assert callable(check)
+    with refused(str(tmp_path), "folder"):
+        check(tmp_path)
+    with refused("missing", "does not exist"):
+        check(tmp_path / "missing" / "a.txt")
+    (tmp_path / "file").touch()
+    with refused("file"):
+        check(tmp_path / "file" / "a.txt")
+
+
+def test_output_folders_are_made_with_their_parents(tmp_path: Path) -> None:
+    make_output_folder(tmp_path / "a" / "b")
+    make_output_folder(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()
+
+
+@pytest.mark.parametrize("path", ["file", "file/below"])
+def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, path: str) -> None:
+    (tmp_path / "file").touch()
+    with refused("file"):
+        make_output_folder(tmp_path / path)
+
+
+# what is there already
+
+
+def write(target: Path, text: str = "new") -> None:
+    with whole_file(target) as temporary:
+        temporary.write_text(text)
+
+
+def mode_of(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_through_a_link_its_target_is_written(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for name, first in (("a.txt", "link.txt"), ("new.txt", "dangling.txt")):
+        (tmp_path / first).symlink_to(tmp_path / "there" / name)
+        (tmp_path / f"second_{first}").symlink_to(first)
+    (tmp_path / "there" / "a.txt").write_text("old")
+    write(tmp_path / "second_link.txt")
+    write(tmp_path / "second_dangling.txt")
+    assert {file.name: file.read_text() for file in (tmp_path / "there").iterdir()} == {
+        "a.txt": "new",
+        "new.txt": "new",
+    }
+    assert len([file for file in tmp_path.iterdir() if file.is_symlink()]) == 4
+
+
+def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path: Path) -> None:
+    private, new = tmp_path / "private", tmp_path / "new"
+    private.touch()
+    private.chmod(0o600)
+    before = os.umask(0o027)
+    try:
+        write(private)
+        write(new)
+        with whole_folder(tmp_path / "folder") as temporary:
+            (temporary / "a").touch(0o600)  # as some writers do
+    finally:
+        os.umask(before)
+    assert (mode_of(private), mode_of(new)) == (0o600, 0o640)
+    assert (mode_of(tmp_path / "folder"), mode_of(tmp_path / "folder" / "a")) == (0o750, 0o640)
+
+
+def test_what_is_no_regular_file_is_refused_and_stays(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "link").symlink_to("/dev/null")
+    (tmp_path / "loop").symlink_to("loop")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(tmp_path / "socket"))
+        before = {file.name: file.lstat().st_mode for file in tmp_path.iterdir()}
+        for path in ("fifo", "link", "socket", "/dev/null"):
+            with refused(path, "regular file"):
+                check_output_file(tmp_path / path)
+            with refused(path):
+                check_output_folder(tmp_path / path)
+        with refused("loop"):
+            check_output_file(tmp_path / "loop")
+        assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
+
+
+def test_names_that_are_too_long_are_refused_at_once(tmp_path: Path) -> None:
+    for path in (tmp_path / ("a" * 256), tmp_path / ("\xe4" * 128), tmp_path.joinpath(*["a" * 200] * 21)):
+        for check in (check_output_file, check_output_folder):
+            with refused("bytes"):
+                check(path)
+    with refused("bytes"):
+        check_output_folder(tmp_path / "new" / ("a" * 256))
+    for check in (check_output_file, check_output_folder):
+        with refused("null"):
+            check(tmp_path / "a\0b")
+
+
+def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").touch()
+    monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != tmp_path / "a")
+    with refused("no permission", str(tmp_path / "a")):
+        check_output_file(tmp_path / "a")
+    check_output_file(tmp_path / "b")
+
+
+def test_the_folder_vanishes_meanwhile(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with refused("a.txt", "No such file"), whole_file(tmp_path / "folder" / "a.txt") as temporary:
+        temporary.write_text("new")
+        (tmp_path / "folder").rename(tmp_path / "moved")
+    assert list(tmp_path.glob("moved/a.txt")) == []
+
+
+# folders
+
+
+def test_a_new_folder_appears_whole(tmp_path: Path) -> None:
+    with whole_folder(tmp_path / "a" / "b") as temporary:
+        (temporary / "one").write_text("1")
+        assert not (tmp_path / "a").exists()
+    assert [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))] == [
+        "a",
+        "a/b",
+        "a/b/one",
+    ]
+
+
+def test_a_folder_keeps_its_other_files(tmp_path: Path) -> None:
+    for name in ("own", "kept", "earlier"):
+        (tmp_path / name).write_text("old")
+    (tmp_path / "kept").chmod(0o600)
+    with whole_folder(tmp_path, ["kept", "earlier", "never"]) as temporary:
+        (temporary / "kept").write_text("new")
+        (temporary / "one").write_text("new")
+    found = {file.name: file.read_text() for file in tmp_path.iterdir()}
+    assert found == {"own": "old", "kept": "new", "one": "new"}
+    assert mode_of(tmp_path / "kept") == 0o600
+
+
+@pytest.mark.parametrize("problem", [RuntimeError("bug"), KeyboardInterrupt(), InputError("bad")])
+@pytest.mark.parametrize("before", [{}, {"a": "old", "earlier": "old"}])
+def test_an_exception_leaves_a_folder_as_it_was(
+    tmp_path: Path, before: dict[str, str], problem: BaseException
+) -> None:
+    target = tmp_path / "new" / "target"
+    if before:
+        target.mkdir(parents=True)
+    for name, text in before.items():
+        (target / name).write_text(text)
+
+    def write_half() -> None:
+        with whole_folder(target, ["earlier"]) as temporary:
+            (temporary / "a").write_text("new")
+            raise problem
+
+    with pytest.raises(type(problem)):
+        write_half()
+    assert {file.name: file.read_text() for file in target.glob("*")} == before
+    assert list(tmp_path.iterdir()) == ([tmp_path / "new"] if before else [])
+
+
+def test_a_full_disk_or_a_folder_in_the_way_leaves_a_folder_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("old")
+    (tmp_path / "b").mkdir()
+    with refused(str(tmp_path), "No space left"), whole_folder(tmp_path) as temporary:
+        (temporary / "a").write_text("new")
+        full_disk()
+    with refused(str(tmp_path / "b"), "folder"), whole_folder(tmp_path) as temporary:
+        (temporary / "a").write_text("new")
+        (temporary / "b").write_text("new")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a", "b"]
+    assert (tmp_path / "a").read_text() == "old"
+
+
+def test_of_two_writers_of_a_new_folder_the_last_wins(tmp_path: Path) -> None:
+    target = tmp_path / "target"
+    with whole_folder(target) as one, whole_folder(target) as other:
+        (one / "a").write_text("one")
+        (one / "b").write_text("one")
+        (other / "a").write_text("other")
+    assert {file.name: file.read_text() for file in target.iterdir()} == {"a": "one", "b": "one"}
+    assert list(tmp_path.iterdir()) == [target]
+
+
+# signals, and what a kill leaves
+
+
+def test_signals_wait_until_all_files_are_in_their_places(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace = Path.replace
+
+    def interrupted(self: Path, target: Path) -> Path:
+        signal.raise_signal(signal.SIGINT)
+        return replace(self, target)
+
+    def write_two() -> None:
+        with whole_folder(tmp_path) as temporary:
+            (temporary / "a").write_text("new")
+            (temporary / "b").write_text("new")
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_two()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a", "b"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(("kind", "name"), [("whole_file", "a"), ("whole_folder", "new")])
+def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(
+    tmp_path: Path, kind: str, name: str
+) -> None:
+    code = WRITER.format(kind, str(tmp_path / name)) + HOLD
+    command = [sys.executable, "-c", code]
+    (tmp_path / "a.txt.part").touch()  # of somebody else
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"\n"
+        write(tmp_path / "b")
+        assert len(list(tmp_path.glob(".dejavu-*"))) == 1  # it is alive
+        process.kill()
+        process.wait()
+    assert len(list(tmp_path.glob(".dejavu-*"))) == 1
+    write(tmp_path / "b")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt.part", "b"]

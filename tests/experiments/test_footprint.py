@@ -1,0 +1,157 @@
+"""`dejavu bench memory`: what is measured, in processes of their own, and what is written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, run
+from helpers import refused
+
+from dejavu_torch.experiments import footprint
+from dejavu_torch.experiments.footprint import (
+    CONTENDERS,
+    Drive,
+    Task,
+    bench_memory,
+    gathered,
+    measured,
+    memory_table,
+    paint_drives,
+    shown_by,
+)
+
+LINUX = Path("/proc/self/statm").exists()
+
+
+class Stub:
+    """In the place of `measured`: every process writes its file, and the second contender dies."""
+
+    def __init__(self) -> None:
+        self.tasks: list[Task] = []
+        self.files: list[int] = []
+
+    def __call__(self, task: Task, folder: Path) -> dict[str, Any]:
+        self.tasks.append(task)
+        self.files.append(len(list(folder.glob("*-*"))))
+        if task.contender == "dejavu templates":
+            return {"skipped": "ended by signal 9"}
+        if not task.queries:
+            task.file(folder).write_bytes(b"kept")
+        seconds = {"dejavu": 2.0, "HOG, float32": 3.0}.get(task.contender, 1.0)
+        return {"seconds": seconds, "peak_bytes": 1_000_000 * task.places, "bytes": 4}
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
+    stub = Stub()
+    monkeypatch.setattr(footprint, "measured", stub)
+    return stub
+
+
+def test_every_contender_learns_each_size_and_localizes_on_the_middle_one(stub: Stub) -> None:
+    rows = list(bench_memory([300, 100, 200], queries=[5]))
+    assert [row.case for row in rows[:2]] == ["programs loaded", "learn 100 frames"]
+    cases = dict.fromkeys(row.case for row in rows[1:])
+    assert list(cases) == [
+        "learn 100 frames",
+        "learn 200 frames",
+        "learn 300 frames",
+        "localize 5 queries, 200 places",
+    ]
+    assert [row.contender for row in rows[1:]] == list(CONTENDERS) * len(cases)
+    assert [(row.case, row.contender) for row in rows] == [(task.case, task.contender) for task in stub.tasks]
+    assert max(stub.files) < len(CONTENDERS)  # files that nothing reads any more do not pile up
+
+
+def test_what_fails_is_a_row_and_the_others_go_on(stub: Stub, tmp_path: Path) -> None:
+    run("bench", "memory", "--places", "64", "--out", tmp_path)
+    written = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    rows = {(row["case"], row["contender"]): row for row in written}
+    assert rows["learn 64 frames", "dejavu templates"]["skipped"] == "ended by signal 9"
+    assert rows["learn 64 frames", "HOG, float32"]["ratio_to_ours"] == 1.5
+    assert rows["localize 10000 queries, 64 places", "dejavu"]["peak_bytes"] == 64_000_000
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.json", "bench.png"]
+
+
+def test_bad_sizes_are_refused_ahead_of_the_work(
+    stub: Stub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = fails(capsys, "bench", "memory", "--places", "7", "--out", tmp_path / "out")
+    assert "7" in error
+    assert "64" in error
+    with refused("1 query"):
+        list(bench_memory([64], queries=[0]))
+    error = fails(capsys, "bench", "memory", "sim:aerial", "--out", tmp_path / "out")
+    assert "takes no sources" in error
+    assert stub.tasks == list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drives")
+    paint_drives(folder, 200)
+    return folder
+
+
+def test_a_frame_is_a_window_of_the_drive(drives: Path) -> None:
+    image = np.load(drives / "places.npy")
+    drive = Drive(image, torch.tensor([3, 150, 0]))
+    (batch,) = drive.batches(8)
+    assert batch.shape == (3, 3, 64, 64)
+    seen = torch.from_numpy(image[:, 150:214]).permute(2, 0, 1) / 255
+    assert torch.equal(batch[1], seen)
+
+
+def test_queries_lie_along_the_route_and_begin_again() -> None:
+    assert shown_by(4, 12).tolist() == [0, 3, 6, 9]
+    assert shown_by(5, 2).tolist() == [0, 1, 0, 1, 0]
+
+
+def test_batches_are_gathered_in_order(drives: Path) -> None:
+    drive = Drive(np.load(drives / "places.npy"), torch.arange(70))
+    whole = gathered((batch.mean((1, 2, 3)) for batch in drive.batches(32)), drive)
+    assert torch.equal(whole, torch.cat([batch.mean((1, 2, 3)) for batch in drive.batches(70)]))
+
+
+@pytest.mark.parametrize("name", CONTENDERS)
+def test_a_process_learns_and_another_finds_the_places(name: str, drives: Path) -> None:
+    learned = measured(Task(name, 200, 0, 1), drives)
+    if "No module" in learned.get("skipped", ""):
+        pytest.skip(learned["skipped"])
+    found = measured(Task(name, 200, 50, 1), drives)
+    assert learned["bytes"] == found["bytes"] == Task(name, 200, 0, 1).file(drives).stat().st_size
+    assert found["recall_at_1"] > 0.9
+    assert not list(drives.glob("*.trial"))
+    if LINUX and name == "HOG, float32":  # (200, 1764) floats, and a batch of frames and more
+        assert 200 * 1764 * 4 < learned["peak_bytes"] < 100e6
+
+
+def test_why_a_process_failed(drives: Path) -> None:
+    facts = measured(Task("dejavu", 150, 10, 1), drives)  # nothing learned so many
+    assert list(facts) == ["skipped"]
+    assert "150" in facts["skipped"]
+
+
+def test_the_current_folder_is_not_imported_from(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "kornia.py").write_text("raise SystemExit('the wrong module')")
+    monkeypatch.chdir(tmp_path)
+    assert "skipped" not in measured(Task("dejavu", 0, 0, 1), drives)
+
+
+def test_the_table() -> None:
+    rows = [
+        footprint.Row("learn", "dejavu", 2.0, peak_bytes=3_000_000, bytes=10_000, recall_at_1=0.5),
+        footprint.Row("learn", "faiss, HOG", skipped="no faiss"),
+    ]
+    assert memory_table(rows)[1:] == [
+        ["learn: dejavu", "3.0", "0.01", "2.0", "0.500", ""],
+        ["learn: faiss, HOG", "", "", "", "", "skipped: no faiss"],
+    ]

@@ -1,0 +1,195 @@
+"""Valid input, made once and small: each maker fills a folder, from which readers take what they change."""
+
+from __future__ import annotations
+
+import shutil
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import torch
+from PIL import Image
+from pytorch_lightning import Trainer
+from torch import Tensor
+
+from dejavu_torch.cli.presets import FOLDER
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.source import open_source
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.periods.imposed import ImposedPeriods
+from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.types import Training
+
+
+def pictures(count: int, side: int = 16, noise: float = 0.0) -> np.ndarray:
+    """(count,side,side) uint8, a window slid along a strip that repeats every 12 pixels."""
+    drawn = np.random.default_rng(0)
+    strip = np.tile(drawn.integers(40, 215, (side, 12)), (1, 2 * count))[:, : count + side]
+    strip = 0.6 * strip + 0.4 * drawn.integers(0, 255, strip.shape)
+    frames = np.stack([strip[:, i : i + side] for i in range(count)])
+    return np.clip(frames + noise * drawn.normal(size=frames.shape), 0, 255).astype(np.uint8)
+
+
+def frames_of(array: np.ndarray) -> Tensor:
+    """(N,1,H,W) in [0, 1]."""
+    return torch.from_numpy(array)[:, None].float() / 255
+
+
+def maps(folder: Path) -> None:
+    """Map files of every kind, and beside each frames that it localizes."""
+    frames, queries = frames_of(pictures(40)), pictures(12, noise=5.0)
+    features = torch.from_numpy(np.random.default_rng(1).normal(size=(40, 12))).float()
+    periods = ImposedPeriods([3, 4, 5], bin=2)
+    write_images(folder / "photos", pictures(40))
+    ground = footage(40)
+    models: dict[str, tuple[DejaVu, Any, np.ndarray]] = {
+        "templates": (DejaVu(mapper=TemplateMapper(periods)), frames, queries),
+        "plan": (
+            DejaVu(mapper=TemplateMapper(periods, reduction="sum", metric="l2")),
+            features,
+            features[:9].numpy(),
+        ),
+        "spectral": (DejaVu(), frames, queries),
+        "plain": (DejaVu(whitening="none"), features, features[:9].numpy()),
+        "chunked": (DejaVu(mapper=SpectralMapper(chunk=16)), frames, queries),
+        "named": (DejaVu(threshold=0.5), open_source(folder / "photos"), queries),
+        "learned": (
+            DejaVu(
+                SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4),
+                mapper=TemplateMapper(periods),
+            ),
+            frames,
+            queries,
+        ),
+        "resampled": (
+            DejaVu(
+                velocity=GroundOdometry(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)), (48, 48), step=6.0)
+            ),
+            frames_of(ground),
+            ground[:20],
+        ),
+    }
+    for name, (model, reference, query) in models.items():
+        model.learn(reference)
+        if name == "learned":
+            model.trained = Training(4, 0)
+        model.save(folder / f"{name}.safetensors")
+        np.save(folder / f"{name}.npy", query)
+    shutil.rmtree(folder / "photos")
+
+
+def footage(count: int, side: int = 48) -> np.ndarray:
+    """(count,side,side) uint8, a camera that looks straight down and comes 4 pixels forward a frame."""
+    drawn = torch.rand(1, 1, count + side // 4, side // 4, generator=torch.Generator().manual_seed(0))
+    ground = torch.nn.functional.interpolate(drawn, scale_factor=4, mode="bicubic")[0, 0].clamp(0, 1).mul(255)
+    return torch.stack([ground[4 * i : 4 * i + side] for i in reversed(range(count))]).byte().numpy()
+
+
+def write_images(folder: Path, images: np.ndarray, suffix: str = ".png") -> None:
+    folder.mkdir()
+    for i, image in enumerate(images):
+        Image.fromarray(image).save(folder / f"{i}{suffix}")
+
+
+def images(folder: Path) -> None:
+    """One picture in every form that is read."""
+    grey = pictures(1, 24)[0]
+    colour = Image.fromarray(np.stack([grey, grey.T, 255 - grey], 2))
+    for suffix in ("png", "jpg", "bmp", "tif", "webp", "ppm"):
+        colour.save(folder / f"colour.{suffix}")
+    for suffix in ("png", "jpg", "pgm", "tif"):
+        Image.fromarray(grey).save(folder / f"grey.{suffix}")
+    colour.quantize(16).save(folder / "palette.png")
+    colour.convert("RGBA").save(folder / "alpha.png")
+    Image.fromarray(grey.astype(np.uint16) * 256).save(folder / "sixteen.png")
+    Image.fromarray(grey.astype(np.float32) / 255).save(folder / "float.tif")
+    Image.fromarray(grey > 128).save(folder / "bits.png")
+    colour.save(folder / "lzw.tiff", compression="tiff_lzw")
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    colour.save(folder / "turned.jpg", exif=turned)
+    (folder / "vector.png").write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n(out/ran) (w) file closefile\n"
+    )
+
+
+def videos(folder: Path) -> None:
+    """Clips of a dozen frames in several containers."""
+    kinds = {"a.mp4": ("libx264", "yuv420p"), "b.avi": ("mjpeg", "yuvj420p"), "c.mkv": ("ffv1", "bgr0")}
+    kinds |= {"d.ts": ("libx264", "yuv420p"), "e.mov": ("mpeg4", "yuv420p"), "f.mjpeg": ("mjpeg", "yuvj420p")}
+    for name, (codec, pixels) in kinds.items():
+        with av.open(str(folder / name), "w") as container:
+            stream = container.add_stream(codec, rate=25)
+            stream.width, stream.height, stream.pix_fmt = 48, 32, pixels
+            for i, image in enumerate(pictures(12, 48)):
+                frame = av.VideoFrame.from_ndarray(np.stack([image[:32]] * 3, 2), format="rgb24")
+                frame.pts, frame.time_base = i, Fraction(1, 25)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+
+
+TRAIN = """
+model:
+  backbone:
+    class_path: dejavu_torch.features.cnn.SmallCNN
+    init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
+  mapper:
+    class_path: dejavu_torch.TemplateMapper
+    init_args:
+      periods:
+        class_path: dejavu_torch.ImposedPeriods
+        init_args: {periods: [3, 4, 5], bin: 2}
+data: {source: in/frames.npy, batch_size: 20, tolerance: 2}
+trainer: {max_steps: 2, accelerator: cpu, logger: false, default_root_dir: out/run}
+"""
+
+
+def new_task() -> PlaceRecognitionTask:
+    backbone = SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
+    return PlaceRecognitionTask(backbone=backbone, mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=2)))
+
+
+def checkpoints(folder: Path) -> None:
+    """The checkpoint of a training of two steps."""
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    trainer = Trainer(
+        accelerator="cpu", default_root_dir=folder, max_steps=2, enable_checkpointing=False, **quiet
+    )
+    trainer.fit(new_task(), RouteData(ArrayTraverse(pictures(40)), batch_size=20, tolerance=2))
+    trainer.save_checkpoint(folder / "last.ckpt")
+
+
+def inputs(folder: Path) -> None:
+    """What command lines name: `in` of their folder."""
+    maps(folder)
+    for path in folder.glob("*.npy"):
+        path.unlink()
+    np.save(folder / "frames.npy", pictures(40))
+    np.save(folder / "query.npy", pictures(12, noise=5.0))
+    np.save(folder / "features.npy", np.random.default_rng(1).normal(size=(40, 12)).astype(np.float32))
+    write_images(folder / "photos", pictures(30))
+    (folder / "clip").mkdir()
+    videos(folder / "clip")
+    (folder / "clip" / "a.mp4").rename(folder / "clip.mp4")
+    shutil.rmtree(folder / "clip")
+    Image.fromarray(pictures(1, 40)[0]).save(folder / "strip.png")
+    (folder / "matches.csv").write_text(matches_text())
+    (folder / "truth.csv").write_text("query,place\n" + "".join(f"{i},{i}\n" for i in range(12)))
+    np.savez(folder / "truth.npz", GThard=np.eye(40, 12, dtype=bool))
+    (folder / "config.yaml").write_text((FOLDER / "local_maxima.yaml").read_text())
+    (folder / "train.yaml").write_text(TRAIN)
+    (folder / "empty").mkdir()
+    (folder / "a_file").write_text("a file")
+    checkpoints(folder)
+
+
+def matches_text() -> str:
+    rows = [f"{i},{max(0, i - i % 3)},{0.1 * i:.9g},{i % 2},{i}.png,{i}.png\n" for i in range(12)]
+    return "query,place,score,accepted,query_name,place_name\n" + "".join(rows)

@@ -1,0 +1,796 @@
+"""Every reader of the package, on mutated input: a new one is a function with `@reader`.
+
+A reader makes its input in `case.folder`, the current folder, from the files its makers made once, calls
+`case.begin()`, and runs. It returns where the input is accepted and lets every exception pass.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import os
+import shutil
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from random import Random
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import safetensors.torch
+import torch
+from PIL import Image
+from torch import Tensor
+
+from dejavu_torch import cli
+from dejavu_torch.cli import commands
+from dejavu_torch.cli.parser import parse
+from dejavu_torch.cli.presets import FOLDER, with_configs
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.ground_truth import find_ground_truth
+from dejavu_torch.data.source import open_source
+from dejavu_torch.database import mapfile
+from dejavu_torch.database.codec import Stream, decode, encode
+from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.matches import read_matches
+from dejavu_torch.experiments import bench, compare, frontier, reproduce
+from dejavu_torch.experiments import evaluate as evaluating
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.model import DejaVu, read_place_map
+from dejavu_torch.periods.imposed import ImposedPeriods
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.training.export import load_weights
+from dejavu_torch.types import InputError, Match, Traverse
+
+from .inputs import (
+    TRAIN,
+    checkpoints,
+    frames_of,
+    images,
+    inputs,
+    maps,
+    matches_text,
+    new_task,
+    pictures,
+    videos,
+)
+from .mutations import (
+    BOMB,
+    CANARY,
+    NUMBERS,
+    PICKLES,
+    TAGS,
+    TEXTS,
+    json_text,
+    mutate_bytes,
+    mutate_json,
+    mutate_tensors,
+    mutate_text,
+    mutate_words,
+    odd_value,
+)
+
+
+class Wrong(AssertionError):
+    """What a reader finds itself: damage that nothing noticed, values out of range."""
+
+
+class Case:
+    """One case: what decides it, its folder with `in` and `out`, and where the makers' files are."""
+
+    def __init__(self, random: Random, folder: Path, made: Path) -> None:
+        self.random, self.folder, self._made = random, folder, made
+        self.command = False
+        self.started: Callable[[], None] = lambda: None
+
+    def made(self, maker: Maker) -> Path:
+        """The folder of what a maker made."""
+        return self._made / maker.__name__
+
+    def begin(self, command: bool = False) -> None:
+        """The input is there: from here on files are watched. A command may write where its words say."""
+        self.command = command
+        self.started()
+
+
+Maker = Callable[[Path], None]
+
+
+class Reader(NamedTuple):
+    """share: of all cases, relative to the others'."""
+
+    name: str
+    run: Callable[[Case], None]
+    makers: tuple[Maker, ...]
+    share: float
+
+
+READERS: dict[str, Reader] = {}
+
+
+def reader(
+    name: str, *makers: Maker, share: float = 1.0
+) -> Callable[[Callable[[Case], None]], Callable[[Case], None]]:
+    """Register a reader."""
+
+    def register(run: Callable[[Case], None]) -> Callable[[Case], None]:
+        READERS[name] = Reader(name, run, makers, share)
+        return run
+
+    return register
+
+
+# what is read ---------------------------------------------------------------------------------------------
+
+
+def take(traverse: Traverse, most: int = 4) -> None:
+    """Read the beginning of a traverse and check what comes."""
+    traverse.frame_shape  # noqa: B018
+    for i, batch in enumerate(traverse.batches(8)):
+        if batch.ndim == 4 and not (batch.isfinite().all() and batch.min() >= 0 and batch.max() <= 1):
+            raise Wrong("frames out of [0, 1]")
+        if i == most:
+            break
+    if traverse.length:
+        for i in range(min(3, traverse.length)):
+            traverse.frame_name(i)
+
+
+def localize(model: DejaVu, queries: Traverse, random: Random) -> None:
+    """Find queries, and check that places exist."""
+    str(model.summary())
+    sequence = random.choice((None, None, SequenceMatcher(3), PlaceFilter()))
+    match = model.localize(queries, sequence=sequence)
+    if not bool(((match.index >= -1) & (match.index < model.map.places)).all()):
+        raise Wrong(f"places {match.index.tolist()} of {model.map.places}")
+    if bool(match.score.isnan().any()):
+        raise Wrong("scores are NaN")
+    for frame in model.map.frame_of(match.index).tolist():
+        model.frame_name(frame)
+
+
+def same_model(first: DejaVu, second: DejaVu) -> bool:
+    """Whether two maps hold the same tensors and settings."""
+    (tensors, header), (others, other) = first._file(), second._file()
+    if (
+        json.dumps(header, sort_keys=True) != json.dumps(other, sort_keys=True)
+        or tensors.keys() != others.keys()
+    ):
+        return False
+    return all(same_tensor(tensors[name], others[name]) for name in tensors)
+
+
+def same_tensor(one: Tensor, other: Tensor) -> bool:
+    return (
+        one.dtype == other.dtype
+        and one.shape == other.shape
+        and torch.equal(one.nan_to_num(), other.nan_to_num())
+    )
+
+
+# maps -----------------------------------------------------------------------------------------------------
+
+
+def pick_map(case: Case) -> Path:
+    return case.random.choice(sorted(case.made(maps).glob("*.safetensors")))
+
+
+def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and header of a valid map."""
+    tensors, header = mapfile.read_map(path)
+    return tensors, header
+
+
+def sealed(tensors: dict[str, Tensor], header: str) -> bytes:
+    """A map file of any tensors and the JSON of any header, with the checksums of just these."""
+    plain = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
+    try:
+        sums = mapfile.checksums(plain, json.loads(header))
+    except (ValueError, RecursionError):  # no JSON that could have a checksum
+        sums = {}
+    text = f'{{"version": {mapfile.FORMAT}, "checksums": {json.dumps(sums)}, "{mapfile.HEADER}": {header}}}'
+    return safetensors.torch.save(plain, {mapfile.NAME: text})
+
+
+def crafted(random: Random, path: Path) -> bytes:
+    """A map whose content is another, sealed again."""
+    tensors, header = contents(path)
+    act = random.random()
+    text = json_text(header)
+    if act < 0.6:
+        text = json_text(mutate_json(random, header))
+    elif act < 0.65 and header.get("names"):
+        names = json.loads(zlib.decompress(base64.b64decode(header["names"])))
+        packed = zlib.compress(json_text(mutate_json(random, names)).encode(errors="surrogatepass"))
+        text = json_text(header | {"names": base64.b64encode(packed).decode()})
+    elif act < 0.7:
+        text = mutate_text(random, text).decode(errors="replace")
+    if act > 0.67:
+        tensors = mutate_tensors(random, tensors)
+    return sealed(tensors, text)
+
+
+def damaged(random: Random, data: bytes) -> bytes:
+    """A map file with other bytes, or with another table of its tensors."""
+    if random.random() < 0.7:
+        return mutate_bytes(random, data)
+    size = int.from_bytes(data[:8], "little")
+    table = json.loads(data[8 : 8 + size])
+    text = json_text(mutate_json(random, table)).encode(errors="surrogatepass")
+    length = random.choice((len(text), len(text), len(text), 2**62, 0, len(text) + 1)).to_bytes(8, "little")
+    return length + text + data[8 + size :]
+
+
+@reader("damaged map", maps, share=2)
+def damaged_map(case: Case) -> None:
+    path, data = pick_map(case), Path("in/map.safetensors")
+    data.write_bytes(damaged(case.random, path.read_bytes()))
+    case.begin()
+    model = DejaVu.load(data)
+    if not same_model(model, DejaVu.load(path)):
+        raise Wrong("a damaged map loads as another")
+
+
+@reader("crafted map", maps, share=3)
+def crafted_map(case: Case) -> None:
+    path, data = pick_map(case), Path("in/map.safetensors")
+    data.write_bytes(crafted(case.random, path))
+    queries = open_source(path.with_suffix(".npy"))
+    case.begin()
+    model = DejaVu.load(data)
+    localize(model, queries, case.random)
+    model.save("out/again.safetensors")
+    if not same_model(model, DejaVu.load("out/again.safetensors")):
+        raise Wrong("a map that was saved loads as another")
+
+
+@reader("map of matches", maps, share=0.5)
+def map_of_matches(case: Case) -> None:
+    path, data = pick_map(case), Path("in/map.safetensors")
+    data.write_bytes(crafted(case.random, path))
+    Path("in/matches.csv").write_text(matches_text())
+    case.begin()
+    read_place_map(data)
+    evaluating.evaluate_file(Path("in/matches.csv"), "0", map=data)
+
+
+@reader("map commands", maps, share=1)
+def map_commands(case: Case) -> None:
+    path, data = pick_map(case), Path("in/map.safetensors")
+    make = crafted if case.random.random() < 0.8 else lambda random, path: damaged(random, path.read_bytes())
+    data.write_bytes(make(case.random, path))
+    shutil.copy(path.with_suffix(".npy"), "in/query.npy")
+    learn = ["learn", "in/query.npy", "--whitening", "in/map.safetensors", "--map", "out/m.safetensors"]
+    find = ["localize", "in/map.safetensors", "in/query.npy", "--out", "out/matches.csv"]
+    words = case.random.choice((["info", "in/map.safetensors"], learn, find, [*find, "--top", "2"]))
+    case.begin(command=True)
+    cli.run(words)
+
+
+@reader("codec", share=1)
+def codec(case: Case) -> None:
+    random = case.random
+    rows, columns = random.randint(1, 30), random.randint(1, 8)
+    levels = torch.tensor([[int(random.gauss(0, 9)) for _ in range(columns)] for _ in range(rows)]).to(
+        torch.int8
+    )
+    stream = encode(levels)
+    data, checksum, sizes = bytes(stream.bytes.tolist()), stream.checksum, [rows, columns]
+    act = random.random()
+    if act < 0.5:
+        data = mutate_bytes(random, data)
+    elif act < 0.9:
+        sizes[random.randrange(2)] = random.choice(
+            (0, -1, rows + 1, columns - 1, 1000, 10**6, 10**9, 2**31, 2**62)
+        )
+    else:
+        checksum = random.choice((0, -1, checksum ^ 1, 2**62))
+    case.begin()
+    found = decode(Stream(torch.tensor(list(data), dtype=torch.uint8), checksum), *sizes)
+    if sizes != [rows, columns] or not torch.equal(found, levels):
+        raise Wrong("a damaged stream decodes to other levels")
+
+
+# checkpoints ----------------------------------------------------------------------------------------------
+
+
+def mutated_checkpoint(random: Random, data: bytes) -> tuple[bytes, bool]:
+    """A checkpoint with other bytes or content, and whether a training could have written it so."""
+    act = random.random()
+    if act < 0.4:
+        return mutate_bytes(random, data), False
+    if act < 0.6:  # in the files of the archive, which is whole
+        written = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(written, "w") as new:
+            chosen = random.choice(old.namelist())
+            for name in old.namelist():
+                held = old.read(name)
+                if name == chosen:
+                    held = random.choice(PICKLES) if random.random() < 0.3 else mutate_bytes(random, held)
+                new.writestr(zipfile.ZipInfo(name), held)
+        return written.getvalue(), True
+    held = torch.load(io.BytesIO(data), weights_only=True)
+    plain = {name: value for name, value in held.items() if name not in ("state_dict", "optimizer_states")}
+    if random.random() < 0.5:
+        tensors = {name: value for name, value in held["state_dict"].items() if isinstance(value, Tensor)}
+        held["state_dict"] = {**held["state_dict"], **mutate_tensors(random, tensors)}
+        for name in set(tensors) - set(held["state_dict"]):
+            del held["state_dict"][name]
+    elif random.random() < 0.5:
+        name = random.choice(sorted(held))
+        held[name] = odd_value(random, held[name])
+        if random.random() < 0.2:
+            held["hyper_parameters"] = {"_class_path": f"{CANARY}.Module", "_instantiator": f"{CANARY}.run"}
+    else:
+        held |= mutate_json(random, plain)
+        state = {name: value for name, value in held["state_dict"].items() if not isinstance(value, Tensor)}
+        held["state_dict"].update(mutate_json(random, state))
+    written = io.BytesIO()
+    torch.save(held, written)
+    return written.getvalue(), True
+
+
+@reader("checkpoint", checkpoints, share=1)
+def checkpoint(case: Case) -> None:
+    path, data = case.made(checkpoints) / "last.ckpt", Path("in/last.ckpt")
+    mutated, crafted = mutated_checkpoint(case.random, path.read_bytes())
+    data.write_bytes(mutated)
+    case.begin()
+    task = new_task()
+    load_weights(task, data)
+    if crafted:
+        with torch.no_grad():
+            task.eval()(frames_of(pictures(3)))
+        return
+    whole = new_task()
+    load_weights(whole, path)
+    for name, value in whole.state_dict().items():
+        other = task.state_dict()[name]
+        if not (same_tensor(value, other) if isinstance(value, Tensor) else value == other):
+            raise Wrong(f"a damaged checkpoint loads as another: {name}")
+
+
+@reader("train commands", inputs, share=0.15)
+def train_commands(case: Case) -> None:
+    shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
+    random, data = case.random, Path("in/last.ckpt")
+    fit, resume = ["train", "fit", "--config", "in/train.yaml"], ["--ckpt_path", "in/last.ckpt"]
+    words = random.choice(
+        (fit, [*fit, *resume], *(["train", one, *fit[2:], *resume] for one in ("validate", "export")))
+    )
+    act = random.random()
+    if act < 0.4:
+        data.write_bytes(mutated_checkpoint(random, data.read_bytes())[0])
+    elif act < 0.7:
+        Path("in/train.yaml").write_bytes(mutated_yaml(random, TRAIN))
+    else:
+        words = ["train", *mutate_words(random, words[1:], TRAIN_OTHERS)]
+    case.begin(command=True)
+    cli.run(words)
+
+
+# configs and command lines ---------------------------------------------------------------------------------
+
+
+SETTINGS = ("0", "1", "2", "0.5", "null", "true", "l2", "mean", "[2,2]", "16", "1e-3", "linear", "none")
+
+
+def mutated_yaml(random: Random, text: str) -> bytes:
+    act = random.random()
+    if act < 0.03:
+        return (BOMB + text).encode()
+    if act < 0.06:
+        return (text + "\na: " * 2 + "[" * 20_000).encode()
+    if act < 0.4:
+        lines = text.splitlines()
+        at = random.randrange(len(lines))
+        name = lines[at].partition(":")[0]
+        lines[at] = f"{name}: {random.choice(random.choice((TAGS, NUMBERS, SETTINGS)))}"
+        return "\n".join(lines).encode()
+    return mutate_text(random, text)
+
+
+@reader("config", inputs, share=1.5)
+def config(case: Case) -> None:
+    random = case.random
+    text = (FOLDER / f"{random.choice(('default', 'local_maxima', 'paper'))}.yaml").read_text()
+    text = "\n".join(
+        line.partition("#")[0].rstrip() for line in text.splitlines() if line.partition("#")[0].strip()
+    )
+    Path("in/config.yaml").write_bytes(mutated_yaml(random, text))
+    learn = ["in/frames.npy", "--map", "out/m.safetensors"]
+    compare = ["in/frames.npy", "in/query.npy", "--out", "out/report"]
+    name, words = random.choice((("learn", learn), ("compare", compare)))
+    chosen = "in/config.yaml"
+    if random.random() < 0.1:
+        chosen = mutate_text(random, "local_maxima").decode(errors="surrogateescape").replace("\0", "")
+    case.begin()
+    parse(name, getattr(commands, f"run_{name}"), with_configs([*words, "--config", chosen]))
+
+
+LINES = [
+    line.split()
+    for line in """
+learn in/frames.npy --map out/m.safetensors
+learn in/features.npy --map out/m.safetensors --threshold 0.5 --batch_size 16
+learn in/photos?width=12 --map out/m.safetensors --features.cell 4 --whitening none
+learn in/frames.npy --map out/m.safetensors --config local_maxima --mapper.periods.window 16
+learn in/frames.npy --map out/m.safetensors --mapper.chunk=16 --whitening.numbers=8 --mapper.resolution 2
+learn in/frames.npy --map out/m.safetensors --second in/photos?stop=30 --second_truth 0 --seed 3
+learn in/frames.npy --map out/m.safetensors --whitening in/spectral.safetensors
+learn in/clip.mp4?width=24 --map out/m.safetensors --preprocess.contrast patch --preprocess.channel R-B
+learn strip:in/strip.png?width=16 --map out/m.safetensors --features PatchPixels
+localize in/spectral.safetensors in/query.npy --out out/matches.csv
+localize in/templates.safetensors in/query.npy --out out/m.csv --top 3 --threshold .4
+localize in/named.safetensors in/query.npy --out out/m.csv --sequence=3 --speeds [.8,1]
+localize in/learned.safetensors in/query.npy --out m.csv --filter --moves [.2,.6,.2]
+localize in/plain.safetensors in/features.npy --out out/m.csv --as_is
+info in/chunked.safetensors
+info in/resampled.safetensors
+evaluate in/matches.csv --truth in/truth.csv --out out/scores --interpolate
+evaluate in/matches.csv --truth in/truth.npz --out out/s --map in/spectral.safetensors
+evaluate in/matches.csv --truth 2 --tolerance 3 --out out/s --reference in/frames.npy
+demo --out out/demo --seed 2
+reproduce aerial --out out/paper --tolerance 4
+bench storage in/frames.npy in/query.npy --out out/bench --places 100
+bench matcher --out out/bench
+--help
+--version
+learn --help
+learn in/frames.npy --map out/m.safetensors --print_config
+""".strip().splitlines()
+]
+SLOW_LINES = [
+    line.split()
+    for line in """
+compare in/frames.npy in/query.npy --out out/report --truth 0 --tolerance 2
+compare in/frames.npy in/query.npy --out out/r --map in/spectral.safetensors --top 2
+compare in/features.npy in/features.npy --out out/r --config local_maxima --leave_out 3
+""".strip().splitlines()
+]
+
+
+def groups(line: Sequence[str]) -> list[list[str]]:
+    """The words of a line, each option with its value."""
+    found: list[list[str]] = []
+    for word in line:
+        after_option = bool(found) and len(found[-1]) == 1 and found[-1][0].startswith("--")
+        if after_option and "=" not in found[-1][0] and not word.startswith("--"):
+            found[-1].append(word)
+        else:
+            found.append([word])
+    return found
+
+
+ODD_WORDS = """
+in/empty in/a_file in out missing utm:25 in/last.ckpt in/fifo.csv in/fifo.npy in/loop.npy null [] {}
+--velocity --velocity.step 2 --velocity=GroundOdometry --corners [[0,0],[1,0],[1,1],[0,1]] --mapper null
+--mapper=TemplateMapper --mapper.help --mapper.route_bytes_per_place 1e-9 --features=HOG --features.cell 1000
+--features.help Whitening --whitening.seed -1 --whitening.views=2 --whitening in/fifo.safetensors --config
+--preprocess.grid=[2,2] --threshold=nan --query in/query.npy --config paper --config in/config.yaml
+--truth utm --config in/fifo.yaml --tolerance 9223372036854775808
+--seed -1 --seed 1180591620717411303424 --batch_size 0
+--top 999 --sequence 999 --sequence=3 --filter --speeds [nan] --moves [0,0] --out in/a_file --out out/no/m.csv
+--map in/spectral.safetensors --map in/fifo.safetensors --truth in/fifo.npz --out in/empty
+"""
+OTHERS = [
+    *(group for line in (*LINES, *SLOW_LINES, ODD_WORDS.split()) for group in groups(line)),
+    *(["x" * 300 + ".safetensors"], ["\udcff.npy"], [""], ["--out", "\udcff.csv"], ["--out", "a\nb.csv"]),
+]
+TRAIN_WORDS = """
+fit validate test export in/a_file -c null --help
+--data.source in/query.npy --data.batch_size=0 --data.validation=in/query.npy --data.tolerance -1
+--trainer.max_steps=1 --trainer.max_epochs 1 --trainer.precision=16 --trainer.max_steps=-1 --optimizer x
+--trainer.default_root_dir=in/a_file --trainer.accelerator=gpu --seed_everything -1
+--ckpt_path in/spectral.safetensors --config in/config.yaml --model.backbone.dimension=4
+--model.learning_rate nan --trainer null --data 3 --model []
+"""
+TRAIN_OTHERS = groups(TRAIN_WORDS.split())
+
+
+def copy_inputs(case: Case) -> None:
+    """All that command lines name, and what is no regular file."""
+    shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
+    for suffix in ("npy", "mp4", "csv", "safetensors", "png", "yaml", "npz"):
+        os.mkfifo(f"in/fifo.{suffix}")
+    Path("in/loop.npy").symlink_to("loop.npy")
+
+
+def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
+    """A mutated command line; what takes minutes is not begun."""
+    copy_inputs(case)
+    line = case.random.choice(lines)
+    own = [group for other in lines if other[0] == line[0] for group in groups(other[1:])] or OTHERS
+    words = [line[0], *mutate_words(case.random, line[1:], case.random.choice((own, OTHERS)))]
+    if case.random.random() < 0.05:
+        words = mutate_words(case.random, line, OTHERS)
+
+    def too_long(*_: object, **__: object) -> None:
+        raise InputError("this would take too long here")
+
+    bench.run_bench = frontier.run_storage = reproduce.reproduce = too_long  # type: ignore[assignment]
+    if words[:1] == ["demo"]:
+        compare.compare = too_long  # type: ignore[assignment]
+    case.begin(command=True)
+    cli.run(words)
+
+
+@reader("commands", inputs, share=1)
+def command_lines(case: Case) -> None:
+    run_words(case, LINES)
+
+
+@reader("slow commands", inputs, share=0.15)
+def slow_command_lines(case: Case) -> None:
+    run_words(case, SLOW_LINES)
+
+
+# sources of frames -----------------------------------------------------------------------------------------
+
+
+@reader("npy", maps, share=2)
+def npy(case: Case) -> None:
+    random, path = case.random, Path("in/array.npy")
+    noise = np.random.default_rng(random.randrange(2**32))
+    array = random.choice(
+        (pictures(9, 8), noise.normal(size=(9, 5)).astype(np.float32), noise.random((4, 1, 8, 8)))
+    )
+    written = io.BytesIO()
+    act = random.random()
+    if act < 0.2:
+        values = (np.nan, np.inf, -1.0, 1e30, 2.0, 1e-40)
+        array = array.astype(np.float64)
+        array.flat[random.randrange(array.size)] = random.choice(values)
+        with np.errstate(over="ignore"):
+            array = array.astype(random.choice((np.float16, np.float32, np.float64)))
+        np.save(written, array)
+    elif act < 0.4:
+        kinds = ("<i8", ">f4", "<c8", "O", "S3", "U4", "?", "<M8[s]", "<f2", "V8", "f4,i4", "<u2")
+        try:
+            array = array.astype(random.choice(kinds))
+        except (TypeError, ValueError):
+            array = np.zeros((3, 4), random.choice(kinds))
+        np.save(written, array, allow_pickle=True)
+    else:
+        np.save(written, array)
+    data = written.getvalue()
+    if act > 0.7:
+        data = mutate_bytes(random, data)
+    elif act > 0.4:  # another header, of the right length
+        text = mutate_text(random, data[10 : data.index(b"\n")].decode().rstrip()) + b"\n"
+        if random.random() < 0.5:
+            shape = ", ".join(str(random.choice((*NUMBERS[:16], 3))) for _ in range(random.randint(0, 5)))
+            text = (
+                f"{{'descr': '{random.choice(('|u1', '<f4', 'O', '<f8'))}', 'fortran_order': False, ".encode()
+            )
+            text += f"'shape': ({shape}), }}\n".encode()
+        version = random.choice((b"\1\0", b"\1\0", b"\2\0", b"\3\0", b"\x09\0"))
+        length = struct.pack("<H" if version == b"\1\0" else "<I", len(text) % 65536)
+        data = b"\x93NUMPY" + version + length + text + data[data.index(b"\n") + 1 :]
+    path.write_bytes(data)
+    case.begin()
+    traverse = open_source(path)
+    take(traverse)
+    if random.random() < 0.1:
+        DejaVu(HOG(cell=2), mapper=TemplateMapper(ImposedPeriods([3]))).learn(traverse)
+
+
+def png_of(width: int, height: int, kind: int, depth: int, data: bytes) -> bytes:
+    """A PNG that claims a size."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(data))
+        + chunk(b"IEND", b"")
+    )
+
+
+def mutated_image(random: Random, folder: Path) -> tuple[str, bytes]:
+    """An image's suffix and its bytes."""
+    path = random.choice(sorted(folder.iterdir()))
+    act = random.random()
+    if act < 0.1:
+        sizes = (0, 1, 24, 5000, 9000, 13_000, 20_000, 2**31 - 1)
+        size = random.choice(sizes), random.choice(sizes)
+        return ".png", png_of(*size, random.choice((0, 2, 3, 4, 6)), random.choice((1, 8, 16)), bytes(10**6))
+    if act < 0.15:
+        values = np.random.default_rng(0).random((24, 24)).astype(np.float32)
+        values[3, 4] = random.choice((np.nan, np.inf, -1.0, 2.0, 255.0, 1e30))
+        written = io.BytesIO()
+        Image.fromarray(values).save(written, "tiff")
+        return ".tif", written.getvalue()
+    if act < 0.2:
+        head = (
+            f"P{random.choice('123456789')}\n{random.choice(NUMBERS)} {random.choice((24, 9000, -1))}\n255\n"
+        )
+        return random.choice((".pgm", ".ppm")), head.encode() + bytes(1000)
+    suffix = random.choice((path.suffix, path.suffix, path.suffix, ".png", ".tif", ".webp", ".pgm"))
+    return suffix, mutate_bytes(random, path.read_bytes())
+
+
+@reader("image", images, share=1.5)
+def image_folder(case: Case) -> None:
+    random, folder = case.random, Path("in/photos")
+    folder.mkdir()
+    for i in range(2):
+        shutil.copy(case.made(images) / "colour.png", folder / f"{i}.png")
+    for _ in range(random.choice((1, 1, 3))):
+        suffix, data = mutated_image(random, case.made(images))
+        name = random.choice(
+            ("5", "5", "5", "a\nb", "é", "\udcff", "\x1b[31m", "٣", "1" * 200, "9" * 249, "-", " ")
+        )
+        (folder / f"{name}{suffix}").write_bytes(data)
+    odd = random.random()
+    if odd < 0.1:
+        (folder / "folder.png").mkdir()
+    elif odd < 0.2:
+        (folder / "7.png").symlink_to("missing.png")
+    options = random.choice(("", "", "", "?width=8", "?height=5&width=9"))
+    case.begin()
+    take(open_source(f"{folder}{options}"))
+
+
+@reader("strip", images, share=0.5)
+def strip(case: Case) -> None:
+    suffix, data = mutated_image(case.random, case.made(images))
+    path = Path(f"in/strip{suffix}")
+    path.write_bytes(data)
+    case.begin()
+    take(open_source(f"strip:{path}?width=8" + case.random.choice(("", "&rows=1:8", "&halve=1", "&grey=1"))))
+
+
+@reader("video", videos, share=1)
+def video(case: Case) -> None:
+    random = case.random
+    path = random.choice(sorted(case.made(videos).iterdir()))
+    suffix = random.choice((path.suffix, path.suffix, path.suffix, ".mp4", ".avi", ".webm", ".wmv"))
+    clip = Path(f"in/clip{suffix}")
+    clip.write_bytes(mutate_bytes(random, path.read_bytes()))
+    case.begin()
+    take(open_source(f"{clip}{random.choice(('', '', '?width=8', '?start=3&stop=9&step=2'))}"))
+
+
+PLAUSIBLE = ("0", "1", "2", "3", "5", "8", "20", "25", "1:2", "3:9", "true", "-1", "100")
+SOURCES = """
+in/frames.npy?start=1&stop=9&step=2 in/features.npy in/photos?width=8&height=6 in/photos?start=2
+in/clip.mp4?width=8&stop=5 strip:in/strip.png?width=8&rows=2:12&halve=1&grey=1 in/a_file in/empty in/strip.png
+sim:aerial?seed=1&traverse=1&frames=40 sim:outdoor?frames=20&seed=2 sim:underground?frames=20&step=2
+sim:railway?frames=20&traverse=1 sim:aerial?frames=30&start=3&stop=20
+in/fifo.npy in/fifo.mp4 in/loop.npy strip:in/fifo.png?width=8
+"""
+
+
+@reader("source", inputs, share=2)
+def source(case: Case) -> None:
+    random = case.random
+    copy_inputs(case)
+    text = random.choice(SOURCES.split())
+    if random.random() < 0.6 and "?" in text:
+        address, _, query = text.partition("?")
+        options = query.split("&")
+        at = random.randrange(len(options))
+        value = random.choice(random.choice((PLAUSIBLE, NUMBERS, TEXTS)))
+        options[at] = f"{options[at].partition('=')[0]}={value}"
+        text = f"{address}?{'&'.join(options)}"
+    else:
+        text = mutate_text(random, text).decode(errors="surrogateescape")
+    case.begin()
+    take(open_source(text), 1)
+
+
+# truths and matches ----------------------------------------------------------------------------------------
+
+
+@reader("truth table", share=1.5)
+def truth_table(case: Case) -> None:
+    random = case.random
+    header = random.choice(("query,place\n", "query,place,place\n", "", "query;place\n"))
+    rows = "".join(f"{i},{(i + random.randint(-1, 1)) % 30}\n" for i in range(12))
+    Path("in/truth.csv").write_bytes(mutate_text(random, header + rows))
+    judge(case, "in/truth.csv")
+
+
+@reader("truth matrices", share=1)
+def truth_matrices(case: Case) -> None:
+    random, path = case.random, Path("in/truth.npz")
+    kinds = (bool, np.uint8, np.float32, "O", "U3", "<c8", "V4", "<M8[s]")
+    matrix = np.eye(30, 12)
+    arrays: dict[str, Any] = {"GThard": matrix.astype(bool), "GTsoft": matrix[::-1].astype(bool)}
+    act = random.random()
+    if act < 0.3:
+        name = random.choice(sorted(arrays))
+        kind = random.choice(kinds)
+        arrays[name] = np.zeros((30, 12), kind) if kind in kinds[3:] else matrix.astype(kind)
+        arrays[name] = random.choice((arrays[name], arrays[name].T, arrays[name][:5], arrays[name][None]))
+    elif act < 0.4:
+        arrays["GThard"] = np.where(matrix > 0, random.choice((np.nan, np.inf, -1, 0)), 0)
+    np.savez_compressed(path, **arrays)
+    data = path.read_bytes()
+    if act > 0.7:
+        data = mutate_bytes(random, data)
+    elif act > 0.4:  # in the files of the archive, which is whole
+        written = io.BytesIO()
+        with (
+            zipfile.ZipFile(io.BytesIO(data)) as old,
+            zipfile.ZipFile(written, "w") as new,
+        ):
+            for name in old.namelist():
+                held = old.read(name)
+                if random.random() < 0.5:
+                    held = mutate_bytes(random, held)
+                elif random.random() < 0.5:
+                    shape = f"({random.choice((30, 10**5, 10**6, 10**12))}, {random.choice((12, 10**6, -1))})"
+                    held = held.replace(
+                        b"(30, 12), }" + b" " * len(shape), shape.encode() + b", }" + b" " * 8
+                    )
+                new.writestr(zipfile.ZipInfo(name), held, zipfile.ZIP_DEFLATED)
+        data = written.getvalue()
+    path.write_bytes(data)
+    judge(case, str(path))
+
+
+@reader("truth text", share=1)
+def truth_text(case: Case) -> None:
+    random = case.random
+    text = mutate_text(random, random.choice(("0", "-1", "12", "utm", "utm:25", "in/truth.csv"))).decode(
+        errors="surrogateescape"
+    )
+    names = [f"@{i}@{2 * i}@.png" for i in range(12)]
+    if random.random() < 0.6:
+        at = random.randrange(12)
+        names[at] = mutate_text(random, names[at]).decode(errors="replace")
+        text = random.choice(("utm", "utm:25", "utm:1e300", "utm:0"))
+    traverse = ArrayTraverse(pictures(12))
+    traverse.frame_name = names.__getitem__  # type: ignore[method-assign]
+    judge(case, text, traverse)
+
+
+def judge(case: Case, truth: str, traverse: Traverse | None = None) -> None:
+    """Twelve matches by a truth."""
+    random = case.random
+    traverses = SimpleNamespace(length=30, place=None) if traverse is None else traverse
+    resampled = random.random() < 0.2
+    interpolate = random.random() < 0.3
+    case.begin()
+    known = find_ground_truth(
+        truth,
+        *((None, None) if traverses is not traverse else (traverse, traverse)),
+        30,
+        12,
+        interpolate,
+        resampled,
+    )
+    if known is None:
+        raise Wrong("a truth that is given is none")
+    if len(known.positives) != 12 or int(known.positives.max()) >= 30 or int(known.positives.min()) < -1:
+        raise Wrong(f"right places {known.positives.tolist()}")
+    found = Match(torch.arange(12), torch.arange(12) / 12, torch.ones(12, dtype=torch.bool))
+    scores = evaluate(found, known, random.choice((0, 2, 100, 2**31, 2**62)))
+    if not all(math.isfinite(value) for value in scores if isinstance(value, float)):
+        raise Wrong(f"scores {scores}")
+
+
+@reader("matches", share=1.5)
+def matches(case: Case) -> None:
+    random = case.random
+    text = matches_text()
+    if random.random() < 0.3:
+        rows = [f"{i // 2},{i},{i / 10},1,{1 + i % 2}\n" for i in range(12)]
+        text = "query,place,score,accepted,rank\n" + "".join(rows)
+    Path("in/matches.csv").write_bytes(mutate_text(random, text))
+    case.begin()
+    read_matches(Path("in/matches.csv"))
+    if random.random() < 0.3:  # its pictures take long
+        evaluating.evaluate_file(Path("in/matches.csv"), "0", random.choice((0, 5, 2**62)))

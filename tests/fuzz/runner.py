@@ -1,0 +1,345 @@
+"""Runs readers on mutated inputs, and tells what went wrong: `python -m tests.fuzz --cases 20000`.
+
+Every case is known by reader, seed and number, and runs in a folder of its own in a process forked from this
+one, with 4 GiB more address space than it begins with and 20 s of CPU. A process that dies is a finding
+of the case it died of, and another goes on behind it.
+
+What counts as a finding:
+
+- any exception but InputError of the library, and SystemExit 0 or 2 of the commands;
+- a message, a warning or an error of a command, that is more than one line;
+- more time or memory than that; the end of the process;
+- files that a refused input leaves, temporary files that anything leaves, inputs that are changed;
+- an import of the canary, a module that only files name;
+- what a reader itself finds: damage that changes what is read, values out of range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import logging
+import os
+import resource
+import select
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from random import Random
+from typing import Any, NamedTuple
+
+import torch
+
+import dejavu_torch
+from dejavu_torch.types import InputError
+
+from .mutations import CANARY
+from .readers import READERS, Case, Reader, Wrong
+
+CPU, WALL = 20, 90  # seconds of a case
+SILENT = 300  # seconds after which a process that says nothing is ended
+MEMORY = 4 * 2**30  # bytes of a case
+GROWN = 2**29  # bytes by which a process may have grown when it goes on to another case
+PACKAGE = Path(dejavu_torch.__file__).parent
+CANARY_CODE = "class Module: pass\ndef run(*args, **more): return 0\n"
+
+
+class Finding(NamedTuple):
+    """kind: the exception, or what else is wrong. where: the innermost frame of the package."""
+
+    kind: str
+    where: str
+    message: str
+
+
+class Result(NamedTuple):
+    """outcome: accepted or refused, or broken where there are findings."""
+
+    case: int
+    outcome: str
+    findings: list[Finding]
+    seconds: float
+
+
+class Hang(BaseException):
+    """A case that takes too long; no handler of `Exception` may stop it."""
+
+
+# in the forked process ----------------------------------------------------------------------------------
+
+
+def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
+    """One case, whatever it does."""
+    shutil.rmtree(root / "work", ignore_errors=True)
+    folder = root / "work" / "a" / "b" / "case"  # so deep that ../.. is still inside
+    temporary = root / "tmp"
+    shutil.rmtree(temporary, ignore_errors=True)
+    for made in (folder / "in", folder / "out", temporary):
+        made.mkdir(parents=True)
+    os.chdir(folder)
+    random = Random(f"{seed}/{reader.name}/{number}")
+    torch.manual_seed(number)
+    case = Case(random, folder, root / "made")
+    began, outcome, findings = time.process_time(), "accepted", []
+    for output in (1, 2):
+        os.ftruncate(output, 0)
+    before: dict[str, Any] = {}
+
+    def started() -> None:
+        before.update(_files(root / "work"))
+
+    case.started = started
+    signal.setitimer(signal.ITIMER_PROF, CPU)
+    signal.setitimer(signal.ITIMER_REAL, WALL)
+    try:
+        with warnings.catch_warnings():  # each is told once a case, not once a process
+            reader.run(case)
+    except InputError as error:
+        outcome = "refused"
+        if len(str(error).splitlines()) != 1:
+            findings.append(_finding(error, "message of several lines"))
+    except SystemExit as error:
+        outcome = {0: "accepted", None: "accepted", 2: "refused"}.get(error.code, "broken")  # type: ignore[arg-type]
+        if outcome == "broken":
+            findings.append(_finding(error, f"exit status {error.code}"))
+    except Wrong as error:
+        findings.append(Finding("wrong", str(error).partition(":")[0], str(error)[:300]))
+    except BaseException as error:
+        findings.append(_finding(error, type(error).__name__))
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    findings += _told(root, case, outcome) if not findings else []
+    findings += _left(root, case, outcome, before, temporary) if before else []
+    if CANARY in sys.modules:
+        del sys.modules[CANARY]
+        findings.append(Finding("code executed", "", "the canary was imported"))
+    return Result(number, "broken" if findings else outcome, findings, time.process_time() - began)
+
+
+def _finding(error: BaseException, kind: str) -> Finding:
+    frames = [
+        f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).is_relative_to(PACKAGE)
+    ]
+    last = frames[-1] if frames else None
+    where = f"{Path(last.filename).relative_to(PACKAGE)}:{last.lineno} {last.name}" if last else ""
+    return Finding(kind, where, str(error)[:300])
+
+
+def _told(root: Path, case: Case, outcome: str) -> list[Finding]:
+    """What is wrong with what a case wrote to stderr: each line is one message of ours."""
+    text = (root / "stderr").read_text(errors="replace")
+    lines = text.split("\n")[:-1]
+    if foreign := [line for line in lines if not line.startswith("dejavu: ")]:
+        return [Finding("stderr", foreign[0][:100], text[:600])]
+    if case.command and outcome == "refused" and not lines:
+        return [Finding("stderr", "", "exit status 2 without a word")]
+    return []
+
+
+def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporary: Path) -> list[Finding]:
+    """What is wrong with the files after a case."""
+    if any(temporary.iterdir()):
+        gc.collect()  # a tensor that is kept in a temporary file
+    left = [path.name for path in temporary.iterdir()]
+    findings = [Finding("temporary file left", "", str(left))] if left else []
+    after = _files(root / "work")
+    new = sorted(name for name in after if name not in before)
+    changed = [name for name in before if after.get(name) != before[name]]
+    if outcome == "accepted":
+        new = [name for name in new if any(part[0] == "." or ".part" in part for part in Path(name).parts)]
+        changed = [] if case.command else changed
+    if new:
+        findings.append(Finding(f"file left where {outcome}", "", str(new)[:300]))
+    if changed:
+        findings.append(Finding("input changed", "", str(changed)[:300]))
+    return findings
+
+
+def _files(folder: Path) -> dict[str, Any]:
+    """Every file and folder, and the size and time of files."""
+    found: dict[str, Any] = {}
+    for inside, folders, files in os.walk(folder):
+        found |= {os.path.join(inside, name).removeprefix(str(folder)): None for name in folders}
+        for name in files:
+            path = os.path.join(inside, name)
+            status = os.lstat(path)
+            found[path.removeprefix(str(folder)).lstrip("/")] = (status.st_size, status.st_mtime_ns)
+    return {name.lstrip("/"): value for name, value in found.items()}
+
+
+def _address_space() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
+def _prepare(root: Path) -> None:
+    """Outputs, timers, warnings and paths of a forked process."""
+
+    def hang(number: int, _: Any) -> None:
+        raise Hang(f"over {CPU} s of CPU" if number == signal.SIGPROF else f"over {WALL} s")
+
+    signal.signal(signal.SIGPROF, hang)
+    signal.signal(signal.SIGALRM, hang)
+    for output, name in ((1, "stdout"), (2, "stderr")):
+        file = os.open(root / name, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_TRUNC)
+        os.dup2(file, output)
+    sys.stdout = open(1, "w", encoding="utf-8", errors="surrogateescape", closefd=False)  # noqa: SIM115
+    sys.stderr = open(2, "w", 1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
+    logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING, stream=sys.stderr, force=True)
+    os.environ["TMPDIR"] = tempfile.tempdir = str(root / "tmp")
+    os.environ["MPLCONFIGDIR"] = str(root / "matplotlib")
+    (root / "canary").mkdir(exist_ok=True)
+    (root / "canary" / f"{CANARY}.py").write_text(CANARY_CODE)
+    sys.path.append(str(root / "canary"))
+    torch.set_num_threads(1)
+
+
+def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: int) -> None:
+    """Run cases, telling of each when it begins and when it has ended."""
+
+    def tell(message: Any) -> None:
+        data = json.dumps(message).encode() + b"\n"
+        while data:
+            data = data[os.write(pipe, data) :]
+
+    _prepare(root)
+    for maker in reader.makers:
+        folder = root / "made" / maker.__name__
+        if not folder.exists():
+            (root / "tmp").mkdir(exist_ok=True)
+            shutil.rmtree(root / "making", ignore_errors=True)
+            (root / "making").mkdir()
+            folder.parent.mkdir(exist_ok=True)
+            torch.manual_seed(0)
+            maker(root / "making")
+            (root / "making").rename(folder)
+    sys.stderr.flush()
+    base = _address_space()
+    resource.setrlimit(resource.RLIMIT_AS, (base + MEMORY, resource.RLIM_INFINITY))
+    for number in numbers:
+        tell(number)
+        result = _run_case(reader, seed, number, root)
+        tell(result)
+        if any(f.kind in ("Hang", "MemoryError") for f in result.findings) or _address_space() > base + GROWN:
+            return  # the next case in a process that has nothing of this one
+
+
+# in this process ----------------------------------------------------------------------------------------
+
+
+def run(reader: Reader, seed: int, numbers: Iterable[int], root: Path) -> Iterator[Result]:
+    """The results of the cases of a reader, in order."""
+    waiting = list(numbers)
+    while waiting:
+        reading, writing = os.pipe()
+        child = os.fork()
+        if not child:
+            status = 1
+            try:
+                os.close(reading)
+                _work(reader, seed, waiting, root, writing)
+                status = 0
+            except BaseException:
+                traceback.print_exc()
+                sys.stderr.flush()
+            finally:
+                os._exit(status)
+        os.close(writing)
+        begun, hung = None, False
+        with open(reading, "rb", buffering=0) as pipe:
+            for line in _lines(pipe):
+                if line is None:
+                    hung = True
+                    os.kill(child, signal.SIGKILL)
+                    break
+                message = json.loads(line)
+                if isinstance(message, int):
+                    begun = message
+                    continue
+                case, outcome, findings, seconds = message
+                waiting.remove(case)
+                begun = None
+                yield Result(case, outcome, [Finding(*one) for one in findings], seconds)
+        status = os.waitpid(child, 0)[1]
+        if begun is not None:
+            waiting.remove(begun)
+            how = "hang" if hung else "killed" if os.WIFSIGNALED(status) else "ended"
+            number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
+            told = (root / "stderr").read_text(errors="replace")[-600:]
+            yield Result(begun, "broken", [Finding(f"process {how}", f"{number}", told)], 0.0)
+        elif status:
+            raise RuntimeError(f"{reader.name} made no input: {(root / 'stderr').read_text()[-3000:]}")
+
+
+def _lines(pipe: Any) -> Iterator[bytes | None]:
+    """Lines as they come; None where none comes for too long."""
+    rest = b""
+    while True:
+        if not select.select([pipe], [], [], SILENT)[0]:
+            yield None
+            return
+        data = pipe.read(65536)
+        if not data:
+            return
+        *whole, rest = (rest + data).split(b"\n")
+        yield from whole
+
+
+def shares(cases: int, names: Iterable[str]) -> dict[str, int]:
+    """How many of the cases each reader gets, at least one."""
+    chosen = {name: READERS[name].share for name in names}
+    return {name: max(1, round(cases * share / sum(chosen.values()))) for name, share in chosen.items()}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; 1 where there are findings."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.partition("\n")[0])
+    parser.add_argument("--cases", type=int, default=300, help="of all readers together")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--reader", action="append", choices=[*READERS], help="only this; may be given again")
+    parser.add_argument("--case", type=int, help="only the case of this number, and all that it says")
+    parser.add_argument("--keep", help="a folder to leave the case's files in")
+    chosen = parser.parse_args(arguments)
+    print("reader               cases  accepted  refused  findings  seconds", flush=True)
+    distinct: dict[tuple[str, str], list[tuple[str, int, Finding]]] = defaultdict(list)
+    total = [0] * 4
+    root = Path(tempfile.mkdtemp(prefix="fuzz-")) if chosen.keep is None else Path(chosen.keep).resolve()
+    root.mkdir(exist_ok=True)
+    try:
+        for name, count in shares(chosen.cases, chosen.reader or READERS).items():
+            numbers = range(count) if chosen.case is None else [chosen.case]
+            outcomes, began = defaultdict(int), time.perf_counter()
+            for result in run(READERS[name], chosen.seed, numbers, root):
+                outcomes[result.outcome] += 1
+                for finding in result.findings:
+                    distinct[finding.kind, finding.where].append((name, result.case, finding))
+            counts = [len(numbers), *(outcomes[one] for one in ("accepted", "refused", "broken"))]
+            total = [a + b for a, b in zip(total, counts, strict=True)]
+            print(_row(name, counts), f"{time.perf_counter() - began:8.1f}", flush=True)
+    finally:
+        if chosen.keep is None:
+            shutil.rmtree(root, ignore_errors=True)
+    print(_row("all", total))
+    for (kind, where), found in sorted(distinct.items(), key=lambda item: -len(item[1])):
+        name, case, finding = found[0]
+        print(f"\n{len(found)} x {kind} {where}\n    {finding.message!r}")
+        print(f"    python -m tests.fuzz --seed {chosen.seed} --reader {name!r} --case {case}")
+        others = sorted({one for one, _, _ in found} - {name})
+        if others:
+            print(f"    also of {', '.join(others)}")
+    return 1 if distinct else 0
+
+
+def _row(name: str, counts: list[int]) -> str:
+    cases, accepted, refused, broken = counts
+    return f"{name:<20} {cases:5}  {accepted:8}  {refused:7}  {broken:8}"

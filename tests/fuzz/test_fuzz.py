@@ -1,0 +1,62 @@
+"""300 cases of the fuzz, and that it finds what there is to find."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+MISTAKES = """
+import os, signal, sys
+from pathlib import Path
+from dejavu_torch.types import InputError
+from tests.fuzz import readers, runner
+
+def crash(case): os.kill(os.getpid(), signal.SIGSEGV)
+def end(case): os._exit(0)
+def spin(case):
+    while True: pass
+def take(case): bytearray(8 * 2**30)
+def raise_key(case): raise KeyError("seen")
+def status(case): raise SystemExit(3)
+def warn(case): print("Traceback of another library", file=sys.stderr)
+def half(case): case.begin(); Path("out/.m.part").touch()
+def refuse(case): case.begin(); Path("out/m").touch(); raise InputError("refused")
+def change(case): Path("in/m").touch(); case.begin(); Path("in/m").write_text("x")
+def run_code(case): import fuzz_canary
+def wrong(case): raise readers.Wrong("damage")
+def well(case): case.begin(); Path("out/m").touch()
+
+runner.CPU = 1
+readers.READERS.clear()
+for name in sys.argv[1:]:
+    readers.reader(name)(globals()[name])
+sys.exit(runner.main(["--cases", str(2 * len(readers.READERS))]))
+"""
+
+
+def run(*words: str) -> subprocess.CompletedProcess[str]:
+    """A process of its own: one that has computed in threads cannot be forked."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *words]
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_no_case_goes_wrong() -> None:
+    done = run("-m", "tests.fuzz", "--cases", "300")
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
+
+
+def test_every_mistake_is_found() -> None:
+    errors = ["crash", "end", "spin", "take", "raise_key", "status", "warn"]
+    wrong = [*errors, "half", "refuse", "change", "run_code", "wrong"]
+    done = run("-c", MISTAKES, *wrong, "well")
+    assert done.returncode == 1, done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    broken = {row[0]: row[1:5] for row in rows if len(row) == 6 and row[1] == "2"}
+    assert broken == {name: ["2", "0", "0", "2"] for name in wrong} | {"well": ["2", "2", "0", "0"]}
+    for kind in ("process killed 11", "Hang", "MemoryError", "KeyError", "exit status 3", "stderr"):
+        assert f"2 x {kind}" in done.stdout
+    assert "python -m tests.fuzz --seed 0 --reader 'raise_key' --case 0" in done.stdout

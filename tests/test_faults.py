@@ -1,0 +1,386 @@
+"""What processes leave where they are interrupted, killed or out of room: old files or whole ones."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import fails, frames, run, write_images
+
+from dejavu_torch import DejaVu
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits, mounts and signals of Linux")
+DEJAVU = (sys.executable, "-m", "dejavu_torch.cli")
+INTERRUPTED = b"dejavu: interrupted\n"
+REPORT = {"index.html", "report.json", "matches.csv", "map.safetensors", "pr.png", "coverage.png"}
+REPORT_OF_ARRAYS = ("compare", "a.npy", "b.npy", "--truth", "0", "--out", "new/report")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    np.save(folder / "a.npy", frames(64))
+    np.save(folder / "b.npy", frames(64, seed=1))
+    run("learn", folder / "a.npy", "--map", folder / "map.safetensors")
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    """A folder of its own with arrays and their map."""
+    for file in made.iterdir():
+        shutil.copy(file, tmp_path)
+    return tmp_path
+
+
+def start(folder: Path, *words: str | Path, **settings: object) -> subprocess.Popen[bytes]:
+    settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **settings}
+    return subprocess.Popen([*DEJAVU, *map(str, words)], cwd=folder, **settings)  # type: ignore[call-overload,no-any-return]
+
+
+def wait_for(process: subprocess.Popen[bytes], there: Callable[[], object]) -> None:
+    late = time.monotonic() + 60
+    while not there():
+        assert process.poll() is None, process.communicate()
+        if time.monotonic() > late:
+            process.kill()
+            pytest.fail(f"it never came to it: {process.communicate()}")
+        time.sleep(0.01)
+
+
+def in_hand(process: subprocess.Popen[bytes]) -> bool:
+    """Whether the command handles its signals; the start of Python itself is beyond it."""
+    lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+    (caught,) = (int(line.split()[1], 16) for line in lines if line.startswith("SigCgt"))
+    return bool(caught >> (signal.SIGTERM - 1) & 1)
+
+
+def names_in(folder: Path) -> set[str]:
+    return {file.name for file in folder.iterdir()} if folder.exists() else set()
+
+
+# interrupts
+
+
+def test_ctrl_c_at_any_moment_is_one_line_and_130(folder: Path) -> None:
+    moments = [0, 0.02, 0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0]
+    before = names_in(folder)
+    for twice, moment in enumerate(moments):
+        process = start(folder, *REPORT_OF_ARRAYS)
+        wait_for(process, lambda process=process: in_hand(process))
+        time.sleep(moment)
+        process.send_signal(signal.SIGINT)
+        if twice % 2:
+            process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+        if process.returncode == 0:  # it was done
+            assert (said, names_in(folder / "new" / "report") >= REPORT) == (b"", True)
+            shutil.rmtree(folder / "new")
+        assert (process.returncode, said) in ((130, INTERRUPTED), (0, b"")), moment
+        assert names_in(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "said"), [(signal.SIGINT, 130, INTERRUPTED), (signal.SIGTERM, 143, b"")]
+)
+def test_a_file_that_is_half_written_goes_and_the_old_one_stays(
+    folder: Path, number: int, status: int, said: bytes
+) -> None:
+    (folder / "m.csv").write_text("old")
+    np.lib.format.open_memmap(folder / "long.npy", "w+", np.uint8, (100_000, 32, 32)).flush()  # takes no room
+    before = names_in(folder)
+    process = start(folder, "localize", "map.safetensors", "long.npy", "--out", "m.csv")
+    wait_for(process, lambda: list(folder.glob(".dejavu-*/*")))
+    process.send_signal(number)
+    assert process.communicate(timeout=60)[1] == said
+    assert (process.returncode, names_in(folder)) == (status, before)
+    assert (folder / "m.csv").read_text() == "old"
+
+
+def test_a_training_that_is_interrupted_leaves_a_map(folder: Path) -> None:
+    (folder / "train.yaml").write_text(
+        "model:\n"
+        "  backbone:\n"
+        "    class_path: dejavu_torch.features.cnn.SmallCNN\n"
+        "    init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}\n"
+        "  mapper:\n"
+        "    class_path: dejavu_torch.TemplateMapper\n"
+        "    init_args:\n"
+        "      periods: {class_path: dejavu_torch.ImposedPeriods, init_args: {periods: [3, 4, 5]}}\n"
+        "data: {source: a.npy, batch_size: 20, tolerance: 2}\n"
+        "trainer: {max_steps: 1000000, accelerator: cpu, enable_progress_bar: false, default_root_dir: run}\n"
+    )
+    process = start(folder, "train", "fit", "--config", "train.yaml")
+    wait_for(process, lambda: list((folder / "run").rglob("config.yaml")))
+    time.sleep(2)
+    process.send_signal(signal.SIGINT)
+    out, said = process.communicate(timeout=60)
+    lines = said.splitlines(keepends=True)
+    assert (process.returncode, lines.count(INTERRUPTED)) == (130, 1)
+    assert [line for line in lines if not line.startswith(b"dejavu: ")] == []
+    assert b"to go on: dejavu train fit" in out
+    assert DejaVu.load(folder / "run" / "map.safetensors").trained is not None
+
+
+def python(code: str, *words: str, **settings: object) -> tuple[int, str, str]:
+    """Status and output of code run by another interpreter; torch is not needed for most."""
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, **settings)  # type: ignore[call-overload]
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_ctrl_c_when_all_is_done_changes_nothing() -> None:
+    late = "import atexit, signal; atexit.register(signal.raise_signal, signal.SIGINT)"
+    code = f"{late}\nfrom dejavu_torch.cli import main; main()"
+    assert python(code, "--version")[::2] == (0, "")
+
+
+def test_a_signal_that_is_ignored_stays_so() -> None:
+    ignore = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # as nohup, or a shell's &, does
+    code = f"{ignore}\nfrom dejavu_torch.cli import process; process.take_over(); signal.raise_signal(2)"
+    assert python(code) == (0, "", "")
+
+
+def test_where_interrupts_are_raised_the_second_one_ends() -> None:
+    code = (
+        "import signal; from dejavu_torch.cli import process; process.take_over()\n"
+        "with process.interrupts_raise():\n"
+        "    try: signal.raise_signal(2)\n"
+        "    except KeyboardInterrupt: print('kept')\n"
+        "    signal.raise_signal(2)\n"
+        "print('not reached')"
+    )
+    assert python(code) == (130, "kept\n", "dejavu: interrupted\n")
+
+
+def test_an_interrupt_that_was_turned_into_another_exception_is_one() -> None:
+    code = (
+        "import signal; from dejavu_torch import cli\n"
+        "def run(given):\n"
+        "    with cli.process.interrupts_raise():\n"
+        "        try: signal.raise_signal(2)\n"
+        "        except KeyboardInterrupt: raise RuntimeError('of an extension')\n"
+        "cli.run = run; cli.main()"
+    )
+    assert python(code) == (130, "", "dejavu: interrupted\n")
+
+
+# standard streams
+
+
+@pytest.mark.parametrize(
+    ("redirected", "status", "said"),
+    [
+        ("| head -1", 0, ""),
+        (">&- 2>&- <&-", 0, ""),
+        ("> /dev/full", 2, "No space left on device"),
+    ],
+)
+def test_files_are_written_whatever_becomes_of_what_is_printed(
+    folder: Path, redirected: str, status: int, said: str
+) -> None:
+    command = f"set -o pipefail; {' '.join(DEJAVU)} learn a.npy --map new.safetensors {redirected}"
+    done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (status, status // 2)
+    assert said in done.stderr
+    assert (folder / "new.safetensors").read_bytes()[8:9] == b"{"  # and nothing that was printed
+    assert DejaVu.load(folder / "new.safetensors").map.places == 64
+
+
+def test_without_anybody_to_read_help_is_silent() -> None:
+    command = f"set -o pipefail; {' '.join(DEJAVU)} {{}}"
+    for words, status, said in (
+        ("| true", 0, ""),
+        ("> /dev/full", 2, "dejavu: what was printed is not whole: No space left on device\n"),
+        ("dance 2>&-", 2, ""),
+    ):
+        done = subprocess.run(["bash", "-c", command.format(words)], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (status, said)
+
+
+def test_the_command_alone_is_the_overview_and_an_empty_word_is_one_line() -> None:
+    alone = subprocess.run(DEJAVU, capture_output=True, text=True)
+    assert (alone.returncode, alone.stderr, alone.stdout[:6]) == (0, "", "usage:")
+    empty = subprocess.run([*DEJAVU, ""], capture_output=True, text=True)
+    assert (empty.returncode, empty.stderr.count("\n"), empty.stdout) == (2, 1, "")
+    assert "'' is no command" in empty.stderr
+
+
+def test_a_folder_that_is_gone_is_no_traceback(tmp_path: Path) -> None:
+    code = "import os; os.rmdir(os.getcwd()); from dejavu_torch.cli import main; main()"
+    (tmp_path / "gone").mkdir()
+    path = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    words = ("learn", "a.npy", "--map", "a.safetensors")
+    status, _, said = python(code, *words, cwd=tmp_path / "gone", env=path)
+    assert (status, said.count("\n")) == (2, 1)
+    assert "current folder" in said
+
+
+# names
+
+
+def test_names_that_are_no_text_do_not_fail_a_report(tmp_path: Path) -> None:
+    for name, seed in ((b"caf\xe9\n\x1b[31m", 1), ("\xe9$_{$".encode(), 2)):
+        plain = write_images(tmp_path / f"{seed}", frames(32, seed=seed))
+        for image in plain.iterdir():
+            os.rename(image, os.fsencode(plain) + b"/\xff\n$_{$" + os.fsencode(image.name))
+        plain.rename(Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)))
+    words = [b"compare", b"caf\xe9\n\x1b[31m", "\xe9$_{$".encode(), b"--truth", b"0", b"--out", b"out"]
+    plain_c = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run([*map(os.fsencode, DEJAVU), *words], cwd=tmp_path, env=plain_c, capture_output=True)
+    assert (done.returncode, done.stderr.count(b"\n")) == (0, done.stderr.count(b"dejavu: "))
+    assert b"\x1b" not in done.stdout
+    assert names_in(tmp_path / "out") >= REPORT
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert page.count(r"caf\udce9\n\x1b[31m") >= 3
+    rows = (tmp_path / "out" / "matches.csv").read_text(encoding="utf-8").splitlines()
+    assert (len(rows), rows[1].count(r"\udcff\n$_{$")) == (33, 2)
+
+
+def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(folder / "fifo.safetensors")
+    (folder / "link").symlink_to("nowhere")
+    before = names_in(folder)
+    for out in ("fifo.safetensors", "a" * 244 + ".safetensors"):
+        error = fails(capsys, "learn", "sim:aerial?frames=100000", "--map", folder / out)
+        assert "expected" in error
+    for out in ("fifo.safetensors", "link", "a" * 256, "new/" + "a" * 256, "/dev/null"):
+        error = fails(capsys, "compare", *["sim:aerial?frames=100000"] * 2, "--out", folder / out)
+        assert "expected" in error
+    assert names_in(folder) == before
+    assert (folder / "fifo.safetensors").is_fifo()
+
+
+# no room
+
+
+def mounted(folder: Path, options: str, *commands: str) -> list[str]:
+    """The lines that commands say behind one another with a small disk at `disk`, by themselves."""
+    probe = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
+    if subprocess.run(probe, capture_output=True).returncode:
+        pytest.skip("nothing can be mounted here")
+    (folder / "disk").mkdir()
+    script = "; ".join([f"mount -t tmpfs -o {options} none disk", *commands])
+    done = subprocess.run(
+        ["unshare", "-rm", "bash", "-c", script], cwd=folder, capture_output=True, text=True
+    )
+    return [*done.stdout.splitlines(), *done.stderr.splitlines()]
+
+
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None:
+    dejavu = " ".join(DEJAVU)
+    found = mounted(
+        folder,
+        "size=64k",
+        "mkdir disk/old; echo old > disk/old/matches.csv; echo old > disk/old/pr.png",
+        "cp map.safetensors disk; dd if=/dev/zero of=disk/full bs=1k count=36 status=none",
+        f"{dejavu} compare a.npy b.npy --truth 0 --out disk/old > /dev/null; echo status $?",
+        f"{dejavu} compare a.npy b.npy --truth 0 --out disk/new > /dev/null; echo status $?",
+        "dd if=/dev/zero of=disk/full bs=1k count=64 status=none 2> /dev/null",
+        f"{dejavu} learn a.npy --map disk/map.safetensors > /dev/null; echo status $?",
+        "find disk -mindepth 1 | sort; cat disk/old/*; cmp map.safetensors disk/map.safetensors",
+    )
+    said = [line for line in found if line.startswith("dejavu: ")]
+    assert [line.rpartition(": ")[2][:13] for line in said] == ["No space left"] * 3
+    assert [line for line in found if line not in said] == [
+        *["status 2"] * 3,
+        *("disk/full", "disk/map.safetensors", "disk/old", "disk/old/matches.csv", "disk/old/pr.png"),
+        *("old", "old"),
+    ]
+
+
+def test_a_place_to_read_only_is_told_ahead_of_the_work(folder: Path) -> None:
+    dejavu = " ".join(DEJAVU)
+    found = mounted(
+        folder,
+        "ro",
+        f"{dejavu} learn sim:aerial?frames=1000000 --map disk/map.safetensors; echo status $?",
+        f"{dejavu} compare a.npy b.npy --out disk/report; echo status $?",
+    )
+    assert found[:2] == ["status 2"] * 2
+    assert [line.startswith("dejavu: ") and "no permission" in line for line in found[2:]] == [True] * 2
+
+
+def test_a_limit_on_files_is_one_line(folder: Path) -> None:
+    (folder / "m.csv").write_text("old")
+    before = names_in(folder)
+    process = start(
+        folder,
+        *("localize", "map.safetensors", "b.npy", "--out", "m.csv"),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500)),
+    )
+    said = process.communicate(timeout=60)[1]
+    assert (process.returncode, said) == (2, b"dejavu: m.csv was not written: File too large\n")
+    assert (names_in(folder), (folder / "m.csv").read_text()) == (before, "old")
+
+
+# kills and several writers: processes that are forked, as torch takes seconds to import
+
+
+def forked(work: Callable[[], None]) -> int:
+    child = os.fork()
+    if child:
+        return child
+    try:
+        work()
+    except BaseException:
+        os._exit(1)
+    os._exit(0)
+
+
+def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:
+    model, target, moment = DejaVu.load(folder / "map.safetensors"), folder / "out", random.Random(0)
+    whole = (folder / "map.safetensors").read_bytes()
+
+    def save_for_ever() -> None:
+        from dejavu_torch.data.output import whole_folder
+
+        while True:
+            model.save(folder / "map.safetensors")
+            shutil.rmtree(target, ignore_errors=True)
+            with whole_folder(target) as temporary:
+                for name in "abc":
+                    (temporary / name).write_bytes(whole)
+
+    for _ in range(20):
+        child = forked(save_for_ever)
+        time.sleep(moment.uniform(0.005, 0.1))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        DejaVu.load(folder / "map.safetensors")
+        # fewer are there where the removal was killed, never a part of one
+        assert {file.read_bytes() for file in target.glob("*")} <= {whole}
+    assert len(list(folder.glob(".dejavu-*"))) <= 2  # each writer removes what the one before it left
+    model.save(folder / "map.safetensors")
+    assert list(folder.glob(".dejavu-*")) == []
+
+
+def test_two_writers_of_a_map_and_a_folder_both_end_well(folder: Path) -> None:
+    from dejavu_torch.data.output import whole_file, whole_folder
+
+    def write(text: str) -> None:
+        for _ in range(100):
+            with whole_file(folder / "one") as temporary:
+                temporary.write_text(text)
+            with whole_folder(folder / "new") as temporary:
+                (temporary / "a").write_text(text)
+                (temporary / "b").write_text(text)
+
+    before = names_in(folder)
+    children = [forked(lambda text=text: write(text * 10_000)) for text in "xyz"]
+    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0, 0]
+    texts = {text * 10_000 for text in "xyz"}
+    assert {(folder / "one").read_text(), (folder / "new" / "a").read_text()} <= texts
+    assert names_in(folder) == before | {"one", "new"}
+    assert names_in(folder / "new") == {"a", "b"}
