@@ -137,10 +137,14 @@ def _finding(error: BaseException, kind: str) -> Finding:
 
 
 def _told(root: Path, case: Case, outcome: str) -> list[Finding]:
-    """What is wrong with what a case wrote to stderr: each line is one message of ours."""
+    """What is wrong with what a case wrote to stderr: each line is one message of ours.
+
+    Beside a call of the library lines of C code are let pass, such as libtiff's, which nothing can turn off.
+    """
     text = (root / "stderr").read_text(errors="replace")
     lines = text.split("\n")[:-1]
-    if foreign := [line for line in lines if not line.startswith("dejavu: ")]:
+    foreign = [line for line in lines if not line.startswith("dejavu: ")]
+    if foreign and (case.command or any(word in text for word in ("Warning: ", "Traceback"))):
         return [Finding("stderr", foreign[0][:100], text[:600])]
     if case.command and outcome == "refused" and not lines:
         return [Finding("stderr", "", "exit status 2 without a word")]
