@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
+from helpers import refused
 
 from dejavu_torch import DejaVu, InputError
 from dejavu_torch.cli.commands import run_learn
@@ -94,6 +95,11 @@ def test_a_config_stands_in_its_place() -> None:
     )
     paths = [str(find_config(name)) for name in ("paper", "default", "train_small")]
     assert found == ["fit", "--config", paths[0], "-c", paths[1], f"--config={paths[2]}", "--other", "paper"]
+
+
+def test_a_config_without_a_name_is_refused() -> None:
+    with refused("--config", "last word"):
+        with_configs(["in.npy", "--config"])
 
 
 @pytest.mark.slow
