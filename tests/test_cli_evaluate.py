@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -319,3 +320,82 @@ def test_options_that_do_nothing_for_ready_features_are_told(
     assert "ready features" not in caplog.text
     run("learn", *arguments, "--preprocess.channel", "R-B")
     assert "these are ready features: channel and contrast are left as they are" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        f"compare a b --out x --tolerance {2**63}",
+        f"evaluate a --truth 0 --out x --tolerance {2**53 + 1}",
+        f"learn a --map b.safetensors --seed -{2**64}",
+        f"learn a --map b.safetensors --preprocess.grid [{10**30},2]",
+        f"learn a --map b.safetensors --whitening.numbers {10**30}",
+        f"localize a b --out c.csv --top {10**30}",
+        f"localize a b --out c.csv --seed {'9' * 4200}",
+        f"train fit --trainer.max_steps {10**30}",
+    ],
+)
+def test_whole_numbers_that_no_tensor_holds_are_refused(
+    arguments: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "expected" in fails(capsys, *arguments.split())
+
+
+def test_options_are_not_guessed_from_their_beginnings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "fifo")  # which a --config would be looked at for
+    assert "--conf" in fails(capsys, "learn", "a", "--map", "b.safetensors", "--conf", tmp_path / "fifo")
+
+
+def test_a_tolerance_beyond_the_route_is_a_tolerance(
+    matches: Path, pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    run("evaluate", matches, "--truth", "4", "--tolerance", str(2**53), "--out", tmp_path / "evaluate")
+    assert report_of(tmp_path / "evaluate")["recall_at_1"] == 1
+    wide = ("--tolerance", str(2**53), "--truth", "4")
+    run("compare", *pair, *wide, "--out", tmp_path / "compare", *TEMPLATES, "--leave_out", str(2**53))
+    assert report_of(tmp_path / "compare")["recall_at_1"] == 1
+    run("compare", *pair, *wide, "--out", tmp_path / "filter", "--filter")
+    assert report_of(tmp_path / "filter")["recall_at_1"] == 1
+
+
+def test_a_sequence_is_of_fewer_queries_than_any_memory_holds(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = fails(capsys, "compare", *pair, "--sequence", str(2**53), "--out", tmp_path / "out")
+    assert "at most 65536" in error
+
+
+def test_frame_numbers_of_any_size_are_evaluated(tmp_path: Path) -> None:
+    far = 2**53 - 1
+    (tmp_path / "m.csv").write_text(f"query,place,score\n0,{far},0.5\n{far},3,0.7\n")
+    (tmp_path / "t.csv").write_text(f"0,{far}\n{far},3\n")
+    run("evaluate", tmp_path / "m.csv", "--truth", tmp_path / "t.csv", "--out", tmp_path / "out")
+    assert report_of(tmp_path / "out")["recall_at_1"] == 1
+
+
+@pytest.mark.parametrize("name", [b"a\nb", b"a\x1b[2Jb", b"\xff\xfe"])
+def test_a_name_of_any_bytes_makes_one_line(
+    tmp_path: Path, name: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / os.fsdecode(name)
+    folder.mkdir()
+    (folder / "1.png").write_bytes(b"no image")
+    for source in (folder, folder / "missing.mp4", f"sim:{os.fsdecode(name)}"):
+        error = fails(capsys, "learn", source, "--map", tmp_path / "map.safetensors")
+        assert error.strip("\n").isprintable()
+
+
+def test_what_pillow_logs_is_no_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "images").mkdir()
+    path = tmp_path / "images" / "a.tif"
+    Image.new("RGB", (5, 4)).save(path)
+    whole = bytearray(path.read_bytes())
+    entry = whole.index((277).to_bytes(2, "little") + (3).to_bytes(2, "little"))  # samples per pixel
+    whole[entry + 8] = 200
+    path.write_bytes(whole)
+    assert "a.tif" in fails(capsys, "learn", tmp_path / "images", "--map", tmp_path / "map.safetensors")
+    assert caplog.text == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from helpers import refused
 from dejavu_torch import DejaVu, InputError
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.presets import find_config, preset_names, with_configs
+from dejavu_torch.cli.presets import check_config, find_config, preset_names, with_configs
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.experiments.reproduce import paper_model
 from dejavu_torch.model import PARTS, REGISTRY
@@ -126,3 +127,74 @@ def test_the_wheel_holds_package_and_presets(tmp_path: Path) -> None:
     python = [sys.executable, "-P", "-c", f"import sys; sys.path.insert(0, {str(package.parent)!r}); {code}"]
     ran = subprocess.run(python, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert Path(ran.stdout.strip()) == package / "configs" / "train_small.yaml"
+
+
+def aliases(levels: int) -> str:
+    """Lists of nine that each stand for nine of the one before."""
+    lines = ["a0: &a0 [x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, levels))]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (aliases(10), "over 10000 values"),
+        ("a: &a [*a]", "over 10000 values"),
+        ("a: " + "[" * 100_000, "50 levels"),
+        ("- " * 1000, "50 levels"),
+        ("a: " + "[" * 100 + "]" * 100, "50 levels"),
+        ("seed: '" + "[" * 100_000 + "'", "a value of 100000 characters"),
+        ("batch_size: 3\nbatch_size: 4", "line 2: batch_size is there twice"),
+        ("mapper: {class_path: a, class_path: b}", "class_path is there twice"),
+        ("batch_size: " + "9" * 5000, "5000 characters"),
+        ("", "holds no options"),
+        ("null", "holds no options"),
+        ("- 3", "holds no options"),
+        ("words", "holds no options"),
+        ("a: [", "no YAML"),
+        ("a: *b", "over 10000 values"),
+        ("a: 1\n---\nb: 2", "no YAML"),
+        ("#" * 300_000, "larger than"),
+        (b"\xff\xfea: 1", "no UTF-8 text"),
+        (b"a: \x07", "no YAML"),
+    ],
+    ids=range(19),
+)
+def test_a_config_that_is_none_is_refused_ahead_of_the_loader(
+    tmp_path: Path, text: str | bytes, words: str
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    for command in (["--config", str(path)], ["fit", "-c", str(path)], [f"--config={path}"]):
+        with refused("mine.yaml", words, "expected a YAML file of options"):
+            with_configs(command)
+
+
+def test_a_config_calls_nothing_by_its_tags(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(f"a: !!python/object/apply:os.mkdir ['{tmp_path / 'ran'}']\n")
+    with refused("mine.yaml", "no YAML"):
+        with_configs(["--config", str(tmp_path / "mine.yaml")])
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_config_is_a_regular_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    with refused("fifo is no regular file"):
+        with_configs(["--config", str(tmp_path / "fifo")])
+    for name in (str(tmp_path), "a\0b", "a" * 5000, ""):
+        with refused("--config"):
+            find_config(name)
+
+
+def test_aliases_that_a_config_may_have(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("a: &a {x: 1}\nb: {<<: *a, y: 2}\nc: *a\n")
+    check_config(tmp_path / "mine.yaml")
+
+
+def test_a_word_of_more_than_an_option_can_mean_is_refused() -> None:
+    flow = "{" + aliases(10).replace("\n", ", ") + "}"
+    for word in (flow, f"--mapper={flow}", "[" * 100_000):
+        with refused("expected"):
+            with_configs(["--seed", word])
+    plain = ["sim:aerial?frames=64&seed=*", "--features.x=a&b*c: [", "a*&b"]
+    assert with_configs(plain) == plain

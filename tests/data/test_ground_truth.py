@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import time
+import zipfile
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch import Tensor
 
+from dejavu_torch import memory
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.frame_range import FrameRange
@@ -663,3 +667,95 @@ def test_a_file_is_described_by_its_name(tmp_path: Path) -> None:
     path = written(tmp_path, "0,1")
     assert describe_ground_truth(path) == path
     assert describe_ground_truth(path, interpolate=True) == f"{path}, interpolated"
+
+
+# claims, which are checked before anything is read
+
+
+def packed(folder: Path, kind: str, shape: str, body: bytes, method: int = zipfile.ZIP_DEFLATED) -> str:
+    """An .npz whose GThard says that it is of this type and shape."""
+    header = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}\n".encode()
+    array = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + body
+    with zipfile.ZipFile(folder / "truth.npz", "w", method) as file:
+        file.writestr("GThard.npy", array)
+    return str(folder / "truth.npz")
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape"),
+    [
+        ("'|b1'", f"({10**6}, {10**6})"),
+        ("'|b1'", f"({2**62}, {2**62})"),
+        ("'|b1'", f"({10**40}, 3)"),
+        ("'|b1'", "(-3, -3)"),
+        ("'|b1'", "(2, 3)"),
+        ("'|O'", "(3, 3)"),
+        ("[('a', '|b1')]", "(3, 3)"),
+        ("('|b1', (1000000000000,))", "(3, 3)"),
+        ("{}", "(3, 3)"),
+        ("'|b1'", "(" * 5000),
+    ],
+)
+def test_what_a_matrix_claims_is_not_believed(tmp_path: Path, kind: str, shape: str) -> None:
+    path = packed(tmp_path, kind, shape, bytes(9))
+    for frames, queries in ((3, 3), (None, 10**6)):
+        with refused("truth.npz", "GThard"):
+            read(path, frames, queries)
+
+
+def test_a_matrix_larger_than_the_memory_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = packed(tmp_path, "'|b1'", "(3000, 3000)", b"\1" * 3000**2)
+    assert Path(path).stat().st_size < 10**5
+    monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
+    with refused("GThard (3000, 3000) bool", "0.01 GB free"):
+        read(path, 3000, 3000)
+
+
+def test_entries_of_other_kinds_are_refused(tmp_path: Path) -> None:
+    for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):  # of which few bytes unpack to any number
+        with refused("another compression"):
+            read(packed(tmp_path, "'|b1'", "(3, 3)", b"\1" * 9, method), 3, 3)
+    path = Path(packed(tmp_path, "'|b1'", "(3, 3)", b"\1" * 9))
+    locked = bytearray(path.read_bytes())
+    for flags in (6, locked.index(b"PK\1\2") + 8):
+        locked[flags] |= 1
+    path.write_bytes(locked)
+    with refused("no whole .npz", "encrypted"):
+        read(str(path), 3, 3)
+    nan = np.full((3, 3), np.nan)
+    with refused("not finite"):
+        read(saved(tmp_path, GThard=nan), 3, 3)
+
+
+def test_a_table_wider_than_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wide = "0," + ",".join(map(str, range(20_000)))
+    path = written(tmp_path, "\n".join([wide, *(f"{i},1" for i in range(1, 2000))]))
+    monkeypatch.setattr(memory, "free_memory", lambda: 1e9)
+    with refused("20000 places for each of 2000 queries", "1 GB free"):
+        read(path, None, 2000)
+    with refused("1500 places for each of 30000 queries", "GB free"):
+        near_truth(torch.zeros(1500, 2), torch.zeros(30_000, 2), radius=1.0)
+
+
+def test_many_frames_that_one_query_speaks_for_take_no_longer(tmp_path: Path) -> None:
+    path = written(tmp_path, "\n".join(f"{i},{i}" for i in range(60_000)))
+    began = time.process_time()
+    found = find_ground_truth(path, None, None, 60_000, torch.tensor([70_000]), resampled=True)
+    assert found is not None
+    assert found.positives.shape == (1, 60_000)
+    assert time.process_time() - began < 10  # copied each time, half a minute
+
+
+def test_no_tolerance_is_too_large() -> None:
+    far = torch.tensor([[10**6], [-1]])
+    for tolerance in (10**6, 2**53, 2**63, 10**30):
+        assert is_right(torch.tensor([0, 0]), far, tolerance).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("name", ["truth.csv", "truth.npz"])
+def test_a_fifo_is_no_ground_truth(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with refused(name, "no regular file"):
+        read(str(tmp_path / name), 3, 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from helpers import all_of, refused
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from dejavu_torch.data import folder
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.data.video import Video
 
@@ -396,3 +398,44 @@ def test_a_drive(data_dir: Path) -> None:
     assert frames.shape == (221, 3, 90, 160)
     assert torch.equal(video.times, before)
     assert next(Video(video.path).batches(1)).shape == (1, 3, 540, 960)
+
+
+def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
+    clip(tmp_path / "a.mkv", pictures(3))
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile a.mkv\n")
+    with refused("list.mp4", "cannot be read as a video"):
+        Video(tmp_path / "list.mp4")
+
+
+def test_a_stream_that_claims_too_many_pixels_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = clip(tmp_path / "a.mkv", pictures(3))
+    monkeypatch.setattr(folder, "MOST_PIXELS", 1000)
+    with refused("a.mkv has 32 x 48 pixels", "at most 1000"):
+        Video(path)
+
+
+@pytest.mark.parametrize("problem", [OverflowError("big"), MemoryError(), UnicodeError("x\ny"), KeyError(1)])
+def test_whatever_the_decoder_raises_is_one_line(
+    tmp_path: Path, problem: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = clip(tmp_path / "a.mkv", pictures(3))
+    video = Video(path)
+
+    def fail(*_: object) -> None:
+        raise problem
+
+    monkeypatch.setattr(Video, "_open", fail)
+    with refused("a.mkv is broken near frame 0"):
+        all_of(video)
+    monkeypatch.undo()
+    monkeypatch.setattr(av, "open", lambda *_, **__: fail())
+    with refused("a.mkv cannot be read as a video"):
+        Video(path)
+
+
+def test_a_fifo_is_no_video(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.mp4")
+    with refused("a.mp4", "no regular file"):
+        Video(tmp_path / "a.mp4")
