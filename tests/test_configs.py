@@ -98,6 +98,11 @@ def test_a_config_stands_in_its_place() -> None:
     assert found == ["fit", "--config", paths[0], "-c", paths[1], f"--config={paths[2]}", "--other", "paper"]
 
 
+def test_a_config_without_a_name_is_refused() -> None:
+    with refused("--config", "last word"):
+        with_configs(["in.npy", "--config"])
+
+
 @pytest.mark.slow
 def test_the_wheel_holds_package_and_presets(tmp_path: Path) -> None:
     """Built and unpacked without a network; then used from elsewhere."""

@@ -129,6 +129,8 @@ def with_configs(words: Sequence[str]) -> list[str]:
         InputError: see `find_config`, or a word too long for any option.
     """
     found = list(words)
+    if words and words[-1] in ("--config", "-c"):
+        raise InputError(f"{words[-1]} is the last word; expected a YAML file or a preset behind it")
     for i, word in enumerate(words):
         check_word(word)
         if word.startswith("--config="):

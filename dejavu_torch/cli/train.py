@@ -191,7 +191,9 @@ class TrainCLI(LightningCLI):
                 self.trainer.fit(**arguments)
         except (InputError, OSError) as error:
             refused = True
-            if new:
+            if new:  # Lightning writes the config ahead of all work
+                if [path.name for path in root.rglob("*") if path.is_file()] == ["config.yaml"]:
+                    (root / "config.yaml").unlink()
                 remove_empty_folders(root)
             if isinstance(error, OSError):
                 raise InputError(f"the training in {root} has failed: {error.strerror or error}") from error

@@ -384,9 +384,9 @@ class TemplateMap(PlaceMap):
         shapes = {"layers": "(L,5)", "feature_ptr": "(L+1,)", "feature_index": "(F,)"}
         for name, shape in shapes.items():
             buffer = getattr(self, name)
-            whole = not (buffer.is_floating_point() or buffer.is_complex() or buffer.dtype == torch.bool)
+            whole = buffer.dtype in (torch.int32, torch.int64)  # what selects features
             if buffer.ndim != 1 + (name == "layers") or not whole:
-                return f"{name} {tuple(buffer.shape)}; expected whole numbers {shape}, got {buffer.dtype}"
+                return f"{name} {tuple(buffer.shape)} {buffer.dtype}; expected {shape} int32 or int64"
         if self.layers.shape[1] != 5:
             return f"layers {tuple(self.layers.shape)}; expected (L,5)"
         pointer = self.feature_ptr.tolist()

@@ -495,6 +495,7 @@ def test_buffers_that_do_not_fit_together_are_refused(saved: Path, name: str, va
         ("feature_ptr", torch.tensor([0.0, 1.0, 2.0])),
         ("feature_ptr", torch.tensor(0)),
         ("feature_index", torch.tensor(0)),
+        ("feature_index", torch.tensor([0, 1], dtype=torch.int8)),
     ],
 )
 def test_buffers_of_another_type_are_refused(saved: Path, name: str, value: Tensor) -> None:

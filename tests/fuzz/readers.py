@@ -87,17 +87,18 @@ class Case:
 
     def __init__(self, random: Random, folder: Path, made: Path) -> None:
         self.random, self.folder, self._made = random, folder, made
-        self.command = False
-        self.started: Callable[[], None] = lambda: None
+        self.words: list[str] = []  # of a command line
+        self.begin: Callable[[], None] = lambda: None  # the input is there: from here on files are watched
 
     def made(self, maker: Maker) -> Path:
         """The folder of what a maker made."""
         return self._made / maker.__name__
 
-    def begin(self, command: bool = False) -> None:
-        """The input is there: from here on files are watched. A command may write where its words say."""
-        self.command = command
-        self.started()
+    def command(self, words: Sequence[str]) -> None:
+        """Run a command line, which may write where its words say."""
+        self.words = list(words)
+        self.begin()
+        cli.run(words)
 
 
 Maker = Callable[[Path], None]
@@ -270,8 +271,7 @@ def map_commands(case: Case) -> None:
     learn = ["learn", "in/query.npy", "--whitening", "in/map.safetensors", "--map", "out/m.safetensors"]
     find = ["localize", "in/map.safetensors", "in/query.npy", "--out", "out/matches.csv"]
     words = case.random.choice((["info", "in/map.safetensors"], learn, find, [*find, "--top", "2"]))
-    case.begin(command=True)
-    cli.run(words)
+    case.command(words)
 
 
 @reader("codec", share=1)
@@ -372,8 +372,7 @@ def train_commands(case: Case) -> None:
         Path("in/train.yaml").write_bytes(mutated_yaml(random, TRAIN))
     else:
         words = ["train", *mutate_words(random, words[1:], TRAIN_OTHERS)]
-    case.begin(command=True)
-    cli.run(words)
+    case.command(words)
 
 
 # configs and command lines ---------------------------------------------------------------------------------
@@ -518,8 +517,7 @@ def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
     bench.run_bench = frontier.run_storage = reproduce.reproduce = too_long  # type: ignore[assignment]
     if words[:1] == ["demo"]:
         compare.compare = too_long  # type: ignore[assignment]
-    case.begin(command=True)
-    cli.run(words)
+    case.command(words)
 
 
 @reader("commands", inputs, share=1)

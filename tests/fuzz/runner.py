@@ -23,6 +23,7 @@ import logging
 import os
 import resource
 import select
+import shlex
 import shutil
 import signal
 import sys
@@ -48,6 +49,7 @@ CPU, WALL = 20, 90  # seconds of a case
 SILENT = 300  # seconds after which a process that says nothing is ended
 MEMORY = 4 * 2**30  # bytes of a case
 GROWN = 2**29  # bytes by which a process may have grown when it goes on to another case
+MOST = 300  # characters of a message
 PACKAGE = Path(dejavu_torch.__file__).parent
 CANARY_CODE = "class Module: pass\ndef run(*args, **more): return 0\n"
 
@@ -93,10 +95,7 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
         os.ftruncate(output, 0)
     before: dict[str, Any] = {}
 
-    def started() -> None:
-        before.update(_files(root / "work"))
-
-    case.started = started
+    case.begin = lambda: before.update(_files(root / "work"))
     signal.setitimer(signal.ITIMER_PROF, CPU)
     signal.setitimer(signal.ITIMER_REAL, WALL)
     try:
@@ -111,7 +110,7 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
         if outcome == "broken":
             findings.append(_finding(error, f"exit status {error.code}"))
     except Wrong as error:
-        findings.append(Finding("wrong", str(error).partition(":")[0], str(error)[:300]))
+        findings.append(Finding("wrong", str(error).partition(":")[0], str(error)[:MOST]))
     except BaseException as error:
         findings.append(_finding(error, type(error).__name__))
     finally:
@@ -124,6 +123,11 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
     if CANARY in sys.modules:
         del sys.modules[CANARY]
         findings.append(Finding("code executed", "", "the canary was imported"))
+    if case.words:
+        line = shlex.join(case.words)
+        findings = [
+            one._replace(message=f"{one.message[:MOST]} of dejavu {line:.{MOST}}") for one in findings
+        ]
     return Result(number, "broken" if findings else outcome, findings, time.process_time() - began)
 
 
@@ -133,16 +137,20 @@ def _finding(error: BaseException, kind: str) -> Finding:
     ]
     last = frames[-1] if frames else None
     where = f"{Path(last.filename).relative_to(PACKAGE)}:{last.lineno} {last.name}" if last else ""
-    return Finding(kind, where, str(error)[:300])
+    return Finding(kind, where, str(error)[:MOST])
 
 
 def _told(root: Path, case: Case, outcome: str) -> list[Finding]:
-    """What is wrong with what a case wrote to stderr: each line is one message of ours."""
+    """What is wrong with what a case wrote to stderr: each line is one message of ours.
+
+    Beside a call of the library lines of C code are let pass, such as libtiff's, which nothing can turn off.
+    """
     text = (root / "stderr").read_text(errors="replace")
     lines = text.split("\n")[:-1]
-    if foreign := [line for line in lines if not line.startswith("dejavu: ")]:
-        return [Finding("stderr", foreign[0][:100], text[:600])]
-    if case.command and outcome == "refused" and not lines:
+    foreign = [line for line in lines if not line.startswith("dejavu: ")]
+    if foreign and (case.words or any(word in text for word in ("Warning: ", "Traceback"))):
+        return [Finding("stderr", foreign[0][:100], text[: 2 * MOST])]
+    if case.words and outcome == "refused" and not lines:
         return [Finding("stderr", "", "exit status 2 without a word")]
     return []
 
@@ -158,11 +166,11 @@ def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporar
     changed = [name for name in before if after.get(name) != before[name]]
     if outcome == "accepted":
         new = [name for name in new if any(part[0] == "." or ".part" in part for part in Path(name).parts)]
-        changed = [] if case.command else changed
+        changed = [] if case.words else changed
     if new:
-        findings.append(Finding(f"file left where {outcome}", "", str(new)[:300]))
+        findings.append(Finding(f"file left where {outcome}", "", str(new)[:MOST]))
     if changed:
-        findings.append(Finding("input changed", "", str(changed)[:300]))
+        findings.append(Finding("input changed", "", str(changed)[:MOST]))
     return findings
 
 
@@ -275,7 +283,7 @@ def run(reader: Reader, seed: int, numbers: Iterable[int], root: Path) -> Iterat
             waiting.remove(begun)
             how = "hang" if hung else "killed" if os.WIFSIGNALED(status) else "ended"
             number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
-            told = (root / "stderr").read_text(errors="replace")[-600:]
+            told = (root / "stderr").read_text(errors="replace")[-2 * MOST :]
             yield Result(begun, "broken", [Finding(f"process {how}", f"{number}", told)], 0.0)
         elif status:
             raise RuntimeError(f"{reader.name} made no input: {(root / 'stderr').read_text()[-3000:]}")

@@ -285,9 +285,11 @@ def test_what_cannot_be_resumed_is_refused(
     if keys[:4] == MOMENTS and keys[-1] == "exp_avg_sq":
         like = torch.load(last, weights_only=True)["optimizer_states"][0]["state"][0]["exp_avg"]
         bad = changed(last, bad, keys, value.expand(like.shape).clone())
-    options = ["--ckpt_path", bad, "--trainer.default_root_dir", tmp_path, "--trainer.logger", "false"]
+    root = tmp_path / "new"
+    options = ["--ckpt_path", bad, "--trainer.default_root_dir", root, "--trainer.logger", "false"]
     line = refusal(capfd, "fit", *options, "--trainer.max_steps", 6)
     assert [word for word in words if word not in line] == [], line
+    assert not root.exists()
 
 
 # claims --------------------------------------------------------------------------------------------------
