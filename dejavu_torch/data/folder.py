@@ -99,7 +99,7 @@ def check_size(path: Path, width: int, height: int) -> None:
         )
 
 
-def check_pixels(path: Path, rows: int, columns: int, most: int = MOST_PIXELS) -> None:
+def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:
     """Refuse, ahead of any allocation, more pixels than can be meant or than there is room for."""
     seen = f"{path} has {rows} x {columns} pixels"
     if rows * columns > most:

@@ -47,7 +47,7 @@ def check_clahe(clip_limit: float, grid: tuple[int, int]) -> None:
     """Refuse a limit or a grid that makes no sense."""
     if not 0 <= clip_limit <= MOST_CLIP:
         raise InputError(
-            f"clip_limit is {clip_limit}; expected a number of at least 0 (0: no limit), at most {MOST_CLIP:g}"
+            f"clip_limit is {clip_limit}; expected a number of at least 0 (no limit), at most {MOST_CLIP:g}"
         )
     if len(grid) != 2 or any(tiles < 1 or tiles != int(tiles) for tiles in grid):
         raise InputError(f"grid is {tuple(grid)}; expected (rows, columns), whole numbers of at least 1")
