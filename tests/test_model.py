@@ -542,12 +542,12 @@ def test_how_a_map_was_trained_is_part_of_its_state() -> None:
     assert model.trained is None
     again.load_state_dict(model.state_dict())
     assert again.trained is None
-    model.trained = Training(7, 1.5, None)
+    model.trained = Training(7, None)
     again.load_state_dict(model.state_dict())
-    assert again.trained == Training(7, 1.5, None)
+    assert again.trained == Training(7, None)
 
 
 def test_learning_anew_forgets_the_training() -> None:
     model = wave_model().learn(waves())
-    model.trained = Training(7, 1.5, None)
+    model.trained = Training(7, None)
     assert model.learn(waves()).trained is None

@@ -8,6 +8,7 @@ from fractions import Fraction
 
 from torch import Tensor
 
+from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import supportive_periods
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
@@ -64,6 +65,7 @@ class ImposedPeriods(PeriodFinder):
         bins = -(-places // self.bin)
         # a route of a single bin leaves nothing to tell apart
         periods = self.periods or supportive_periods(max(2, bins))
+        check_room(4 * sum(periods) * dimension, f"a template for each of {sum(periods)} imposed phases")
         distinct = math.lcm(*periods)
         if distinct < bins:
             log.warning(

@@ -703,9 +703,9 @@ def test_the_header_tells_of_training(path: Path, trained: DejaVu, tmp_path: Pat
 
 @pytest.mark.parametrize("seed", [None, 0])
 def test_training_of_any_seed_comes_back(path: Path, trained: DejaVu, seed: int | None) -> None:
-    trained.trained = Training(0, 0.0, seed)
+    trained.trained = Training(0, seed)
     trained.save(path)
-    assert DejaVu.load(path).trained == Training(0, 0.0, seed)
+    assert DejaVu.load(path).trained == Training(0, seed)
 
 
 # no file names code to import

@@ -291,6 +291,6 @@ def test_leave_out_scores_as_the_model_does() -> None:
 def test_leave_out_of_trained_templates_is_refused() -> None:
     features = torch.rand(40, 3)
     model = template_model(periods=Fixed(layer(4, 0, 40, 0, 1, 2))).learn(features)
-    model.trained = Training(10, 1.0, None)
+    model.trained = Training(10, None)
     with refused("trained templates", "was not trained"):
         leave_out_match(model, features)
