@@ -8,7 +8,8 @@ from pathlib import Path
 
 from dejavu_torch.types import InputError
 
-GROUP = Path("/sys/fs/cgroup")  # the limits of a container
+GROUP = Path("/sys/fs/cgroup")  # the limits of a container (version 2)
+CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back where memory is short
 
 
 def free_memory() -> float:
@@ -30,7 +31,11 @@ def check_room(needed: float, what: str) -> None:
     """
     free = free_memory()
     if needed > free:
-        raise InputError(f"{what} takes {needed / 1e9:.3g} GB; expected at most the {free / 1e9:.3g} GB free")
+        raise InputError(f"{what} takes {_told(needed)}; expected at most the {_told(free)} free")
+
+
+def _told(size: float) -> str:
+    return f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{max(size, 0) / 1e6:.3g} MB"
 
 
 def _of_system() -> float:
@@ -48,9 +53,12 @@ def _of_system() -> float:
 
 def _of_container() -> float:
     try:
-        return float((GROUP / "memory.max").read_text()) - float((GROUP / "memory.current").read_text())
+        limit, taken = (float((GROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
+        lines = (GROUP / "memory.stat").read_text().splitlines()
+        parts = {name: float(value) for name, value in map(str.split, lines)}
     except (OSError, ValueError):  # none, or "max"
         return math.inf
+    return limit - taken + sum(parts.get(name, 0) for name in CACHES)
 
 
 def _of_process() -> float:

@@ -41,6 +41,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
+from dejavu_torch.text import one_line
 from dejavu_torch.types import BATCH_NUMBERS, InputError, Match, SequenceModel, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -451,7 +452,8 @@ class DejaVu(nn.Module):
 
     def _features(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """What whitening takes: features of a traverse in batches (B,D), without gradients."""
-        pixels = math.prod(getattr(self.features, "resize", None) or (1,))  # that a frame is brought to
+        resize = getattr(self.features, "resize", None) if type(self.features) in CLASSES else None
+        pixels = math.prod(resize or (1,))  # that a frame is brought to
         at_once = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
         return feature_batches(traverse, self.pipeline, at_once, self.map.positions.device, progress)
 
@@ -489,7 +491,10 @@ class DejaVu(nn.Module):
         self._require_map()
         if callable(getattr(self.mapper, "metric", None)):
             raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
-        write_map(Path(path), *self._file())
+        tensors, header = self._file()
+        checked(header, Header, "the model")  # what is written can be read
+        checked(header["map"], self.map.state, "the map")
+        write_map(Path(path), tensors, header)
 
     @classmethod
     def load(cls, path: str | Path, features: nn.Module | None = None) -> DejaVu:
@@ -643,7 +648,7 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], Header]]:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (RuntimeError, RecursionError) as error:  # what torch does not fit in, or nested without end
-        problem = " ".join(str(error).split())
+        problem = one_line(error)
         raise InputError(f"{path} does not fit its modules: {problem}") from error
 
 
@@ -674,12 +679,15 @@ def _map_state(route: PlaceMap, tensors: dict[str, Tensor], header: Header) -> d
 
 
 def _check_weights(header: Header, tensors: dict[str, Tensor], given: nn.Module | None) -> None:
-    """Refuse, before they are made, features of other sizes than the file's weights."""
-    with torch.device("meta"):
-        probe = _build(header, "features", given)
-    assert probe is not None
-    if probe is given:
+    """Refuse, before they are made, features of other sizes than the file's weights.
+
+    A network that is given is there already.
+    """
+    if given is not None:
         return
+    with torch.device("meta"):
+        probe = _build(header, "features", None)
+    assert probe is not None
     for name, own in probe.state_dict().items():
         stored = tensors.get(f"features.{name}")
         if isinstance(own, Tensor) and (stored is None or stored.shape != own.shape):

@@ -18,3 +18,13 @@ def printable(text: object) -> str:
         c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode()
         for c in str(text)
     )
+
+
+def one_line(text: object) -> str:
+    """A text without line breaks, each run of blanks one space.
+
+    Example:
+        >>> one_line(ValueError("two\\n  lines"))
+        'two lines'
+    """
+    return " ".join(str(text).split())

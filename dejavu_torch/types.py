@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from dejavu_torch.text import printable
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least one: 256 MB
+FRAME_NUMBERS = 2**28  # in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
 
 
@@ -99,14 +100,14 @@ class Traverse(ABC):
         """How many frames to read at a time: `most`, or fewer where frames are large.
 
         Raises:
-            InputError: a frame of more numbers than a batch may hold.
+            InputError: a frame of more than 2^28 numbers.
         """
         shape = self.frame_shape
-        fits = BATCH_NUMBERS // max(1, math.prod(shape))
-        if not fits:
+        numbers = math.prod(shape)
+        if numbers > FRAME_NUMBERS:
             seen = f"{self.name} has frames of {' x '.join(map(str, shape))} numbers"
-            raise InputError(f"{seen}; expected at most {BATCH_NUMBERS}, as ?width=640 makes of images")
-        return max(1, min(most, fits))
+            raise InputError(f"{seen}; expected at most {FRAME_NUMBERS}, as ?width=640 makes of images")
+        return max(1, min(most, BATCH_NUMBERS // max(1, numbers)))
 
 
 @dataclass(frozen=True)

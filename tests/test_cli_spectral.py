@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +55,16 @@ def same_maps(first: Path, second: Path) -> bool:
 
 
 # what works
+
+
+@pytest.mark.parametrize("config", [(), TEMPLATES], ids=["spectral", "templates"])
+def test_two_processes_write_the_same_bytes(folder: Path, tmp_path: Path, config: tuple[str, ...]) -> None:
+    words = ("learn", ROUTE, *config, "--map")
+    run(*words, tmp_path / "here.safetensors")
+    environment = os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())}
+    command = [sys.executable, "-m", "dejavu_torch.cli", *words, str(tmp_path / "there.safetensors")]
+    subprocess.run(command, check=True, capture_output=True, env=environment)
+    assert (tmp_path / "here.safetensors").read_bytes() == (tmp_path / "there.safetensors").read_bytes()
 
 
 def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,9 +40,9 @@ ARROWS = {
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "types data",
-    "model": "types data features periods database recognition motion",
+    "model": "types text data features periods database recognition motion",
     "evaluation": "types resize text data features periods database recognition motion model",
-    "training": "types resize data features periods database recognition motion model evaluation",
+    "training": "types text resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model evaluation",
     "cli": "types text data features periods database recognition motion model evaluation training "
     "experiments",

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from dejavu_torch import __version__
 from dejavu_torch.cli import process
-from dejavu_torch.text import printable
+from dejavu_torch.text import one_line, printable
 
 COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of commands.py, or train.py
     "demo": "learn the built-in route, localize a second traverse of it, report",
@@ -171,8 +171,3 @@ def fail(message: str) -> NoReturn:
     """One line on stderr, exit status 2."""
     print(f"dejavu: {printable(one_line(message))}", file=sys.stderr)
     raise SystemExit(2)
-
-
-def one_line(text: str) -> str:
-    """A text without line breaks."""
-    return " ".join(text.split())

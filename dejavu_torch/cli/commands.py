@@ -410,6 +410,11 @@ def _check_report_folder(out: Path, *sources: str | None) -> None:
     if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
         raise InputError(f"{out} holds the images; expected another folder for the report")
     check_output_folder(out)
+    if out.is_dir():
+        from dejavu_torch.evaluation.report import PICTURES
+
+        for name in ("index.html", "report.json", "matches.csv", "map.safetensors", *PICTURES):
+            check_output_file(out / (name if "." in name else f"{name}.png"))
 
 
 def _sequence_of(

@@ -16,6 +16,7 @@ from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
+from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
 MODEL = "model"  # the parameter of a command that is a DejaVu: each of its arguments is an option
@@ -63,11 +64,6 @@ def whole_numbers(value: object) -> Iterator[int]:
     elif isinstance(value, dict | list | tuple):
         for part in value.values() if isinstance(value, dict) else value:
             yield from whole_numbers(part)
-
-
-def one_line(text: object) -> str:
-    """A text without line breaks."""
-    return " ".join(str(text).split())
 
 
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):

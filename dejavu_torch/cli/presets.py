@@ -102,13 +102,15 @@ class _Collection:
         self.size += size
         if self.mapping and self.parts % 2 == 0 and text is not None:
             if text in self.keys:
-                raise ValueError(f"{line}: {text} is there twice")
+                raise ValueError(f"{line}: {text} appears twice")
             self.keys.add(text)
         self.parts += 1
 
 
 def check_word(word: str) -> None:
     """Refuse a word that is YAML, as the value of any option may be, but more than an option can mean."""
+    if not word or (word.startswith("--") and word.endswith("=")):
+        raise InputError(f"{word or 'a word'} is empty; expected a name or a value")
     if len(word) > LONGEST:
         raise InputError(f"{word[:40]} ...: a word of {len(word)} characters; expected at most {LONGEST}")
     if "&" in word and "*" in word:  # aliases
@@ -117,7 +119,7 @@ def check_word(word: str) -> None:
         except yaml.YAMLError:  # an address, or a name
             pass
         except ValueError as error:
-            raise InputError(f"{word}: {error}; expected less") from error
+            raise InputError(f"{word}: {error}; expected a value as an option has") from error
 
 
 def with_configs(words: Sequence[str]) -> list[str]:

@@ -20,6 +20,7 @@ from dejavu_torch.cli.commands import print_map
 from dejavu_torch.cli.parser import Parser, refusal
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
+from dejavu_torch.text import one_line
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport
@@ -326,7 +327,7 @@ def run_train(arguments: Sequence[str]) -> None:
             save_config_callback=ConfigFile,
         )
     except RuntimeError as error:
-        problem = " ".join(str(error).split())[:300]
+        problem = one_line(error)[:300]
         if "Early stopping conditioned" not in problem:
             raise
         raise InputError(problem) from error

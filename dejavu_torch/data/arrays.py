@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST, reading
+from dejavu_torch.data.folder import ROUNDING
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import printable
@@ -59,12 +60,13 @@ class ArrayTraverse(IndexedTraverse):
         batch = part if part.dtype == torch.float64 else part.float()
         if batch.ndim == 4 and isinstance(self.values, np.memmap):  # a tensor is the caller's own affair
             low, high = batch.flatten(1).aminmax(dim=1)
-            bad = ~((low >= 0) & (high <= 1))  # or NaN
+            bad = ~((low >= -ROUNDING) & (high <= 1 + ROUNDING))  # or NaN
             if bad.any():
                 at = int(bad.nonzero()[0])
                 seen = f"numbers from {low[at]:.4g} to {high[at]:.4g}"
                 seen = seen if (low[at] - high[at]).isfinite() else "NaN or infinite numbers"
                 raise InputError(f"{self.name}: frame {frames[at]} holds {seen}; expected 0 to 1")
+            batch.clamp_(0, 1)
         return batch
 
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dejavu_torch.memory import check_room
+from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
 LARGEST = 2**53  # beyond it a float does not hold every whole number
@@ -59,7 +60,7 @@ def reading(path: Path, seen: str, expected: str) -> Iterator[None]:
 def _why(error: Exception) -> str:
     """An exception in words of one line."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return " ".join(str(text).split())
+    return one_line(text)
 
 
 def read_text(path: Path, expected: str) -> str:

@@ -10,7 +10,7 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from dejavu_torch.data.files import LARGEST, reading
+from dejavu_torch.data.files import reading
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.resize import MOST_PIXELS, resize_frames
@@ -18,7 +18,18 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import InputError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
-FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")  # and no other, such as one that starts a program
+MOST_READ = 2**28  # pixels of an image, such as a long strip; a small file can claim any number
+ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
+FORMATS = (
+    "PNG",
+    "JPEG",
+    "BMP",
+    "DIB",
+    "TIFF",
+    "WEBP",
+    "PPM",
+    "GIF",
+)  # and no other, such as one that starts a program
 BYTES_A_PIXEL = 24  # that reading takes at most: decoded, as an array, and as floats
 
 
@@ -81,17 +92,18 @@ class ImageFolder(IndexedTraverse):
 
 def check_size(path: Path, width: int, height: int) -> None:
     """Refuse a size in pixels below 0, which stands for the frames' own, or beyond any frame."""
-    if width < 0 or height < 0:
-        raise InputError(f"{path}: width={width}, height={height}; expected width and height of at least 0")
-    if max(width, height) > LARGEST:
-        raise InputError(f"{path}: width={width}, height={height}; expected at most {MOST_PIXELS} pixels")
+    if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
+        raise InputError(
+            f"{path}: width={width}, height={height}; expected width and height of at least 0 each, at most "
+            f"{MOST_PIXELS} pixels"
+        )
 
 
-def check_pixels(path: Path, rows: int, columns: int) -> None:
-    """Refuse, ahead of any allocation, more pixels of a frame than can be meant or than there is room for."""
+def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:
+    """Refuse, ahead of any allocation, more pixels than can be meant or than there is room for."""
     seen = f"{path} has {rows} x {columns} pixels"
-    if rows * columns > MOST_PIXELS:
-        raise InputError(f"{seen}; expected at most {MOST_PIXELS}")
+    if rows * columns > most:
+        raise InputError(f"{seen}; expected at most {most}")
     check_room(BYTES_A_PIXEL * rows * columns, f"{seen}, which")
 
 
@@ -120,14 +132,14 @@ def read_image(path: Path) -> Tensor:
     Of a file of several images it is the first.
 
     Raises:
-        InputError: the file cannot be read as an image, has over 2^26 pixels, more than there is memory for,
+        InputError: the file cannot be read as an image, has over 2^28 pixels, more than there is memory for,
             or numbers outside [0, 1].
     """
     with (
         reading(path, "cannot be read as an image", "an image such as .png or .jpg"),
         Image.open(path, formats=FORMATS) as opened,
     ):
-        check_pixels(path, opened.height, opened.width)
+        check_pixels(path, opened.height, opened.width, MOST_READ)
         ImageOps.exif_transpose(opened, in_place=True)
         mode = opened.mode
         wide = mode.startswith(("I", "F"))  # 16-bit grey, or floats that are in [0, 1] already
@@ -137,9 +149,10 @@ def read_image(path: Path) -> Tensor:
         image = torch.from_numpy(pixels.astype(np.float32))[None]
         image.div_(65535 if mode.startswith("I") else 1)
         low, high = image.aminmax()
-        if not (low >= 0 and high <= 1):  # or NaN
+        slack = ROUNDING if mode.startswith("F") else 0
+        if not (low >= -slack and high <= 1 + slack):  # or NaN
             raise InputError(f"{path} holds numbers from {low:.4g} to {high:.4g} of white; expected 0 to 1")
-        return image
+        return image.clamp_(0, 1)
     # turned while they are bytes, and then floats of that order: the least that is held at once
     channels = np.array(pixels.reshape(*pixels.shape[:2], -1).transpose(2, 0, 1), order="C")
     return torch.from_numpy(channels).float().div_(255)

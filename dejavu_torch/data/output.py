@@ -8,7 +8,7 @@ import signal
 import stat
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -114,7 +114,8 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
-    """A temporary folder whose files take their places in `path`, together, when the block ends well.
+    """A temporary folder whose files take their places in `path`, one behind the other, when the block ends
+    well.
 
     A folder that is new appears with all of them at once. One that is there keeps its other files.
 
@@ -143,7 +144,7 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
         with _signals_later():
             if not path.is_dir():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                folder.chmod(folder.stat().st_mode | (0o777 & ~_umask()))
+                folder.chmod(_mode_of_new(folder, os.mkdir, os.rmdir))
                 with suppress(OSError):  # another process made one meanwhile
                     folder.rename(path)
             for name in names if folder.is_dir() else ():
@@ -216,7 +217,7 @@ def _finish(written: Path, path: Path) -> None:
         os.fsync(file)
     finally:
         os.close(file)
-    mode = 0o666 & ~_umask()  # some writers make private files
+    mode = _mode_of_new(written.parent, Path.touch, os.unlink)  # some writers make private files
     with suppress(FileNotFoundError):
         old = path.stat()
         mode = stat.S_IMODE(old.st_mode)
@@ -290,7 +291,10 @@ def _check_name(path: Path) -> None:
         )
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _mode_of_new(folder: Path, make: Callable[[Path], None], remove: Callable[[Path], None]) -> int:
+    """The mode of what is made; asking the system for its mask would change that for a moment."""
+    fresh = folder / ".mode"
+    make(fresh)
+    mode = stat.S_IMODE(fresh.stat().st_mode)
+    remove(fresh)
+    return mode

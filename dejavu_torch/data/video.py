@@ -195,7 +195,7 @@ class Video(Traverse):
         height, width = fitted_size(self.path, h, w, self.width, self.height)
         if turns % 2:
             width, height = height, width
-        check_pixels(self.path, height, width)
+        check_pixels(self.path, height, width, MOST_PIXELS)
         with reading(self.path, f"cannot be resized to {height} x {width} pixels", "less"):
             pixels = frame.reformat(width, height, "rgb24", interpolation=how).to_ndarray()
         return np.rot90(pixels, turns)
@@ -218,7 +218,7 @@ class Video(Traverse):
                 raise InputError(f"{self.name} has no video stream; expected a video")
             if stream.codec_context is None:
                 raise InputError(f"{self.name} has a codec that cannot be decoded; expected such as H.264")
-            check_pixels(self.path, stream.codec_context.height, stream.codec_context.width)
+            check_pixels(self.path, stream.codec_context.height, stream.codec_context.width, MOST_PIXELS)
             # a frame may be of another size than the stream
             stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
             stream.thread_type = "AUTO"

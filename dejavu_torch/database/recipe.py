@@ -81,7 +81,11 @@ def build(recipe: Recipe, kind: type[M], registry: Registry, given: nn.Module | 
     if not issubclass(cls, kind):
         raise InputError(f"the map names {name}, which is no {kind.__name__}")
     hints = get_type_hints(cls.__init__)
-    kinds = {key: hints[key] for key in inspect.signature(cls).parameters}
+    kinds = {  # an argument that is newer than the file has its default
+        key: hints[key]
+        for key, parameter in inspect.signature(cls).parameters.items()
+        if key in recipe.init_args or parameter.default is parameter.empty
+    }
     arguments = checked_fields(recipe.init_args, kinds, f"the map's {name}")
     parts = {key: build(part, nn.Module, registry, given) for key, part in inner_recipes(recipe)}
     return cls(**arguments | parts)

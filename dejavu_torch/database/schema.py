@@ -12,7 +12,13 @@ from torch import nn
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.types import InputError
 
-NAMES = {int: "a whole number", float: "a number", str: "a text", bool: "true or false", type(None): "null"}
+NAMES = {
+    int: "a whole number below 2^53",
+    float: "a finite number",
+    str: "a text",
+    bool: "true or false",
+    type(None): "null",
+}
 SHOWN = 60  # characters of a value
 
 
@@ -25,7 +31,7 @@ def checked(value: Any, kind: Any, where: str) -> Any:
             a text.
         where: the value stands, for messages.
 
-    Convention: numbers are finite and below 2^53.
+    Convention: numbers are finite, whole ones below 2^53.
 
     Raises:
         InputError: naming what is of another type.
@@ -35,7 +41,7 @@ def checked(value: Any, kind: Any, where: str) -> Any:
         (4, 4)
         >>> checked("4", int | None, "block")
         Traceback (most recent call last):
-        dejavu_torch.types.InputError: block is '4'; expected a whole number or null
+        dejavu_torch.types.InputError: block is '4'; expected a whole number below 2^53 or null
     """
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
@@ -66,7 +72,7 @@ def checked(value: Any, kind: Any, where: str) -> Any:
     elif origin is Callable:
         fits = isinstance(value, str)
     elif kind is float:
-        fits = type(value) in (int, float) and abs(value) < LARGEST
+        fits = type(value) in (int, float) and math.isfinite(value)
     elif kind is int:
         fits = type(value) is int and abs(value) < LARGEST
     else:
@@ -85,12 +91,12 @@ def checked_fields(value: Any, kinds: Mapping[str, Any], where: str) -> dict[str
 
 
 def _plain(value: Any, where: str) -> Any:
-    """Any JSON value of finite numbers below 2^53."""
-    if isinstance(value, float | int) and not (math.isfinite(value) and abs(value) < LARGEST):
-        raise _refusal(value, float, where)
+    """Any JSON value, of numbers as `checked` takes them."""
+    if isinstance(value, float | int) and not isinstance(value, bool):
+        checked(value, type(value), where)
     if isinstance(value, dict | list | tuple):
-        for part in value.values() if isinstance(value, dict) else value:
-            _plain(part, where)
+        for name, part in value.items() if isinstance(value, dict) else enumerate(value):
+            _plain(part, f"{where}.{name}")
     return value
 
 

@@ -23,6 +23,7 @@ from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel
 
 Reduction = Literal["mean", "sum"]
 TRAINABLE = ("templates", "weights")
+MOST_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
 PLACE_BYTES = 32  # that a place of a layer takes while its phases are worked out, and while it is scored
 
 
@@ -201,8 +202,12 @@ class TemplateMap(PlaceMap):
                 f"feature {outside[0].features[-1]}; expected it inside {self.places} places of "
                 f"{self.dimension} features"
             )
-        # before the phase of every place is worked out: no tensor of a file is as long as the route
+        # before the phase of every place is worked out
         covered = sum(layer.stop - layer.start for layer in self.plan)
+        if max(self.places, covered) > MOST_PLACES:
+            raise InputError(
+                f"a map of {self.places} places, {covered} in all layers; expected at most {MOST_PLACES}"
+            )
         check_room(PLACE_BYTES * (self.places + covered), f"a map of {self.places} places")
         self.segments = segments(self.plan, self.places)
         phases = [layer.place_phases for layer in self.plan]

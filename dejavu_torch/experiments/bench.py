@@ -31,6 +31,7 @@ from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.hog import hog
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.text import one_line
 from dejavu_torch.types import FrequencyLayer, InputError
 
 BATCH = 64
@@ -296,7 +297,7 @@ def benchmark(case: str, contenders: Sequence[Program], repeats: int) -> list[Ro
         except Exception as error:  # whatever another program fails with
             if expected is None:
                 raise
-            line = " ".join(str(error).split())
+            line = one_line(error)
             rows[name] = Row(case, name, skipped=f"{type(error).__name__}: {line}"[:200])
             continue
         rows[name] = Row(

@@ -160,8 +160,7 @@ class Embedding(nn.Module):
         self.hidden = hidden
         self.noise = noise
         self.kept = kept
-        weights = next(network.parameters(), None)
-        black = torch.zeros(1, channels, *self.resize, device=None if weights is None else weights.device)
+        black = torch.zeros(1, channels, *self.resize)
         try:
             with torch.no_grad(), in_mode(network, False):
                 output = network(black)

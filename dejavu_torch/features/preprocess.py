@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal, get_args
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 from dejavu_torch.features.hog import parts
 from dejavu_torch.types import InputError
 
+MOST_CLIP = 1e6
 Contrast = Literal["patch", "clahe"]
 COLOURS = "RGB"
 FLAT = 1 / 255  # one step of an 8-bit image: a smaller standard deviation says nothing
@@ -45,8 +45,10 @@ def check_patch(patch: int) -> None:
 
 def check_clahe(clip_limit: float, grid: tuple[int, int]) -> None:
     """Refuse a limit or a grid that makes no sense."""
-    if not 0 <= clip_limit < math.inf:
-        raise InputError(f"clip_limit is {clip_limit}; expected a number of at least 0 (0: no limit)")
+    if not 0 <= clip_limit <= MOST_CLIP:
+        raise InputError(
+            f"clip_limit is {clip_limit}; expected a number of at least 0 (no limit), at most {MOST_CLIP:g}"
+        )
     if len(grid) != 2 or any(tiles < 1 or tiles != int(tiles) for tiles in grid):
         raise InputError(f"grid is {tuple(grid)}; expected (rows, columns), whole numbers of at least 1")
 

@@ -20,6 +20,7 @@ from torch.optim import Optimizer
 
 from dejavu_torch.data.output import make_output_folder, whole_file
 from dejavu_torch.database.place_map import EXTRA
+from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
 EXPECTED = "expected a checkpoint that `dejavu train fit` wrote"
@@ -281,4 +282,4 @@ def taking_over(path: object, still: Callable[[], bool] = lambda: True) -> Itera
 
 def cause_of(error: Exception) -> str:
     """An exception in one short line."""
-    return " ".join(f"{type(error).__name__} {error}".split())[:300]
+    return one_line(f"{type(error).__name__} {error}")[:300]

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from dejavu_torch.database.distance import phase_distances
 from dejavu_torch.features.embedding import Coder, Embedding, to_length
 from dejavu_torch.features.extract import features_of, in_mode
+from dejavu_torch.text import one_line
 from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames
 from dejavu_torch.training.losses import Losses, place_cross_entropy
 from dejavu_torch.types import InputError
@@ -298,5 +299,5 @@ def described(task: PlaceRecognitionTask, values: Tensor, describe: Callable[[Te
         with torch.autocast(task.device.type, enabled=False):
             return features_of(as_frames(values).to(task.device), describe, "the batch")
     except RuntimeError as error:
-        problem, maker = " ".join(str(error).split())[:200], type(task.dejavu.features).__name__
+        problem, maker = one_line(error)[:200], type(task.dejavu.features).__name__
         raise InputError(f"{maker} does not take frames {tuple(values.shape[1:])}: {problem}") from error

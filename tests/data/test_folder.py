@@ -249,7 +249,7 @@ def png(rows: int, columns: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + parts
 
 
-@pytest.mark.parametrize("size", [(9000, 9000), (13_000, 13_000), (60_000, 60_000), (2, 2**27)])
+@pytest.mark.parametrize("size", [(14_000, 14_000), (60_000, 60_000), (2, 2**27)])
 def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(
     tmp_path: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -264,7 +264,7 @@ def test_an_image_that_the_memory_does_not_hold_is_refused(
 ) -> None:
     monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
     (tmp_path / "a.png").write_bytes(png(1000, 1000))
-    with refused("1000 x 1000 pixels", "0.01 GB free"):
+    with refused("1000 x 1000 pixels", "10 MB free"):
         read_image(tmp_path / "a.png")
 
 
@@ -311,5 +311,5 @@ def test_a_name_of_any_bytes_is_one_line(tmp_path: Path, name: bytes) -> None:
 @pytest.mark.parametrize("given", [(10**12, 0), (0, 10**30), (10**5, 10**5)])
 def test_a_size_beyond_reason_is_refused(tmp_path: Path, given: tuple[int, int]) -> None:
     write(tmp_path, "1.png")
-    with refused("expected at most"):
+    with refused("expected", "at most"):
         all_of(ImageFolder(tmp_path, *given))

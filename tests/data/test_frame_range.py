@@ -74,7 +74,7 @@ def test_large_frames_are_read_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) 
     assert frames.batch_size(64) == 3
     monkeypatch.setattr(types, "BATCH_NUMBERS", 20)
     assert frames.batch_size(64) == 1
-    monkeypatch.setattr(types, "BATCH_NUMBERS", 19)
+    monkeypatch.setattr(types, "FRAME_NUMBERS", 19)
     with refused("frames of 1 x 4 x 5 numbers", "expected at most 19"):
         frames.batch_size(64)
 

@@ -15,7 +15,7 @@ from helpers import all_of, refused
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from dejavu_torch.data import folder
+from dejavu_torch.data import video as video_module
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.data.video import Video
 
@@ -411,7 +411,7 @@ def test_a_stream_that_claims_too_many_pixels_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = clip(tmp_path / "a.mkv", pictures(3))
-    monkeypatch.setattr(folder, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(video_module, "MOST_PIXELS", 1000)
     with refused("a.mkv has 32 x 48 pixels", "at most 1000"):
         Video(path)
 

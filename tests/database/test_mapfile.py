@@ -587,8 +587,6 @@ HUGE = 2**62
     [
         {"batch_size": HUGE},
         {"batch_size": True},
-        {"threshold": 1e300},
-        {"step": 1e300},
         {"frame_shape": [1, 10**9, 10**9]},
         {"frame_shape": [1, -4, 4]},
         {"frame_shape": 64},
@@ -648,6 +646,35 @@ def test_claims_of_a_header_are_refused(
         DejaVu.load(path)
 
 
+@pytest.mark.parametrize("covered", [10**8, 2**50])
+def test_layers_of_more_places_than_can_be_meant_are_refused(saved: Path, covered: int) -> None:
+    tensors, sealed = contents(saved)
+    layers = tensors["map.layers"].clone()
+    layers[:, 4] = covered
+    craft(saved, {"map.layers": layers}, map=sealed["header"]["map"] | {"places": covered})
+    for read in (DejaVu.load, read_place_map):
+        with refused(f"a map of {covered} places, {2 * covered} in all layers", "expected at most"):
+            read(saved)
+
+
+def test_what_could_not_be_read_is_not_written(path: Path) -> None:
+    model = template_model(periods=WINDOW).learn(waves())
+    model.batch_size = 2**60
+    with refused("batch_size", "2^53"):
+        model.save(path)
+    assert not path.exists()
+    model.batch_size, model.threshold = 64, 1e30
+    model.save(path)
+    assert DejaVu.load(path).threshold == 1e30
+
+
+def test_an_argument_newer_than_the_file_has_its_default(saved: Path) -> None:
+    recipe = contents(saved)[1]["header"]["features"]
+    older = {name: value for name, value in recipe["init_args"].items() if name != "gradient"}
+    craft(saved, features=recipe | {"init_args": older})
+    assert DejaVu.load(saved).features.gradient == "central"
+
+
 def test_a_header_nested_without_end_is_refused(path: Path, whole_maps: list[Path]) -> None:
     header = contents(spectral(path, whole_maps))[1]["header"]
     nested = header["features"]
@@ -687,7 +714,7 @@ def test_places_that_no_memory_holds_are_refused(saved: Path, monkeypatch: pytes
     state = contents(saved)[1]["header"]["map"]
     craft(saved, map=state | {"places": 10**12})
     for read in (DejaVu.load, read_place_map):
-        with refused("a map of 1000000000000 places takes", "free"):
+        with refused("a map of 1000000000000 places", "at most"):
             read(saved)
 
 
@@ -811,6 +838,20 @@ class Patch(nn.Module):
         return self.convolution(frames)
 
 
+class Moving(Patch):
+    """A network that makes tensors as it runs."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        maps = super().forward(frames)
+        return maps + torch.linspace(0, 1, maps.shape[-1])
+
+
+class Sized(Small):
+    """Features from elsewhere, with a `resize` of their own."""
+
+    resize = 224
+
+
 def embedding(network: nn.Module, **settings: Any) -> Embedding:
     return Embedding(network, **{"dimension": 5, "channels": 1, "resize": (8, 8)} | settings)
 
@@ -867,6 +908,12 @@ def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> N
     assert again.features is given
     assert torch.equal(given.network.convolution.weight, model.features.network.convolution.weight)
     assert torch.equal(again.localize(query).score, model.localize(query).score)
+
+
+def test_a_network_that_is_given_may_do_as_it_likes(path: Path) -> None:
+    learnt_with(embedding(Moving()), path)
+    assert isinstance(DejaVu.load(path, Moving()).features.network, Moving)
+    assert learnt_with(Sized(), path).map.places == 64
 
 
 def test_of_an_embedding_the_network_alone_may_be_given(path: Path) -> None:
