@@ -6,8 +6,8 @@ import logging
 import math
 import shlex
 import warnings
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +192,7 @@ class TrainCLI(LightningCLI):
             raise InputError("trainer.overfit_batches does not fit; expected trainer.limit_train_batches")
         root = Path(self.trainer.default_root_dir)
         check_output_folder(root)
-        resumed = self.config_init[self.subcommand].get("ckpt_path")
+        resumed = self.config_init[self.subcommand].get("ckpt_path") is not None
         if resumed:
             self.before_validate()
         if not asked["fast_dev_run"] and (root / "map.safetensors").exists() and not resumed:
@@ -201,16 +201,12 @@ class TrainCLI(LightningCLI):
     def fit(self, **arguments: Any) -> None:
         """Train, and print what was written, also where the user interrupts."""
         root = Path(self.trainer.default_root_dir)
-        new, refused = not root.exists(), False
+        refused = False
         try:
             with interrupts_raise(), self._taking_over(arguments):
                 self.trainer.fit(**arguments)
         except (InputError, OSError) as error:
             refused = True
-            if new:  # Lightning writes the config ahead of all work
-                if [path.name for path in root.rglob("*") if path.is_file()] == ["config.yaml"]:
-                    (root / "config.yaml").unlink()
-                remove_empty_folders(root)
             if isinstance(error, OSError):
                 raise InputError(f"the training in {root} has failed: {error.strerror or error}") from error
             raise
@@ -232,8 +228,21 @@ class TrainCLI(LightningCLI):
         with self._taking_over(arguments):
             self.trainer.test(**arguments)
 
-    def _taking_over(self, arguments: dict[str, Any]) -> AbstractContextManager[None]:
-        return taking_over(arguments.get("ckpt_path"), lambda: self.model.resumed is not None)
+    @contextmanager
+    def _taking_over(self, arguments: dict[str, Any]) -> Iterator[None]:
+        """What fails leaves no folder of the config alone, which Lightning writes ahead of all work."""
+        root = Path(self.trainer.default_root_dir)
+        new = not root.exists()
+        try:
+            with taking_over(arguments.get("ckpt_path"), lambda: self.model.resumed is not None):
+                yield
+        except Exception:
+            files = [path for path in root.rglob("*") if path.is_file()] if new else []
+            if [path.name for path in files] == ["config.yaml"]:
+                files[0].unlink()
+            if new:
+                remove_empty_folders(root)
+            raise
 
     def before_validate(self) -> None:
         """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""

@@ -102,9 +102,10 @@ def test_a_pickle_runs_nothing_whatever_the_config_says(
     folder: Path, last: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     bad = changed(last, tmp_path / "bad.ckpt", ("more",), Touch())
+    words = ["--ckpt_path", bad, "--weights_only", "false", "--trainer.default_root_dir", tmp_path / "new"]
     for command in ("fit", "validate"):
-        line = refusal(capfd, command, "--ckpt_path", bad, "--weights_only", "false")
-        assert "more than tensors and plain data" in line
+        assert "more than tensors and plain data" in refusal(capfd, command, *words)
+    assert not (tmp_path / "new").exists()
     assert not (folder / "executed").exists()
 
 
@@ -146,11 +147,12 @@ def test_a_word_is_a_file_name(
 
 
 @pytest.mark.parametrize("command", ["fit", "validate", "export"])
+@pytest.mark.parametrize("name", ["last", ""])
 def test_last_is_the_last_of_the_folder(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str, name: str
 ) -> None:
     """And never untrained weights."""
-    line = refusal(capfd, command, "--ckpt_path", "last", "--trainer.default_root_dir", tmp_path / "run")
+    line = refusal(capfd, command, "--ckpt_path", name, "--trainer.default_root_dir", tmp_path / "run")
     assert "there is no checkpoint in" in line
 
 
