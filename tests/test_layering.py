@@ -42,7 +42,7 @@ ARROWS = {
     "motion": "types data",
     "model": "types text data features periods database recognition motion",
     "evaluation": "types resize text data features periods database recognition motion model",
-    "training": "types text resize data features periods database recognition motion model evaluation",
+    "training": "types text memory resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model evaluation",
     "cli": "types text data features periods database recognition motion model evaluation training "
     "experiments",

@@ -54,7 +54,7 @@ def refusal(error: Exception) -> InputError:
     own = [one for one in chain if isinstance(one, InputError)]
     if own:
         return own[-1]
-    return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST]}")
+    return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST] or type(chain[-1]).__name__}")
 
 
 def whole_numbers(value: object) -> Iterator[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shlex
 import warnings
 from collections.abc import Iterator, Sequence
@@ -27,6 +28,15 @@ from dejavu_torch.training.export import LastCheckpoint, MapExport
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
 
+RANGES = {  # of numbers that Lightning takes as they are, and fails on later
+    "seed_everything": (0, 2**32 - 1),
+    "trainer.max_steps": (-1, math.inf),
+    "trainer.val_check_interval": (1e-9, math.inf),
+    "trainer.check_val_every_n_epoch": (1, math.inf),
+    "trainer.accumulate_grad_batches": (1, math.inf),
+    "trainer.num_nodes": (1, 2**31 - 1),
+}
+MAY_BE_NULL = ("trainer.val_check_interval", "trainer.check_val_every_n_epoch")
 EVERY = 500  # steps between two validations, and between two checkpoints
 TRAINER = {
     "max_steps": 3000,
@@ -123,9 +133,15 @@ class TrainCLI(LightningCLI):
         parser.set_defaults({f"trainer.{name}": value for name, value in TRAINER.items()} | PARTS)
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Keep the words, for what to do next."""
+        """Keep the words, for what to do next; refuse numbers that Lightning fails on later."""
         self.words = list(args)
         super().parse_arguments(parser, args)
+        chosen = self.config[self.config["subcommand"]]
+        for name, (least, most) in RANGES.items():
+            value = chosen[name]
+            number = isinstance(value, (int, float))
+            if (number and not least <= value <= most) or (value is None and name not in MAY_BE_NULL):
+                raise InputError(f"{name} is {value}; expected a number from {least:g} to {most:.12g}")
 
     def _parse_ckpt_path(self) -> None:
         """Settings come from the config alone: Lightning would take some from the checkpoint, and import the
@@ -328,11 +344,15 @@ def run_train(arguments: Sequence[str]) -> None:
         )
     except RuntimeError as error:
         problem = one_line(error)[:300]
-        if "Early stopping conditioned" not in problem:
+        if "allocate memory" in problem:
+            problem = f"this training takes more memory than there is: {problem}"
+        elif "Early stopping conditioned" not in problem:
             raise
         raise InputError(problem) from error
     except MisconfigurationException as error:
         raise InputError(str(error)) from error
+    except MemoryError as error:
+        raise InputError(f"this training takes more memory than there is: {error}") from error
     except SystemExit as error:
         if isinstance(error.__context__, KeyboardInterrupt):  # Lightning would have it be a failure
             raise KeyboardInterrupt from error

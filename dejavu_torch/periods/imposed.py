@@ -67,7 +67,7 @@ class ImposedPeriods(PeriodFinder):
         bins = -(-places // self.bin)
         # a route of a single bin leaves nothing to tell apart
         periods = self.periods or supportive_periods(max(2, bins))
-        check_room(4.0 * sum(periods) * dimension, f"the templates of {sum(periods)} phases")
+        check_room(4 * sum(periods) * dimension, f"a template for each of {sum(periods)} imposed phases")
         distinct = math.lcm(*periods)
         if distinct < bins:
             log.warning(

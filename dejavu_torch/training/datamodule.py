@@ -14,11 +14,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.memory import concatenate
+from dejavu_torch.memory import check_room
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
@@ -137,10 +139,10 @@ class RouteData(LightningDataModule):
         velocity: GroundOdometry | None = None,
     ) -> None:
         super().__init__()
-        if tolerance < 0 or clip < 1 or batch_size < 2 or batch_size % clip:
+        if tolerance < 0 or clip < 1 or not 2 <= batch_size < LARGEST or batch_size % clip:
             raise InputError(
                 f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}; expected a tolerance of 0 "
-                "or more, and batches of at least 2 frames made of whole clips"
+                "or more, and batches of at least 2 frames, below 2^53, made of whole clips"
             )
         if resize is not None and (len(resize) != 2 or min(resize) < 1):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
@@ -269,7 +271,10 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
     def rows() -> Iterator[Tensor]:
         nonlocal shape
         for batch in traverse.batches(READ_AT_ONCE):
-            if batch.ndim == 4:
+            if batch.ndim == 4 and resize is not None:
+                numbers = batch.shape[1] * math.prod(resize)
+                needed = numbers * (4 * len(batch) + (traverse.length or 0))
+                check_room(needed, f"{traverse.name} in frames of {resize[0]} x {resize[1]}")
                 batch = resize_frames(batch, resize)
             if shape and tuple(batch.shape[1:]) != shape:
                 raise InputError(
