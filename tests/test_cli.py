@@ -688,3 +688,14 @@ def test_localize_memory_does_not_grow_with_the_queries(small_map: Path, tmp_pat
     few, many = peak(128), peak(1280)
     # features of the further frames would take 8 MB, their frames 57 MB, the painted route takes 2 MB
     assert many - few < 8_000
+
+
+def test_a_warning_of_a_library_is_one_line(small_map: Path) -> None:
+    code = (
+        "import sys, warnings\nfrom dejavu_torch.cli import commands, main\n"
+        "commands.print_map = lambda model: warnings.warn('two\\nlines')\nmain(['info', sys.argv[1]])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(small_map)], capture_output=True, text=True, check=True
+    )
+    assert done.stderr == "dejavu: two lines\n"

@@ -100,7 +100,9 @@ def _run(given: Sequence[str]) -> None:
 
 
 def _log_to_stderr() -> None:
+    """Messages and warnings of all libraries as lines of ours."""
     import logging
+    import warnings
 
     class OneLine(logging.Formatter):
         def format(self, record: logging.LogRecord) -> str:
@@ -110,6 +112,8 @@ def _log_to_stderr() -> None:
     handler.setFormatter(OneLine("dejavu: %(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     logging.getLogger("PIL").setLevel(logging.CRITICAL)  # what it says of an image is in the one line
+    log = logging.getLogger("dejavu_torch")
+    warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
 
 
 def _shortage(error: Exception) -> str | None:

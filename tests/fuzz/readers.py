@@ -28,7 +28,7 @@ from PIL import Image
 from torch import Tensor
 
 from dejavu_torch import cli
-from dejavu_torch.cli import commands
+from dejavu_torch.cli import commands, train
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import FOLDER, with_configs
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -359,6 +359,7 @@ def checkpoint(case: Case) -> None:
 
 @reader("train commands", inputs, share=0.15)
 def train_commands(case: Case) -> None:
+    train.TRAINER |= {"max_steps": 2, "max_time": "00:00:00:08"}  # where a config does not say it
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
     random, data = case.random, Path("in/last.ckpt")
     fit, resume = ["train", "fit", "--config", "in/train.yaml"], ["--ckpt_path", "in/last.ckpt"]

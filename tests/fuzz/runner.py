@@ -40,6 +40,7 @@ from typing import Any, NamedTuple
 import torch
 
 import dejavu_torch
+from dejavu_torch import cli
 from dejavu_torch.types import InputError
 
 from .mutations import CANARY
@@ -203,7 +204,8 @@ def _prepare(root: Path) -> None:
         os.dup2(file, output)
     sys.stdout = open(1, "w", encoding="utf-8", errors="surrogateescape", closefd=False)  # noqa: SIM115
     sys.stderr = open(2, "w", 1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
-    logging.basicConfig(format="dejavu: %(message)s", level=logging.WARNING, stream=sys.stderr, force=True)
+    logging.getLogger().handlers.clear()
+    cli._log_to_stderr()
     os.environ["TMPDIR"] = tempfile.tempdir = str(root / "tmp")
     os.environ["MPLCONFIGDIR"] = str(root / "matplotlib")
     (root / "canary").mkdir(exist_ok=True)
