@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from jsonargparse import Namespace
 from lightning_fabric.plugins import CheckpointIO
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning import LightningModule, Trainer
@@ -137,6 +138,9 @@ class TrainCLI(LightningCLI):
         self.words = list(args)
         super().parse_arguments(parser, args)
         chosen = self.config[self.config["subcommand"]]
+        for part in ("trainer", "model", "data"):
+            if not isinstance(chosen[part], Namespace):
+                raise InputError(f"{part} is {chosen[part]!r:.40}; expected options, as KEY: VALUE")
         for name, (least, most) in RANGES.items():
             value = chosen[name]
             number = isinstance(value, (int, float))

@@ -144,6 +144,14 @@ def test_a_mistake_in_the_config_is_one_line(
     fails(capfd, ["fit", "--config", str(tmp_path / "bad.yaml")], words)
 
 
+@pytest.mark.parametrize("part", ["trainer", "model"])
+def test_a_part_that_is_a_number_is_one_line(
+    folder: Path, capfd: pytest.CaptureFixture[str], tmp_path: Path, part: str
+) -> None:
+    (tmp_path / "bad.yaml").write_text(f"data: {{source: one.npy}}\n{part}: 5\n")
+    fails(capfd, ["fit", "--config", str(tmp_path / "bad.yaml")], [f"{part} is 5", "expected options"])
+
+
 def fails(capfd: pytest.CaptureFixture[str], arguments: list[str], words: list[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["train", *arguments])
