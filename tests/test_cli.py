@@ -559,6 +559,11 @@ def test_bad_source(bad: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "expected" in fails(capsys, "learn", bad, "--map", tmp_path / "a.safetensors")
 
 
+@pytest.mark.parametrize("name", ["", ".", "/"])
+def test_a_map_without_a_name_is_one_line(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    fails(capsys, "learn", "sim:aerial?frames=64", "--map", name)
+
+
 @pytest.mark.parametrize("bad", ["a.txt", "a"])
 def test_a_map_has_its_ending(bad: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     error = fails(capsys, "learn", "nowhere", "--map", tmp_path / bad)  # before anything is read

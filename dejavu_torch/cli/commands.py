@@ -86,7 +86,8 @@ def run_learn(
         second_truth: which places it shows, as --truth of `dejavu compare`
     """
     if map.suffix != ".safetensors":
-        raise InputError(f"--map {map} is no name of a map; expected such as route.safetensors")
+        expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
+        raise InputError(f"--map {map} is no name of a map; expected {expected}")
     check_output_file(map)
     _set_seed(model, seed)
     traverse = model.resample(open_source(source), progress=True)
