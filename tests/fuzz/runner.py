@@ -41,6 +41,7 @@ import torch
 
 import dejavu_torch
 from dejavu_torch import cli
+from dejavu_torch.data.output import PREFIX
 from dejavu_torch.types import InputError
 
 from .mutations import CANARY
@@ -166,7 +167,7 @@ def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporar
     new = sorted(name for name in after if name not in before)
     changed = [name for name in before if after.get(name) != before[name]]
     if outcome == "accepted":
-        new = [name for name in new if any(part[0] == "." or ".part" in part for part in Path(name).parts)]
+        new = [name for name in new if PREFIX in name or ".part" in name]
         changed = [] if case.words else changed
     if new:
         findings.append(Finding(f"file left where {outcome}", "", str(new)[:MOST]))
