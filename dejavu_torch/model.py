@@ -579,10 +579,9 @@ class DejaVu(nn.Module):
         Raises:
             InputError: a state of other entries, or of other types.
         """
-        kinds = {name: HEADER_TYPES[name] for name in self.get_extra_state()}
-        checked = checked_fields(state, kinds, "the model's state")
-        self.frame_shape, self.step, self.trained = (checked[n] for n in ("frame_shape", "step", "trained"))
-        self.frame_names = [] if checked["names"] is None else decode_names(checked["names"])
+        told = checked_fields(state, STATE_TYPES, "the model's state")
+        self.frame_shape, self.step, self.trained = (told[n] for n in ("frame_shape", "step", "trained"))
+        self.frame_names = [] if told["names"] is None else decode_names(told["names"])
 
     def _require_map(self) -> None:
         if not self.map.places:
@@ -629,6 +628,7 @@ class Header(NamedTuple):
 
 
 HEADER_TYPES = get_type_hints(Header)
+STATE_TYPES = {name: HEADER_TYPES[name] for name in ("frame_shape", "step", "trained", "names")}
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 # commands and notebooks run in processes of their own, beside each other
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# a shell has what runs in its background ignore Ctrl-C, and commands take over what they find
+if (
+    signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    and threading.current_thread() is threading.main_thread()
+):
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # the same examples on every machine, however slow it is
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=40)

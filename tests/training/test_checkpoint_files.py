@@ -147,11 +147,11 @@ def test_a_word_is_a_file_name(
 
 
 @pytest.mark.parametrize("command", ["fit", "validate", "export"])
-@pytest.mark.parametrize("name", ["last", ""])
 def test_last_is_the_last_of_the_folder(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str, name: str
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str
 ) -> None:
     """And never untrained weights."""
+    name = "last"
     line = refusal(capfd, command, "--ckpt_path", name, "--trainer.default_root_dir", tmp_path / "run")
     assert "there is no checkpoint in" in line
 
@@ -215,7 +215,7 @@ ODD: list[tuple[tuple[Any, ...], Any, list[str]]] = [
     (("state_dict", "dejavu.map.templates"), torch.empty(HUGE, device="meta"), ["more numbers"]),
     (("state_dict", "dejavu._extra_state"), {"frame_shape": torch.ones(3)}, ["_extra_state", "plain"]),
     (("state_dict", "dejavu._extra_state"), {"frame_shape": float("nan")}, ["_extra_state", "plain"]),
-    (("state_dict", "dejavu._extra_state"), {}, ["cannot be taken over", "frame_shape"]),
+    (("state_dict", "dejavu._extra_state"), {}, ["_extra_state", "frame_shape"]),
     (("global_step",), "4", ["global_step is of type str"]),
     (("global_step",), -1, ["global_step is -1"]),
     (("global_step",), 2**62, ["global_step is 4611686018427387904"]),
