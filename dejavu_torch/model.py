@@ -42,7 +42,15 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.text import one_line
-from dejavu_torch.types import BATCH_NUMBERS, InputError, Match, SequenceModel, Training, Traverse
+from dejavu_torch.types import (
+    BATCH_NUMBERS,
+    FRAME_NUMBERS,
+    InputError,
+    Match,
+    SequenceModel,
+    Training,
+    Traverse,
+)
 
 log = logging.getLogger("dejavu_torch")
 
@@ -124,7 +132,7 @@ class DejaVu(nn.Module):
         if not isinstance(batch_size, int) or batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
         if threshold is not None and not threshold > -math.inf:
-            raise InputError(f"the threshold is {threshold}; expected a number")
+            raise InputError(f"the threshold is {threshold}; expected a number, or None")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
         self.mapper = SpectralMapper() if mapper is None else mapper
@@ -538,7 +546,7 @@ class DejaVu(nn.Module):
                 f"its whitening makes {whitening.dimension} numbers; expected the map's {self.map.dimension}"
             )
         if shape is not None and (
-            len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > BATCH_NUMBERS
+            len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > FRAME_NUMBERS
         ):
             raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 

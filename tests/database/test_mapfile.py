@@ -657,6 +657,14 @@ def test_layers_of_more_places_than_can_be_meant_are_refused(saved: Path, covere
             read(saved)
 
 
+def test_a_map_of_large_frames_can_be_read(path: Path) -> None:
+    """A frame of 24 million pixels, read one at a time, has more numbers than a batch of small ones."""
+    model = template_model(HOG(resize=(16, 16)), WINDOW).learn(pictures())
+    model.frame_shape = (3, 4000, 6000)
+    model.save(path)
+    assert DejaVu.load(path).frame_shape == (3, 4000, 6000)
+
+
 def test_what_could_not_be_read_is_not_written(path: Path) -> None:
     model = template_model(periods=WINDOW).learn(waves())
     model.batch_size = 2**60
