@@ -193,12 +193,13 @@ def test_a_reference_tells_evaluate_where_the_map_ends(
 def test_the_threshold_that_is_named_accepts_right_places_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flights = ("sim:aerial?frames=256", "sim:aerial?frames=256&traverse=1")
+    flights = ("sim:aerial?frames=128", "sim:aerial?frames=128&traverse=1")
     run("compare", *flights, "--out", tmp_path / "first")
     first = report_of(tmp_path / "first")
     assert f"--threshold {first['threshold_of_full_precision']:.9g}" in capsys.readouterr().out
     threshold = str(first["threshold_of_full_precision"])
-    run("compare", *flights, "--threshold", threshold, "--out", tmp_path / "second")
+    learned = ("--map", tmp_path / "first" / "map.safetensors")
+    run("compare", *flights, *learned, "--threshold", threshold, "--out", tmp_path / "second")
     second = report_of(tmp_path / "second")
     assert 0 < second["accepted"] == second["accepted_right"]
     assert second["accepted"] == round(first["recall_at_100_precision"] * first["with_answer"])

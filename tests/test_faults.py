@@ -73,7 +73,7 @@ def names_in(folder: Path) -> set[str]:
 
 
 def test_ctrl_c_at_any_moment_is_one_line_and_130(folder: Path) -> None:
-    moments = [0, 0.02, 0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0]
+    moments = [0, 0.02, 0.2, 0.6, 1.2, 1.9, 2.6]
     before = names_in(folder)
     for twice, moment in enumerate(moments):
         process = start(folder, *REPORT_OF_ARRAYS)
@@ -286,15 +286,14 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None
         "mkdir disk/old; echo old > disk/old/matches.csv; echo old > disk/old/pr.png",
         "cp map.safetensors disk; dd if=/dev/zero of=disk/full bs=1k count=36 status=none",
         f"{dejavu} compare a.npy b.npy --truth 0 --out disk/old > /dev/null; echo status $?",
-        f"{dejavu} compare a.npy b.npy --truth 0 --out disk/new > /dev/null; echo status $?",
         "dd if=/dev/zero of=disk/full bs=1k count=64 status=none 2> /dev/null",
         f"{dejavu} learn a.npy --map disk/map.safetensors > /dev/null; echo status $?",
         "find disk -mindepth 1 | sort; cat disk/old/*; cmp map.safetensors disk/map.safetensors",
     )
     said = [line for line in found if line.startswith("dejavu: ")]
-    assert [line.rpartition(": ")[2][:13] for line in said] == ["No space left"] * 3
+    assert [line.rpartition(": ")[2][:13] for line in said] == ["No space left"] * 2
     assert [line for line in found if line not in said] == [
-        *["status 2"] * 3,
+        *["status 2"] * 2,
         *("disk/full", "disk/map.safetensors", "disk/old", "disk/old/matches.csv", "disk/old/pr.png"),
         *("old", "old"),
     ]

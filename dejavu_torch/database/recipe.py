@@ -15,6 +15,7 @@ from dejavu_torch.types import InputError
 
 M = TypeVar("M", bound=nn.Module)
 Registry = Mapping[str, type[nn.Module]]
+MOST_PARTS = 16  # of a recipe: each is tried out with all that it holds
 
 
 class Recipe(NamedTuple):
@@ -67,7 +68,8 @@ def build(recipe: Recipe, kind: type[M], registry: Registry, given: nn.Module | 
         given: a module from elsewhere, used where the recipe, or a part of it, is its own.
 
     Raises:
-        InputError: a class outside the registry, one that is no `kind`, or arguments that are not its own.
+        InputError: a class outside the registry, one that is no `kind`, arguments that are not its own, or
+            parts within parts beyond `MOST_PARTS`.
     """
     name = recipe.class_path
     if isinstance(given, kind) and recipe_of(given, registry) == recipe:
@@ -87,6 +89,9 @@ def build(recipe: Recipe, kind: type[M], registry: Registry, given: nn.Module | 
         if key in recipe.init_args or parameter.default is parameter.empty
     }
     arguments = checked_fields(recipe.init_args, kinds, f"the map's {name}")
+    count = len(with_parts(recipe))
+    if count > MOST_PARTS:
+        raise InputError(f"the map's {name} is made of {count} parts; expected at most {MOST_PARTS}")
     parts = {key: build(part, nn.Module, registry, given) for key, part in inner_recipes(recipe)}
     return cls(**arguments | parts)
 
