@@ -8,7 +8,8 @@ from pathlib import Path
 
 from dejavu_torch.types import InputError
 
-GROUP = Path("/sys/fs/cgroup")  # the limits of a container (version 2)
+GROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
+OWN = Path("/proc/self/cgroup")  # in which of them the process is
 CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back where memory is short
 
 
@@ -52,10 +53,29 @@ def _of_system() -> float:
 
 
 def _of_container() -> float:
+    """What is left to the group of the process, and to each that it lies in."""
     try:
-        limit, taken = (float((GROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
-        lines = (GROUP / "memory.stat").read_text().splitlines()
-        parts = {name: float(value) for name, value in map(str.split, lines)}
+        lines = [line.split(":", 2) for line in OWN.read_text().splitlines()]
+    except OSError:
+        lines = []
+    free = math.inf
+    for _, kinds, place in [line for line in lines if len(line) == 3] or [("0", "", "/")]:
+        if kinds and "memory" not in kinds.split(","):
+            continue
+        root = GROUPS / "memory" if kinds else GROUPS
+        inside = root / place.lstrip("/")
+        for group in (inside, *inside.parents):
+            if group.is_relative_to(root):
+                free = min(free, _of_group(group, bool(kinds)))
+    return free
+
+
+def _of_group(group: Path, first_version: bool) -> float:
+    names = ("limit_in_bytes", "usage_in_bytes") if first_version else ("max", "current")
+    try:
+        limit, taken = (float((group / f"memory.{name}").read_text()) for name in names)
+        lines = (group / "memory.stat").read_text().splitlines()
+        parts = {name.removeprefix("total_"): float(value) for name, value in map(str.split, lines)}
     except (OSError, ValueError):  # none, or "max"
         return math.inf
     return limit - taken + sum(parts.get(name, 0) for name in CACHES)

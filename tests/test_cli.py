@@ -437,7 +437,7 @@ def test_too_few_frames(count: int, tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_paper_preset_refuses_less_than_its_window(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", "paper")
+    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "-c", "paper")
     assert "256" in error
     assert "1024" in error
 

@@ -24,7 +24,7 @@ def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.Monk
 
 
 def test_the_limit_of_a_container_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    monkeypatch.setattr(memory, "GROUPS", tmp_path)
     before = free_memory()
     (tmp_path / "memory.current").write_text("1000000\n")
     (tmp_path / "memory.max").write_text("max\n")
@@ -35,6 +35,21 @@ def test_the_limit_of_a_container_counts(tmp_path: Path, monkeypatch: pytest.Mon
     assert free_memory() == 2.45e6  # what caches hold is free
     with pytest.raises(InputError, match=r"^a strip takes 5 MB; expected at most the 2.45 MB free$"):
         check_room(5e6, "a strip")
+
+
+def test_the_limits_of_the_groups_around_a_job_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own, inside = tmp_path / "own", tmp_path / "memory" / "slurm" / "job" / "step"
+    monkeypatch.setattr(memory, "GROUPS", tmp_path)
+    monkeypatch.setattr(memory, "OWN", own)
+    own.write_text("5:cpu:/elsewhere\n4:memory:/slurm/job/step\n0::/slurm\n")
+    inside.mkdir(parents=True)
+    for group, limit in ((inside, 2**63 - 4096), (inside.parent, 3_000_000)):
+        (group / "memory.limit_in_bytes").write_text(f"{limit}\n")
+        (group / "memory.usage_in_bytes").write_text("1000000\n")
+        (group / "memory.stat").write_text("inactive_file 9\ntotal_inactive_file 400000\n")
+    assert free_memory() == 2.4e6
+    own.write_text("0::/slurm/../..\n")
+    assert free_memory() > 2.4e6
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="this system does not say what is taken")

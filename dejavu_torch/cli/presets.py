@@ -138,7 +138,7 @@ def with_configs(words: Sequence[str]) -> list[str]:
             found[i] = f"--config={path}"
         elif i and words[i - 1] in ("--config", "-c"):
             path = find_config(word)
-            found[i] = str(path)
+            found[i - 1 : i + 1] = "--config", str(path)
         else:
             continue
         check_config(path)

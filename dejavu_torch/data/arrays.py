@@ -42,7 +42,8 @@ class ArrayTraverse(IndexedTraverse):
         kind = str(values.dtype).removeprefix("torch.") if isinstance(values, Tensor) else values.dtype.name
         pixels = kind == "uint8" and (len(shape) == 3 or (len(shape) == 4 and shape[3] in (1, 3)))
         floats = kind in ("float16", "bfloat16", "float32", "float64") and len(shape) in (2, 4)
-        if not (pixels or floats):
+        colours_last = floats and len(shape) == 4 and shape[3] in (1, 3) and shape[1] not in (1, 3)
+        if not (pixels or floats) or colours_last:
             raise InputError(f"{name} is {shape} {kind}; expected {EXPECTED}")
         if 0 in shape:
             raise InputError(f"{name} is {shape}, which holds nothing; expected {EXPECTED}")

@@ -27,10 +27,12 @@ def check_regular(path: Path, expected: str) -> int:
     """
     try:
         status = path.stat()
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is not there; expected {expected}") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise InputError(f"{path} cannot be read: {_why(error)}; expected {expected}") from error
     if not stat.S_ISREG(status.st_mode):
-        kind = "a directory" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
         raise InputError(f"{path} is {kind}; expected {expected}")
     return status.st_size
 

@@ -9,16 +9,19 @@ import json
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import is_zipfile
 
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import whole_file
 from dejavu_torch.types import InputError
 
 FORMAT = 7
+SEALED = 7  # the first with checksums; before it the version stood by itself
 NAME = "dejavu_torch-map"
 EXPECTED = "a map file, as DejaVu.save writes"
 HEADER = "header"  # the part that is no tensor
@@ -91,20 +94,21 @@ def read_map(path: Path) -> Contents:
     Raises:
         InputError: missing, truncated, foreign, damaged, or of another format.
     """
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; expected {EXPECTED}")
-    if not path.is_file():
-        raise InputError(f"{path} is not there; expected {EXPECTED}")
+    check_regular(path, EXPECTED)
+    if is_zipfile(path):
+        seen = f"{path} is a checkpoint or an archive"
+        raise InputError(f"{seen}; expected a map, as `dejavu train export` makes")
+            f"{path} is a checkpoint or an archive; expected a map, as `dejavu train export` makes"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             if NAME not in metadata and metadata.get("format") != NAME:
                 raise InputError(f"{path} is no map of dejavu_torch; expected {EXPECTED}")
-            # before format 7 the version stood by itself
             sealed: dict[str, Any] = (
                 _json(metadata[NAME]) if NAME in metadata else {"version": int(metadata["version"])}
             )
-            _check_version(path, sealed["version"])
+            _check_version(path, sealed["version"], NAME in metadata)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         header, seen = sealed[HEADER], checksums(tensors, sealed[HEADER])
     except InputError:
@@ -132,8 +136,8 @@ def _no_number(text: str) -> float:
     raise ValueError(f"{text} is no number")
 
 
-def _check_version(path: Path, version: object) -> None:
-    if type(version) is not int:
+def _check_version(path: Path, version: object, sealed: bool) -> None:
+    if type(version) is not int or (sealed and version < SEALED):
         raise ValueError(f"its version is {version!r:.40}")
     if version != FORMAT:
         newer = "a newer dejavu_torch is needed" if version > FORMAT else "learn the route again"

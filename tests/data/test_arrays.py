@@ -79,6 +79,7 @@ def test_a_batch_is_a_copy_of_a_file(tmp_path: Path) -> None:
         np.zeros((3, 4, 5, 2), np.uint8),
         np.zeros((3, 4, 5), np.uint16),
         np.zeros((2, 3, 4, 5, 6)),
+        np.zeros((3, 4, 5, 3)),
         np.zeros((0, 4)),
         np.zeros((3, 0)),
         np.zeros((0, 4, 5), np.uint8),

@@ -23,8 +23,8 @@ def test_a_regular_file_tells_its_size(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("missing", "No such file"),
-        ("", "a directory"),
+        ("missing", "is not there"),
+        ("", "a folder"),
         ("fifo", "no regular file"),
         ("a\0b", "null"),
         ("x" * 5000, "too long"),

@@ -240,10 +240,10 @@ def test_text_that_is_no_truth_is_refused(truth: str) -> None:
 
 @pytest.mark.parametrize("name", ["none.csv", "none.npz", "none.CSV"])
 def test_a_file_that_is_not_there_is_refused_early(tmp_path: Path, name: str) -> None:
-    with refused(name, "No such file", "expected"):
+    with refused(name, "is not there", "expected"):
         check_ground_truth(str(tmp_path / name))
     (tmp_path / name).mkdir()
-    with refused(name, "directory"):
+    with refused(name, "is a folder"):
         check_ground_truth(str(tmp_path / name))
 
 

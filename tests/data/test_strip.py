@@ -86,7 +86,7 @@ def test_what_is_no_strip_is_refused(strip: Tensor) -> None:
 
 
 def test_a_missing_or_broken_image_is_refused(tmp_path: Path) -> None:
-    with refused("missing.png", "cannot be read"):
+    with refused("missing.png", "is not there"):
         open_source(f"strip:{tmp_path}/missing.png?width=3")
     (tmp_path / "text.png").write_text("text")
     with refused("text.png", "cannot be read"):

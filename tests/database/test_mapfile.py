@@ -344,6 +344,18 @@ def test_a_map_of_an_unreleased_format_is_refused(saved: Path) -> None:
         DejaVu.load(saved)
 
 
+def test_an_age_that_no_file_of_this_form_has_is_damage(saved: Path) -> None:
+    with_metadata(saved, {NAME: json.dumps(contents(saved)[1] | {"version": 5})})
+    with refused(str(saved), "its version is 5", "whole one"):
+        DejaVu.load(saved)
+
+
+def test_a_checkpoint_is_told_as_one(path: Path) -> None:
+    torch.save({"state_dict": {}}, path)
+    with refused(str(path), "is a checkpoint", "dejavu train export"):
+        DejaVu.load(path)
+
+
 def test_a_map_of_a_kind_that_is_not_known_is_refused(saved: Path) -> None:
     kind = contents(saved)[1]["header"]["map"] | {"kind": "holographic"}
     craft(saved, map=kind)
@@ -1034,7 +1046,7 @@ def test_no_foreign_class_path_is_imported(
         outer = "Embedding"
         foreign = {"class_path": outer, "init_args": {"network": foreign}}
     craft(saved, features=foreign)
-    with refused():
+    with refused(class_path):
         DejaVu.load(saved)
     with refused("HOG"):
         DejaVu.load(saved, HOG())

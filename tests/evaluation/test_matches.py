@@ -125,9 +125,9 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path, text: str | bytes, words
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with refused("none.csv", "No such file", "query,place,score"):
+    with refused("none.csv", "is not there", "query,place,score"):
         read_matches(tmp_path / "none.csv")
-    with refused("directory"):
+    with refused("is a folder"):
         read_matches(tmp_path)
 
 
