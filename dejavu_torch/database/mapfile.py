@@ -9,7 +9,6 @@ import json
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import is_zipfile
 
 import safetensors.torch
 import torch
@@ -23,6 +22,7 @@ from dejavu_torch.types import InputError
 FORMAT = 7
 SEALED = 7  # the first with checksums; before it the version stood by itself
 NAME = "dejavu_torch-map"
+ZIP = b"PK\x03\x04"  # what an archive begins with
 EXPECTED = "a map file, as DejaVu.save writes"
 HEADER = "header"  # the part that is no tensor
 
@@ -95,21 +95,22 @@ def read_map(path: Path) -> Contents:
         InputError: missing, truncated, foreign, damaged, or of another format.
     """
     check_regular(path, EXPECTED)
-    if is_zipfile(path):
-        seen = f"{path} is a checkpoint or an archive"
-        raise InputError(f"{seen}; expected a map, as `dejavu train export` makes")
-            f"{path} is a checkpoint or an archive; expected a map, as `dejavu train export` makes"
-        )
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
+        with path.open("rb") as file:
+            if file.read(len(ZIP)) == ZIP:
+                raise InputError(
+                    f"{path} is a checkpoint or another archive; expected a map, as `dejavu train export` "
+                    "makes of a checkpoint"
+                )
+        with safe_open(path, framework="pt") as archive:
+            metadata = archive.metadata() or {}
             if NAME not in metadata and metadata.get("format") != NAME:
                 raise InputError(f"{path} is no map of dejavu_torch; expected {EXPECTED}")
             sealed: dict[str, Any] = (
                 _json(metadata[NAME]) if NAME in metadata else {"version": int(metadata["version"])}
             )
             _check_version(path, sealed["version"], NAME in metadata)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
         header, seen = sealed[HEADER], checksums(tensors, sealed[HEADER])
     except InputError:
         raise
