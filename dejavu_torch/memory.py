@@ -59,7 +59,7 @@ def _of_container() -> float:
     except OSError:
         lines = []
     free = math.inf
-    for _, kinds, place in [line for line in lines if len(line) == 3] or [("0", "", "/")]:
+    for _, kinds, place in [line for line in lines if len(line) == 3] or [["0", "", "/"]]:
         if kinds and "memory" not in kinds.split(","):
             continue
         root = GROUPS / "memory" if kinds else GROUPS
