@@ -102,7 +102,8 @@ def test_it_resumes(folder: Path, tmp_path: Path) -> None:
 
 
 def test_auto_is_one_device_of_however_many(folder: Path, tmp_path: Path) -> None:
-    train("fit", "--trainer.devices", "auto", "--trainer.default_root_dir", tmp_path)
+    options = ["--trainer.default_root_dir", tmp_path, "--trainer.logger", "false"]
+    train("fit", "--trainer.devices", "auto", *options)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trainer"]["devices"] == 1
 
 
