@@ -30,12 +30,11 @@ from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_w
 from dejavu_torch.types import InputError
 
 RANGES = {  # of numbers that Lightning takes as they are, and fails on later
-    "seed_everything": (0, 2**32 - 1),
-    "trainer.max_steps": (-1, math.inf),
-    "trainer.val_check_interval": (1e-9, math.inf),
-    "trainer.check_val_every_n_epoch": (1, math.inf),
-    "trainer.accumulate_grad_batches": (1, math.inf),
-    "trainer.num_nodes": (1, 2**31 - 1),
+    "seed_everything": (0, 2**32 - 1, "from 0 to 2^32 - 1"),
+    "trainer.max_steps": (-1, math.inf, "of at least 1, or -1 for no end"),
+    "trainer.val_check_interval": (1e-9, math.inf, "above 0"),
+    "trainer.check_val_every_n_epoch": (1, math.inf, "of at least 1"),
+    "trainer.accumulate_grad_batches": (1, math.inf, "of at least 1"),
 }
 MAY_BE_NULL = ("trainer.val_check_interval", "trainer.check_val_every_n_epoch")
 EVERY = 500  # steps between two validations, and between two checkpoints
@@ -141,19 +140,24 @@ class TrainCLI(LightningCLI):
         for part in ("trainer", "model", "data"):
             if not isinstance(chosen[part], Namespace):
                 raise InputError(f"{part} is {chosen[part]!r:.40}; expected options, as KEY: VALUE")
-        for name, (least, most) in RANGES.items():
+        for name, (least, most, expected) in RANGES.items():
             value = chosen[name]
             number = isinstance(value, (int, float))
             if (number and not least <= value <= most) or (value is None and name not in MAY_BE_NULL):
-                raise InputError(f"{name} is {value}; expected a number from {least:g} to {most:.12g}")
+                raise InputError(f"{name} is {value}; expected a number {expected}")
+        counts = {name: chosen["trainer"][name] for name in ("devices", "num_nodes")}
+        if _several(counts["devices"]) or counts["num_nodes"] != 1:  # they would wait for each other forever
+            told = ", ".join(f"trainer.{name} is {value}" for name, value in counts.items())
+            raise InputError(f"a training runs on one device: {told:.99}; expected 1 of each")
 
     def _parse_ckpt_path(self) -> None:
         """Settings come from the config alone: Lightning would take some from the checkpoint, and import the
         classes that it names."""
 
     def before_instantiate_classes(self) -> None:
-        """Validation is by steps, unless it is asked for by epochs or otherwise."""
+        """Validation is by steps, unless it is asked for by epochs or otherwise; one device of several."""
         trainer = self.config[self.subcommand]["trainer"]
+        trainer["devices"] = 1 if trainer["devices"] == "auto" else trainer["devices"]
         if trainer["check_val_every_n_epoch"] is None and trainer["val_check_interval"] is None:
             steps = trainer["max_steps"]
             trainer["val_check_interval"] = min(EVERY, steps) if steps > 0 else EVERY
@@ -234,9 +238,10 @@ class TrainCLI(LightningCLI):
 
     @contextmanager
     def _taking_over(self, arguments: dict[str, Any]) -> Iterator[None]:
-        """What fails leaves no folder of the config alone, which Lightning writes ahead of all work."""
+        """What fails leaves no folder of the config alone, which Lightning writes ahead of all work, nor the
+        folders that were made for it."""
         root = Path(self.trainer.default_root_dir)
-        new = not root.exists()
+        new = [folder for folder in (root, *root.parents) if not folder.exists()]
         try:
             with taking_over(arguments.get("ckpt_path"), lambda: self.model.resumed is not None):
                 yield
@@ -245,7 +250,7 @@ class TrainCLI(LightningCLI):
             if [path.name for path in files] == ["config.yaml"]:
                 files[0].unlink()
             if new:
-                remove_empty_folders(root)
+                remove_empty_folders(new[-1])
             raise
 
     def before_validate(self) -> None:
@@ -305,6 +310,12 @@ class ConfigFile(SaveConfigCallback):
             self.parser.save(self.config, temporary, "yaml", False, overwrite=True, multifile=False)
 
 
+def _several(devices: int | str | list[int]) -> bool:
+    """Whether trainer.devices is no single one: a count of 1, or the number of one, as `[2]` or `2,`."""
+    named = devices.strip(", ").split(",") if isinstance(devices, str) and "," in devices else devices
+    return len(named) != 1 if isinstance(named, list) else named not in (1, "1", "auto")
+
+
 def _listed(given: Any) -> list[Any]:
     """One, several or none, as Lightning takes callbacks and plugins."""
     return [*given] if isinstance(given, list) else [] if given is None else [given]
@@ -347,16 +358,11 @@ def run_train(arguments: Sequence[str]) -> None:
             save_config_callback=ConfigFile,
         )
     except RuntimeError as error:
-        problem = one_line(error)[:300]
-        if "allocate memory" in problem:
-            problem = f"this training takes more memory than there is: {problem}"
-        elif "Early stopping conditioned" not in problem:
+        if "Early stopping conditioned" not in str(error):
             raise
-        raise InputError(problem) from error
+        raise InputError(one_line(error)[:300]) from error
     except MisconfigurationException as error:
         raise InputError(str(error)) from error
-    except MemoryError as error:
-        raise InputError(f"this training takes more memory than there is: {error}") from error
     except SystemExit as error:
         if isinstance(error.__context__, KeyboardInterrupt):  # Lightning would have it be a failure
             raise KeyboardInterrupt from error

@@ -272,8 +272,7 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
         nonlocal shape
         for batch in traverse.batches(READ_AT_ONCE):
             if batch.ndim == 4 and resize is not None:
-                numbers = batch.shape[1] * math.prod(resize)
-                needed = numbers * (4 * len(batch) + (traverse.length or 0))
+                needed = 4 * len(batch) * batch.shape[1] * math.prod(resize)
                 check_room(needed, f"{traverse.name} in frames of {resize[0]} x {resize[1]}")
                 batch = resize_frames(batch, resize)
             if shape and tuple(batch.shape[1:]) != shape:

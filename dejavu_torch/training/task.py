@@ -14,6 +14,7 @@ import pytorch_lightning as pl
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -49,6 +50,7 @@ log = logging.getLogger("dejavu_torch")
 TEMPERATURE = 0.03  # of `log_posterior` at the start
 DESCRIPTOR = 0.4  # of the steps of a training whose descriptor gets a code
 MAP = "dejavu.map."  # ahead of the names of the map's tensors in a checkpoint
+WHITENING = "dejavu.whitening."
 CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
 NETWORK = "network."  # of any Embedding
 
@@ -143,6 +145,10 @@ class PlaceRecognitionTask(pl.LightningModule):
         if self.made and isinstance(backbone, Embedding) and has_descriptor(backbone):
             backbone = backbone.without_code()
         self.dejavu = DejaVu(backbone, whitening, mapper, batch_size=batch_size, preprocess=preprocess)
+        for module in backbone.modules():  # a checkpoint cannot be loaded into expanded ones
+            for name, buffer in module.named_buffers(recurse=False):
+                if not is_lazy(buffer):
+                    setattr(module, name, buffer.contiguous())
         if start is not None:
             start_from(backbone, start)
         self.frozen = [module.eval() for module in freeze_parts(backbone, freeze or [], batch_norm)]
@@ -453,6 +459,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         if checkpoint.get("stages") != stages:
             seen = checkpoint.get("stages", "no training")
             raise InputError(f"the checkpoint is of {seen}; expected one of the stages {stages}")
+        self._check_finite(checkpoint["state_dict"])
         if self._trainer is not None:
             self.resumed = checkpoint
             if self.trainer.state.fn != "fit":
@@ -467,6 +474,16 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both; expected a "
                 "checkpoint of the same settings"
             )
+
+    def _check_finite(self, state: dict[str, Any]) -> None:
+        """Refuse NaN and infinity, but for buffers of the backbone, such as a mask."""
+        own = {name for name, _ in self.named_parameters()}
+        for name, value in state.items():
+            checked = name in own or name.startswith((MAP, WHITENING))
+            if checked and isinstance(value, Tensor) and not bool(value.isfinite().all()):
+                raise InputError(
+                    f"{name} of the checkpoint has NaN or infinite numbers; expected finite ones"
+                )
 
     def _take_templates(self, state: dict[str, Any]) -> None:
         mapper = cast(TemplateMapper, self.dejavu.mapper)

@@ -156,6 +156,27 @@ class Late(Plain):
     def forward(self, frames):
         return super().forward(frames) * (float("nan") if self.calls > 2 else 1.0)
 
+class Hungry(Plain):
+    def forward(self, frames):
+        if self.calls > 2:
+            raise MemoryError
+        return super().forward(frames)
+
+class Masked(Plain):
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mask", torch.full((4, 4), -torch.inf).triu(1))
+        self.register_buffer("wide", torch.ones(1, 4).expand(4, 4))
+    def get_extra_state(self):
+        return {"best": -torch.inf, "seen": torch.ones(2)}
+    def set_extra_state(self, state):
+        assert state["best"] == -torch.inf
+
+class Lazy(Plain):
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Sequential(nn.LazyBatchNorm1d(), nn.LazyLinear(8))
+
 class Interrupted(Plain):
     def forward(self, frames):
         if self.calls > 3:

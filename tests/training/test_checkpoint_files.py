@@ -19,6 +19,7 @@ import torch
 from helpers import refused
 from pytorch_lightning.plugins import AsyncCheckpointIO, TorchCheckpointIO
 from small_training import backbone, data_of, mapper, new_task, train, trainer
+from torch import Tensor
 
 from dejavu_torch import DejaVu
 from dejavu_torch.training.checkpoint import CheckpointFiles, read_checkpoint
@@ -39,12 +40,17 @@ def last(made: Path) -> Path:
 
 
 def changed(last: Path, path: Path, keys: tuple[Any, ...], value: Any) -> Path:
-    """The checkpoint with another value, or without it where the value is `...`."""
+    """The checkpoint with another value, or without it where the value is `...`.
+
+    A tensor of one number fills the one that was there.
+    """
     whole = place = torch.load(last, weights_only=True)
     for key in keys[:-1]:
         place = place[key]
     if value is ...:
         del place[keys[-1]]
+    elif isinstance(value, Tensor) and not value.ndim:
+        place[keys[-1]] = value.expand_as(place[keys[-1]]).clone()
     else:
         place[keys[-1]] = value
     torch.save(whole, path)
@@ -115,9 +121,9 @@ def test_a_pickle_runs_nothing_whatever_the_config_says(
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda path, last: None, ["is not there"]),
-        (lambda path, last: path.mkdir(), ["is a folder"]),
-        (lambda path, last: os.mkfifo(path), ["is no file"]),
+        (lambda path, last: None, ["No such file"]),
+        (lambda path, last: path.mkdir(), ["is a directory"]),
+        (lambda path, last: os.mkfifo(path), ["is no regular file"]),
         (lambda path, last: path.touch(), ["cannot be read"]),
         (lambda path, last: path.write_text("no checkpoint"), ["cannot be read"]),
         (lambda path, last: shutil.copy(last.parents[1] / "map.safetensors", path), ["cannot be read"]),
@@ -209,7 +215,9 @@ GROUP = ("optimizer_states", 0, "param_groups", 0)
 ODD: list[tuple[tuple[Any, ...], Any, list[str]]] = [
     (("state_dict",), [1], ["state_dict is of type list"]),
     (("state_dict", "log_temperature"), "x", ["log_temperature", "no tensor"]),
-    (("state_dict", "log_temperature"), torch.tensor(float("nan")), ["state_dict has NaN"]),
+    (("state_dict", "log_temperature"), torch.tensor(float("nan")), ["log_temperature", "NaN"]),
+    (("state_dict", "dejavu.map.templates"), torch.tensor(float("inf")), ["map.templates", "infinite"]),
+    (("state_dict", "dejavu.features.linear.weight"), torch.tensor(float("inf")), ["weight", "infinite"]),
     (("state_dict", "log_temperature"), ..., ["of another model", "log_temperature"]),
     (("state_dict", "dejavu.map.templates"), torch.zeros(1).expand(HUGE), ["more numbers than the file"]),
     (("state_dict", "dejavu.map.templates"), torch.empty(HUGE, device="meta"), ["more numbers"]),
@@ -240,7 +248,8 @@ ODD_TO_RESUME: list[tuple[tuple[Any, ...], Any, list[str]]] = [
     ((*GROUP, "lr"), "x", ["resumed", "lr"]),
     (MOMENTS, {}, ["resumed", "optimizer is not of this run"]),
     ((*MOMENTS, "exp_avg"), torch.zeros(3), ["exp_avg of parameter 0"]),
-    ((*MOMENTS, "exp_avg_sq"), -torch.ones(()), ["exp_avg_sq of parameter 0"]),
+    ((*MOMENTS, "exp_avg"), torch.tensor(float("-inf")), ["exp_avg of parameter 0"]),
+    ((*MOMENTS, "exp_avg_sq"), torch.tensor(-1.0), ["exp_avg_sq of parameter 0"]),
     ((*MOMENTS, "step"), torch.tensor(-1.0), ["step of parameter 0"]),
     (("lr_schedulers",), ..., ["resumed", "lr_schedulers"]),
     (("lr_schedulers", 0, "step"), 3, ["resumed", "lr_schedulers.0"]),
@@ -248,50 +257,37 @@ ODD_TO_RESUME: list[tuple[tuple[Any, ...], Any, list[str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("keys", "value", "words"), ODD, ids=str)
+CASES = [(("export", "validate"), *odd) for odd in ODD] + [(("fit",), *odd) for odd in ODD_TO_RESUME]
+
+
+@pytest.mark.parametrize(("commands", "keys", "value", "words"), CASES, ids=str)
 def test_an_odd_value_is_refused(
     folder: Path,
     last: Path,
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
+    commands: tuple[str, ...],
     keys: tuple[Any, ...],
     value: Any,
     words: list[str],
 ) -> None:
-    bad = changed(last, tmp_path / "bad.ckpt", keys, value)
-    for command in ("export", "validate"):
-        line = refusal(
-            capfd,
-            command,
-            "--ckpt_path",
-            bad,
-            "--trainer.default_root_dir",
-            tmp_path,
-            "--trainer.logger",
-            "false",
-        )
-        assert [word for word in [*words, "bad.ckpt"] if word not in line] == [], line
-
-
-@pytest.mark.parametrize(("keys", "value", "words"), ODD_TO_RESUME, ids=str)
-def test_what_cannot_be_resumed_is_refused(
-    folder: Path,
-    last: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    keys: tuple[Any, ...],
-    value: Any,
-    words: list[str],
-) -> None:
-    bad = changed(last, tmp_path / "bad.ckpt", keys, value)
-    if keys[:4] == MOMENTS and keys[-1] == "exp_avg_sq":
-        like = torch.load(last, weights_only=True)["optimizer_states"][0]["state"][0]["exp_avg"]
-        bad = changed(last, bad, keys, value.expand(like.shape).clone())
-    root = tmp_path / "new"
+    bad, root = changed(last, tmp_path / "bad.ckpt", keys, value), tmp_path / "new"
     options = ["--ckpt_path", bad, "--trainer.default_root_dir", root, "--trainer.logger", "false"]
-    line = refusal(capfd, "fit", *options, "--trainer.max_steps", 6)
-    assert [word for word in words if word not in line] == [], line
-    assert not root.exists()
+    for command in commands:
+        line = refusal(capfd, command, *options, "--trainer.max_steps", 6)
+        assert [word for word in words if word not in line] == [], line
+        assert not root.exists()
+
+
+@pytest.mark.parametrize("name", ["mine.Masked", "mine.Lazy"])
+def test_a_backbone_may_hold_what_it_likes(folder: Path, tmp_path: Path, name: str) -> None:
+    """Infinite and expanded buffers, a state of its own, lazy layers: what a training wrote is taken over."""
+    kept = tmp_path / "checkpoints" / "last.ckpt"
+    options = ["--model.backbone", name, "--trainer.default_root_dir", tmp_path]
+    train("fit", *options)
+    for command in ("fit", "validate", "export"):
+        train(command, *options, "--trainer.max_steps", 6, "--ckpt_path", kept)
+    assert read_checkpoint(kept)["global_step"] == 6
 
 
 # claims --------------------------------------------------------------------------------------------------

@@ -280,3 +280,11 @@ def test_values_that_are_no_frames_are_refused() -> None:
 
     with refused("(1, 4, 4) and of (1, 4, 5)", "data.resize"):
         store(Mixed(torch.rand(4, 1, 4, 4)))
+
+
+def test_smaller_frames_need_room_for_a_batch_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is stored of all of them may lie in a file."""
+    monkeypatch.setattr("dejavu_torch.memory.free_memory", lambda: 4.0 * 64 * 16**2)
+    assert store(numbered(200), (16, 16)).shape == (200, 1, 16, 16)
+    with refused("in frames of 16 x 17", "free"):
+        store(numbered(200), (16, 17))

@@ -101,6 +101,12 @@ def test_it_resumes(folder: Path, tmp_path: Path) -> None:
     assert (before["global_step"], after["global_step"]) == (4, 6)
 
 
+def test_auto_is_one_device_of_however_many(folder: Path, tmp_path: Path) -> None:
+    options = ["--trainer.default_root_dir", tmp_path, "--trainer.logger", "false"]
+    train("fit", "--trainer.devices", "auto", *options)
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trainer"]["devices"] == 1
+
+
 def test_a_seed_repeats_a_map(folder: Path, tmp_path: Path) -> None:
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         train("fit", "--seed_everything", seed, "--trainer.default_root_dir", tmp_path / name)

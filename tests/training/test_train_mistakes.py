@@ -11,6 +11,7 @@ from dejavu_torch.cli import main
 
 STOP, WATCH = (["--trainer.callbacks+", name] for name in ("EarlyStopping", "ModelCheckpoint"))
 ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
+EVERY = ("fit", "validate", "test", "export")
 SPECTRAL = ["--model.mapper", "SpectralMapper"]
 
 
@@ -58,9 +59,21 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
         ("fit", ["--trainer.max_steps", "0"], ["no steps", "above 0"]),
         ("fit", ["--trainer.max_epochs", "0"], ["no steps"]),
         ("fit", ["--trainer.val_check_interval", "0"], ["trainer.val_check_interval is 0"]),
-        ("fit", ["--trainer.check_val_every_n_epoch", "0"], ["check_val_every_n_epoch is 0", "from 1"]),
+        (
+            "fit",
+            ["--trainer.check_val_every_n_epoch", "0"],
+            ["check_val_every_n_epoch is 0", "of at least 1"],
+        ),
+        ("fit", ["--trainer.max_steps", "-2"], ["trainer.max_steps is -2", "-1 for no end"]),
+        *((command, ["--trainer.devices", "2"], ["runs on one device", "devices is 2"]) for command in EVERY),
+        ("fit", ["--trainer.devices", "[0,1]"], ["runs on one device", "devices is [0, 1]"]),
+        ("fit", ["--trainer.devices", "0,1"], ["runs on one device", "devices is 0,1"]),
+        ("fit", ["--trainer.devices", "-1"], ["runs on one device", "devices is -1"]),
+        ("fit", ["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
+        ("fit", ["--trainer.devices", "1000000000000"], ["runs on one device", "devices is 1000000000000"]),
+        ("fit", ["--trainer.num_nodes", "2"], ["runs on one device", "num_nodes is 2"]),
         ("fit", ["--trainer.num_nodes", "1000000000000"], ["num_nodes is 1000000000000"]),
-        ("fit", ["--trainer.devices", "1000000000000"], ["cannot be built: MemoryError"]),
+        ("fit", ["--model.backbone", "mine.Hungry"], ["not enough memory: it ran out"]),
         ("fit", ["--seed_everything", str(2**63)], ["seed_everything", "expected whole numbers of at most"]),
         ("fit", ["--data.batch_size", str(2**63)], ["data.batch_size", "expected whole numbers of at most"]),
         ("fit", ["--data.resize", "[1000000,1000000]"], ["frames of 1000000 x 1000000", "GB free"]),
@@ -150,6 +163,17 @@ def test_a_part_that_is_a_number_is_one_line(
 ) -> None:
     (tmp_path / "bad.yaml").write_text(f"data: {{source: one.npy}}\n{part}: 5\n")
     fails(capfd, ["fit", "--config", str(tmp_path / "bad.yaml")], [f"{part} is 5", "expected options"])
+
+
+@pytest.mark.parametrize("options", [["--data.source", "short.npy"], ["--ckpt_path", "run/map.safetensors"]])
+def test_a_mistake_leaves_no_folder_that_was_made_for_the_run(
+    folder: Path, capfd: pytest.CaptureFixture[str], tmp_path: Path, options: list[str]
+) -> None:
+    """Up to those that were there before."""
+    (tmp_path / "kept").mkdir()
+    root = tmp_path / "kept" / "nest" / "a" / "b"
+    fails(capfd, ["fit", "--config", "train.yaml", "--trainer.default_root_dir", str(root), *options], [])
+    assert [*tmp_path.rglob("*")] == [tmp_path / "kept"]
 
 
 def fails(capfd: pytest.CaptureFixture[str], arguments: list[str], words: list[str]) -> None:
