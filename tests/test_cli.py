@@ -147,22 +147,19 @@ def test_features_by_class_path(tmp_path: Path) -> None:
 
 
 def test_features_of_another_package_are_named_again_to_localize(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     np.save(tmp_path / "frames.npy", frames(64))
     route = tmp_path / "a.safetensors"
-    run("learn", tmp_path / "frames.npy", "--map", route, "--features", "torch.nn.Flatten")
+    monkeypatch.chdir(tmp_path)
+    flat = "--features", "torch.nn.Flatten", "--features.start_dim=1", "--features.end_dim", "-1"
+    run("learn", tmp_path / "frames.npy", "--map", route, *flat)
+    learned = capsys.readouterr().out.splitlines()[-1]
     assert "torch.nn" in fails(capsys, "info", route)
-    run(
-        "localize",
-        route,
-        tmp_path / "frames.npy",
-        "--features",
-        "torch.nn.Flatten",
-        "--out",
-        tmp_path / "m.csv",
-    )
-    assert len((tmp_path / "m.csv").read_text().splitlines()) == 65
+    run("info", route, *flat)
+    assert capsys.readouterr().out.splitlines()[-1] == learned
+    run(*("frames.npy" if word == "QUERY" else word for word in shlex.split(learned)[2:]))
+    assert len((tmp_path / "matches.csv").read_text().splitlines()) == 65
 
 
 def test_classes_of_the_current_folder(tmp_path: Path) -> None:

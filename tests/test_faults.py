@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -130,6 +131,40 @@ def test_a_training_that_is_interrupted_leaves_a_map(folder: Path) -> None:
     assert [line for line in lines if not line.startswith(b"dejavu: ")] == []
     assert b"to go on: dejavu train fit" in out
     assert DejaVu.load(folder / "run" / "map.safetensors").trained is not None
+
+
+def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dejavu_torch.cli import process
+    from dejavu_torch.data.output import remove_temporaries
+    from dejavu_torch.experiments import footprint
+
+    (tmp_path / "tmp").mkdir()
+    script = "#!/bin/sh", 'cd "${0%/*}"', "echo $$ > new", "mv new pid", "exec sleep 60"
+    (tmp_path / "python").write_text("\n".join(script))
+    (tmp_path / "python").chmod(0o700)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+
+    def bench() -> None:
+        process.take_over()
+        process.cleanup[:] = [remove_temporaries]
+        list(footprint.bench_memory([64]))
+
+    child = forked(bench)
+    pid = tmp_path / "pid"
+    late = time.monotonic() + 60
+    while not pid.exists() and time.monotonic() < late:
+        time.sleep(0.01)
+    assert list(tmp_path.glob("tmp/.dejavu-*/*.npy"))
+    os.kill(child, signal.SIGINT)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 130
+    assert names_in(tmp_path / "tmp") == set()
+    status = Path(f"/proc/{int(pid.read_text())}/status")
+    while status.exists() and "State:\tZ" not in status.read_text() and time.monotonic() < late:
+        time.sleep(0.01)
+    assert time.monotonic() < late
 
 
 def python(code: str, *words: str, **settings: object) -> tuple[int, str, str]:
@@ -260,6 +295,52 @@ def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(
         assert "expected" in error
     assert names_in(folder) == before
     assert (folder / "fifo.safetensors").is_fifo()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "localize map.safetensors b.npy --out map.safetensors",
+        "localize map.safetensors b.npy?start=3 --out ./b.npy",
+        "localize map.safetensors b.npy --out link.csv",
+        "localize map.safetensors images?width=8 --out images/0.png",
+        "localize map.safetensors strip:images/0.png?width=8 --out images/../images/0.png",
+        "learn link.npy --map link.safetensors",
+        "learn a.npy --second b.npy --map link.safetensors",
+        "learn a.npy --second b.npy --second_truth link.safetensors --map link.safetensors",
+        "learn a.npy --whitening map.safetensors --map ./map.safetensors",
+        "compare a.npy b.npy --whitening report/map.safetensors --out report",
+        "compare a.npy b.npy --truth report/matches.csv --out report",
+        "compare a.npy b.npy --second images --out images",
+        "evaluate m.csv --truth 0 --reference strip:report/pr.png?width=8 --out report",
+        "bench storage a.npy images --out images",
+        "demo --second images --out images",
+    ],
+)
+def test_an_output_that_is_what_is_read_is_refused_and_stays(
+    folder: Path, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    for name in ("csv", "npy", "safetensors"):
+        (folder / f"link.{name}").symlink_to("b.npy")
+    (folder / "report").mkdir()
+    shutil.copy("map.safetensors", "report")
+    shutil.copy(write_images(folder / "images", frames(2)) / "0.png", "report/pr.png")
+    (folder / "report" / "matches.csv").write_text("query,place\n0,0\n")
+    shutil.copy("report/matches.csv", "m.csv")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert "is what is read; expected another" in fails(capsys, *words.split())
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_report_may_lie_beside_what_it_is_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    run("localize", "map.safetensors", "b.npy", "--out", "m.csv")
+    (folder / "0").mkdir()
+    run("evaluate", "m.csv", "--truth", "0", "--out", ".")
+    run("evaluate", "m.csv", "--truth", "0", "--map", "map.safetensors", "--out", "0")
+    assert {"index.html", "m.csv", "map.safetensors"} <= names_in(folder)
+    assert "index.html" in names_in(folder / "0")
 
 
 # no room

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import nn
 
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
-from dejavu_torch.data.source import open_source
+from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.views import Views
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report
     from dejavu_torch.experiments.compare import Comparison
 
+COMPARED = ("map.safetensors", "matches.csv")  # beside a report of them
 APART = 5  # places: any two candidates of a query are further apart
 
 
@@ -46,7 +48,7 @@ def run_demo(
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.experiments.reproduce import paper_model
 
-    check_output_folder(out)
+    _check_report_folder(out, COMPARED, [second])
     _set_seed(model, seed)
     learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
     reference, query = open_source(learned), open_source(localized)
@@ -58,7 +60,14 @@ def run_demo(
     result = compare(reference, query, model=model, seed=seed, second=views, others=others, progress=True)
     _publish(result, out, "dejavu demo: the built-in route", command)
     tries = (
-        ["localize", str(out / "map.safetensors"), localized, "--out", "matches.csv"],
+        [
+            "localize",
+            str(out / "map.safetensors"),
+            localized,
+            *_features_of(model, command),
+            "--out",
+            "matches.csv",
+        ],
         ["compare", learned, localized, "--config", "local_maxima", "--out", "templates"],
         ["compare", "MORNING", "EVENING", "--out", "report"],
     )
@@ -74,6 +83,7 @@ def run_learn(
     second: str | None = None,
     second_truth: str | None = None,
     model: DejaVu,
+    command: str,
 ) -> None:
     """Learn a map; print its plan, its summary and the bytes per place.
 
@@ -89,6 +99,7 @@ def run_learn(
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
     check_output_file(map)
+    check_not_read(map, source, second, second_truth)
     _set_seed(model, seed)
     traverse = model.resample(open_source(source), progress=True)
     _print_steps(traverse)
@@ -97,7 +108,7 @@ def run_learn(
     model.save(map)
     print_map(model)
     if model.map.summary().covered:
-        _print_next("localize", map, "QUERY", "--out", "matches.csv")
+        _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
     else:
         print("next: try more frames, another --preprocess.contrast, or `dejavu train fit`")
 
@@ -136,6 +147,7 @@ def run_localize(
         features: class of the map's features, if not ours
     """
     check_output_file(out)
+    check_not_read(out, map, source)
     model = DejaVu.load(map, features)
     if corners is not None:
         if as_is or model.velocity is None or model.step is None:
@@ -223,7 +235,7 @@ def run_compare(
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
         model.threshold = model.threshold if given.threshold is None else given.threshold
     first, queries = open_source(reference), open_source(query)
-    _check_report_folder(out, reference, query)
+    _check_report_folder(out, COMPARED, [reference, query, second], [truth, second_truth])
     _set_seed(model, seed)
     first, views = _with_second(model, first, second, second_truth, queries)
     result = compare(
@@ -271,7 +283,7 @@ def run_evaluate(
     from dejavu_torch.experiments.evaluate import evaluate_file
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
-    _check_report_folder(out, reference, query)
+    _check_report_folder(out, (), [reference, query], [matches, truth, map])
     result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map)
     with report_folder(out) as folder:
         title = f"{matches} evaluated by {truth}"
@@ -348,6 +360,8 @@ def run_bench(
     from dejavu_torch.evaluation.report import text_table
     from dejavu_torch.experiments import bench, footprint, frontier
 
+    for file in (out, out / "bench.json", out / "bench.png"):
+        check_not_read(file, *sources, codebooks)
     if what == "storage":
         given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
         found = frontier.run_storage(out, sources, places, codebooks, given, shared, progress=True)
@@ -375,7 +389,7 @@ def run_bench(
     _say(f"{note}; next: open {out / 'bench.png'}")
 
 
-def run_info(map: Path, *, features: nn.Module | None = None) -> None:
+def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> None:
     """What is in a map, and its summary.
 
     Args:
@@ -403,19 +417,37 @@ def run_info(map: Path, *, features: nn.Module | None = None) -> None:
         print(f"trained for {steps} steps, seed {seed}")
     print(f"map format {FORMAT}, its checksums agree")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
-    _print_next("localize", map, "QUERY", "--out", "matches.csv")
+    _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
 
 
-def _check_report_folder(out: Path, *sources: str | None) -> None:
-    """Refuse early a folder that cannot be made or written in, or where images lie."""
-    if out.resolve() in [Path(source.partition("?")[0]).resolve() for source in sources if source]:
-        raise InputError(f"{out} holds the images; expected another folder for the report")
+def _features_of(model: DejaVu, command: str) -> list[str]:
+    """The options of a later command for features that are not this package's, with their own options in this
+    one."""
+    name = recipe_of(model.features, REGISTRY).class_path
+    told = [
+        word
+        for before, word in pairwise(shlex.split(command))
+        if word.startswith("--features.") or (before.startswith("--features.") and "=" not in before)
+    ]
+    return [] if name in REGISTRY else ["--features", name, *told]
+
+
+def _check_report_folder(
+    out: Path, beside: Sequence[str], sources: Sequence[str | None], files: Sequence[str | Path | None] = ()
+) -> None:
+    """Refuse early a folder that cannot be made or written in, or where what is read would be lost.
+
+    Args:
+        beside: files that are written there beside the report. sources, files: that are read.
+    """
+    check_not_read(out, *sources)
     check_output_folder(out)
     if out.is_dir():
         from dejavu_torch.evaluation.report import PICTURES
 
-        for name in ("index.html", "report.json", "matches.csv", "map.safetensors", *PICTURES):
-            check_output_file(out / (name if "." in name else f"{name}.png"))
+        for name in ("index.html", "report.json", *beside, *(f"{name}.png" for name in PICTURES)):
+            check_output_file(out / name)
+            check_not_read(out / name, *sources, *files)
 
 
 def _sequence_of(

@@ -12,6 +12,7 @@ import docstring_parser
 import jsonargparse
 
 from dejavu_torch.data.files import LARGEST
+from dejavu_torch.data.source import check_not_read
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.hog import HOG
@@ -186,6 +187,8 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         arguments.pop("config")
         model = arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
         if whitening:
+            written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"
+            check_not_read(written, whitening)
             _take_whitening(model, whitening, told)
     return arguments
 

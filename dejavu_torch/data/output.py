@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import stat
 import tempfile
 import threading
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +23,7 @@ except ImportError:  # Windows: what is left behind stays
 from dejavu_torch.types import InputError
 
 PREFIX = ".dejavu-"  # of the folders where files are written until they are whole
+HERE = f"{PREFIX}{zlib.crc32(os.fsencode(socket.gethostname())):08x}-"  # of those of this host
 LONGEST_NAME, LONGEST_PATH = 255, 4096 - 64  # bytes; a path leaves room for the files of a folder
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _temporary: set[Path] = set()  # the folders of this process that are there now
@@ -31,7 +34,7 @@ def check_output_file(path: Path) -> None:
 
     Raises:
         InputError: the parent folder is missing or not writable, or the path is a folder, a device or the
-            like, too long, or a file that may not be written.
+            like, a standard stream, too long, or a file that may not be written or replaced.
     """
     with _refusing(path, "cannot be written", ValueError):  # a name that the system cannot spell
         _check_name(path)
@@ -47,6 +50,22 @@ def check_output_file(path: Path) -> None:
         for place in (target.parent, target):
             if place.exists() and not os.access(place, os.W_OK):
                 raise InputError(f"{path} cannot be written: no permission to write in {place}")
+        if target.exists():
+            _check_replaced(path, target)
+
+
+def _check_replaced(path: Path, target: Path) -> None:
+    """Refuse to replace a file that somebody else writes or owns."""
+    there, folder = target.stat(), target.parent.stat()
+    for stream in range(3):
+        with suppress(OSError):  # it is closed
+            if os.path.samestat(there, os.fstat(stream)):
+                raise InputError(f"{path} is a standard stream of this process; expected a file of its own")
+    if Path("/proc") in _target(path.parent).parents:  # as /dev/fd is
+        raise InputError(f"{path} is an open file of a process; expected a file of its own")
+    user = os.geteuid() if hasattr(os, "geteuid") else 0
+    if folder.st_mode & stat.S_ISVTX and user not in (0, there.st_uid, folder.st_uid):
+        raise InputError(f"{path} cannot be written: in {target.parent} only its owner may replace it")
 
 
 def check_output_folder(path: Path) -> None:
@@ -104,7 +123,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         'all of it'
     """
     check_output_file(path)
-    with _refusing(path, "was not written"), _temporary_folder(_target(path).parent) as folder:
+    with _refusing(path, "was not written"), temporary_folder(_target(path).parent) as folder:
         yield folder / path.name
         _finish(folder / path.name, path)
         with _signals_later():
@@ -134,7 +153,7 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
         ['note.txt']
     """
     check_output_folder(path)
-    with _refusing(path, "was not written"), _temporary_folder(_existing(path)) as folder:
+    with _refusing(path, "was not written"), temporary_folder(_existing(path)) as folder:
         yield folder
         names = sorted(file.name for file in folder.iterdir())
         for name in names:
@@ -144,9 +163,10 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
         with _signals_later():
             if not path.is_dir():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                folder.chmod(_mode_of_new(folder, os.mkdir, os.rmdir))
+                mode = _mode_of_new(folder, os.mkdir, os.rmdir)
                 with suppress(OSError):  # another process made one meanwhile
                     folder.rename(path)
+                    path.chmod(mode)  # no sooner: one that may not be written in could not be moved
             for name in names if folder.is_dir() else ():
                 (folder / name).replace(_target(path / name))
             for name in {*earlier} - {*names}:
@@ -162,12 +182,25 @@ def remove_temporaries() -> None:
 
 
 @contextmanager
-def _temporary_folder(parent: Path) -> Iterator[Path]:
-    """A folder of this process's own in `parent`, locked while it is in use."""
+def temporary_folder(parent: Path) -> Iterator[Path]:
+    """A folder of this process's own in `parent`, locked while it is in use; removed behind the block, also
+    by `remove_temporaries`, or after a kill by the next one in `parent`.
+
+    Raises:
+        OSError: the system refuses it.
+
+    Example:
+        >>> with temporary_folder(Path(tempfile.gettempdir())) as folder:
+        ...     _ = (folder / "note.txt").write_text("for now")
+        >>> folder.exists()
+        False
+    """
     _remove_abandoned(parent)
     while True:
-        folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
+        folder = Path(tempfile.mkdtemp(prefix=HERE, dir=parent))
         _temporary.add(folder)
+        with suppress(FileNotFoundError):  # as below
+            folder.chmod(0o700)  # whatever the umask
         lock = _locked(folder)
         if folder.is_dir():  # else another took it for abandoned before it was locked
             break
@@ -181,8 +214,12 @@ def _temporary_folder(parent: Path) -> Iterator[Path]:
 
 
 def _remove_abandoned(parent: Path) -> None:
-    """Remove what processes that were killed left: the system took their locks."""
-    for folder in parent.glob(f"{PREFIX}*"):
+    """Remove what processes of this host that were killed left: the system took their locks.
+
+    The name, which a folder has from its first moment on, says that it is ours, and of this host: locks of a
+    network file system may hold on one host only.
+    """
+    for folder in parent.glob(f"{HERE}{'?' * 8}"):  # of tempfile
         if folder.is_dir() and not folder.is_symlink():
             lock = _locked(folder, wait=False)
             if lock is not None:
@@ -212,6 +249,7 @@ def _finish(written: Path, path: Path) -> None:
 
     Its owner as well, where that is allowed.
     """
+    written.chmod(0o600)  # whatever the umask
     file = os.open(written, os.O_RDONLY)
     try:
         os.fsync(file)
@@ -293,7 +331,7 @@ def _check_name(path: Path) -> None:
 
 def _mode_of_new(folder: Path, make: Callable[[Path], None], remove: Callable[[Path], None]) -> int:
     """The mode of what is made; asking the system for its mask would change that for a moment."""
-    fresh = folder / ".mode"
+    fresh = Path(tempfile.mktemp(dir=folder))  # a name that no file in it has; the folder is our own
     make(fresh)
     mode = stat.S_IMODE(fresh.stat().st_mode)
     remove(fresh)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,16 +48,43 @@ def open_source(source: str | Path) -> Traverse:
         10
     """
     text = str(source)
+    address, query = _split(text)
+    reader = _reader(text, address)
+    arguments = _arguments(text, query, reader)
+    part = {name: arguments.pop(name) for name in PART if name in arguments}
+    return FrameRange(reader(**arguments), **part) if part else reader(**arguments)
+
+
+def check_not_read(out: Path, *sources: str | Path | None) -> None:
+    """Refuse an output that is what a command reads, or an image of a folder that it reads: it would be lost.
+
+    Args:
+        sources: as of `open_source`, or any other text; of them the paths that are there count.
+
+    Raises:
+        InputError: naming the output.
+
+    Example:
+        >>> check_not_read(Path("scores.csv"), "photos?width=160", "utm:25", None)
+    """
+    for source in filter(None, sources):
+        place = Path(_split(str(source))[0].removeprefix("strip:"))
+        read = False
+        with suppress(OSError, ValueError):  # one of them is not there, or can be no path
+            read = out.samefile(place) or (out.suffix.lower() in SUFFIXES and out.parent.samefile(place))
+        if read:
+            raise InputError(f"{out} is what is read; expected another name")
+
+
+def _split(text: str) -> tuple[str, str]:
+    """The address of a source, and its options."""
     if text.startswith(("sim:", "strip:")):
         address, _, query = text.partition("?")
     elif "?" in text and not os.path.exists(text):  # False also of what can be no path
         address, _, query = text.rpartition("?")
     else:
         address, query = text, ""
-    reader = _reader(text, address)
-    arguments = _arguments(text, query, reader)
-    part = {name: arguments.pop(name) for name in PART if name in arguments}
-    return FrameRange(reader(**arguments), **part) if part else reader(**arguments)
+    return address, query
 
 
 def _reader(text: str, address: str) -> Callable[..., Traverse]:

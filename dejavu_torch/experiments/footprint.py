@@ -6,6 +6,7 @@ import ctypes
 import gc
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,7 +26,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from dejavu_torch.data.frame_range import IndexedTraverse
-from dejavu_torch.data.output import check_output_folder, whole_folder
+from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.spectral import SpectralMapper
@@ -271,6 +272,7 @@ def measured(task: Task, folder: Path) -> dict[str, Any]:
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONPATH": search},
+        preexec_fn=end_with_parent if sys.platform == "linux" else None,
     )
     if done.returncode < 0:
         return {"skipped": f"ended by signal {-done.returncode}, such as for want of memory"}
@@ -278,6 +280,11 @@ def measured(task: Task, folder: Path) -> dict[str, Any]:
         return {"skipped": (done.stderr.strip().splitlines() or ["it failed"])[-1][:200]}
     facts: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return facts
+
+
+def end_with_parent() -> None:
+    """Have the system end this process when its parent ends, as by Ctrl-C."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -> Iterator[Row]:
@@ -306,12 +313,12 @@ def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -
     cases = [(n, 0) for n in sizes] + [(middle, q) for q in queries]
     tasks = [Task(OURS, 0, 0, threads)]
     tasks += [Task(name, n, q, threads) for n, q in cases for name in CONTENDERS]
-    with tempfile.TemporaryDirectory() as folder:
-        paint_drives(Path(folder), sizes[-1])
+    with temporary_folder(Path(tempfile.gettempdir())) as folder:
+        paint_drives(folder, sizes[-1])
         for task in tqdm(tasks, "memory", disable=None, leave=False):
-            facts = measured(task, Path(folder))
+            facts = measured(task, folder)
             if not task.queries and task.places != middle:
-                task.file(Path(folder)).unlink(missing_ok=True)
+                task.file(folder).unlink(missing_ok=True)
             yield Row(task.case, task.contender, threads=threads, **facts)
 
 

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 import socket
 import stat
 import subprocess
 import sys
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from helpers import refused
 
 from dejavu_torch.data.output import (
+    HERE,
     check_output_file,
     check_output_folder,
     make_output_folder,
@@ -190,6 +194,56 @@ def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.Monke
     check_output_file(tmp_path / "b")
 
 
+def test_in_a_folder_as_tmp_a_file_of_another_user_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").touch()
+    tmp_path.chmod(0o1777)
+    check_output_file(tmp_path / "a")
+    monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 1)
+    with refused(str(tmp_path / "a"), "owner"):
+        check_output_file(tmp_path / "a")
+    check_output_file(tmp_path / "new")
+    tmp_path.chmod(0o777)
+    check_output_file(tmp_path / "a")
+
+
+@pytest.mark.parametrize("mode", ["w", "a"])  # as > and >> have it
+def test_the_file_that_a_stream_goes_to_is_refused_and_stays(tmp_path: Path, mode: str) -> None:
+    log, kept = tmp_path / "log", os.dup(1)
+    with log.open(mode) as file:
+        try:
+            os.dup2(file.fileno(), 1)
+            for path in ("/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", log, f"/dev/fd/{file.fileno()}"):
+                with refused(str(path), "of its own"):
+                    check_output_file(Path(path))
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)
+    check_output_file(log)
+
+
+@pytest.mark.parametrize("mask", [0o277, 0o377, 0o777])
+def test_a_umask_that_takes_all_rights_does_not_fail_the_writer(mask: int) -> None:
+    folder = Path(tempfile.mkdtemp())  # where others than root may go
+    folder.chmod(0o777)
+    child = os.fork()
+    if not child:
+        with suppress(BaseException):
+            if os.geteuid() == 0:
+                os.setuid(65534)
+            os.umask(mask)
+            write(folder / "a")
+            with whole_folder(folder / "b") as temporary:
+                (temporary / "one").write_text("1")
+            os._exit(0)
+        os._exit(1)
+    status = os.waitpid(child, 0)[1]
+    found = {file.name: mode_of(file) for file in folder.iterdir()}
+    shutil.rmtree(folder)
+    assert (status, found) == (0, {"a": 0o666 & ~mask, "b": 0o777 & ~mask})
+
+
 def test_the_folder_vanishes_meanwhile(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with refused("a.txt", "No such file"), whole_file(tmp_path / "folder" / "a.txt") as temporary:
@@ -199,6 +253,15 @@ def test_the_folder_vanishes_meanwhile(tmp_path: Path) -> None:
 
 
 # folders
+
+
+@pytest.mark.parametrize("name", [".mode", ".dejavu-notes", "a" * 255])
+def test_any_name_can_be_written(tmp_path: Path, name: str) -> None:
+    write(tmp_path / name)
+    with whole_folder(tmp_path / "new") as temporary:
+        (temporary / name).write_text("new")
+    assert [file.read_text() for file in (tmp_path / name, tmp_path / "new" / name)] == ["new", "new"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted([name, "new"])
 
 
 def test_a_new_folder_appears_whole(tmp_path: Path) -> None:
@@ -310,3 +373,16 @@ def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(
     assert len(list(tmp_path.glob(".dejavu-*"))) == 1
     write(tmp_path / "b")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt.part", "b"]
+
+
+def test_only_what_this_host_left_is_removed(tmp_path: Path) -> None:
+    foreign = [".dejavu-notes", ".dejavu-abcdefgh", ".dejavu-00000000-abcdefgh", f"{HERE}notes"]
+    for name in (*foreign, f"{HERE}abcdefgh"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "x").write_text("kept")
+    (tmp_path / f"{HERE}abcdefgi").symlink_to(".dejavu-notes")
+    write(tmp_path / "a")
+    with whole_folder(tmp_path / "new") as temporary:
+        (temporary / "a").touch()
+    assert {path.parent.name for path in tmp_path.glob(".dejavu-*/x")} == {*foreign, f"{HERE}abcdefgi"}
+    assert not (tmp_path / f"{HERE}abcdefgh").exists()

@@ -479,6 +479,7 @@ in/empty in/a_file in out missing utm:25 in/last.ckpt in/fifo.csv in/fifo.npy in
 --seed -1 --seed 1180591620717411303424 --batch_size 0
 --top 999 --sequence 999 --sequence=3 --filter --speeds [nan] --moves [0,0] --out in/a_file --out out/no/m.csv
 --map in/spectral.safetensors --map in/fifo.safetensors --truth in/fifo.npz --out in/empty
+--out in/query.npy --out in/spectral.safetensors --out in/truth.csv --out in
 """
 OTHERS = [
     *(group for line in (*LINES, *SLOW_LINES, ODD_WORDS.split()) for group in groups(line)),

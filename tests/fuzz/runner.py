@@ -9,7 +9,8 @@ What counts as a finding:
 - any exception but InputError of the library, and SystemExit 0 or 2 of the commands;
 - a message, a warning or an error of a command, that is more than one line;
 - more time or memory than that; the end of the process;
-- files that a refused input leaves, temporary files that anything leaves, inputs that are changed;
+- files that a refused input leaves, temporary files that anything leaves;
+- files that were there and are changed: inputs, the user's own, all but what a command line names as output;
 - an import of the canary, a module that only files name;
 - what a reader itself finds: damage that changes what is read, values out of range.
 """
@@ -32,7 +33,8 @@ import time
 import traceback
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
@@ -53,6 +55,8 @@ MEMORY = 4 * 2**30  # bytes of a case
 GROWN = 2**29  # bytes by which a process may have grown when it goes on to another case
 MOST = 300  # characters of a message
 PACKAGE = Path(dejavu_torch.__file__).parent
+BYSTANDER = f"{PREFIX}notes"  # a folder of the user's own
+OUTPUTS = ("--out", "--trainer.default_root_dir")
 CANARY_CODE = "class Module: pass\ndef run(*args, **more): return 0\n"
 
 
@@ -88,6 +92,9 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
     shutil.rmtree(temporary, ignore_errors=True)
     for made in (folder / "in", folder / "out", temporary):
         made.mkdir(parents=True)
+    for place in (folder, folder / "out"):
+        (place / BYSTANDER).mkdir()
+        (place / BYSTANDER / "x").write_text("of the user")
     os.chdir(folder)
     random = Random(f"{seed}/{reader.name}/{number}")
     torch.manual_seed(number)
@@ -165,15 +172,37 @@ def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporar
     findings = [Finding("temporary file left", "", str(left))] if left else []
     after = _files(root / "work")
     new = sorted(name for name in after if name not in before)
-    changed = [name for name in before if after.get(name) != before[name]]
+    changed = [name for name in before if after.get(name, "gone") != before[name]]
     if outcome == "accepted":
-        new = [name for name in new if PREFIX in name or ".part" in name]
-        changed = [] if case.words else changed
+        new = [name for name in new if PREFIX in name]
+        named = _named(case.words, case.folder.relative_to(root / "work"))
+        changed = [name for name in changed if not named(name)]
     if new:
         findings.append(Finding(f"file left where {outcome}", "", str(new)[:MOST]))
     if changed:
         findings.append(Finding("input changed", "", str(changed)[:MOST]))
     return findings
+
+
+def _named(words: Sequence[str], folder: Path) -> Callable[[str], bool]:
+    """Whether a command line names a file as output, or a folder that it lies in, and not also as input.
+
+    Args:
+        folder: that its words are relative to.
+    """
+    outputs, inputs = set(), set()
+    for before, word in pairwise(["", *words]):
+        option, equals, value = word.partition("=") if word.startswith("--") else (before, "=", word)
+        if not equals:
+            continue  # its value is the next word
+        written = option in OUTPUTS or (option == "--map" and words[0] == "learn")
+        address = value.removeprefix("strip:").partition("?")[0]
+        (outputs if written else inputs).add(os.path.normpath(folder / address))
+
+    def named(name: str) -> bool:
+        return name not in inputs and any(Path(name).is_relative_to(place) for place in outputs)
+
+    return named
 
 
 def _files(folder: Path) -> dict[str, Any]:

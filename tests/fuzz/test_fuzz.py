@@ -9,7 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 MISTAKES = """
-import os, signal, sys
+import os, shutil, signal, sys
 from pathlib import Path
 from dejavu_torch.types import InputError
 from tests.fuzz import readers, runner
@@ -22,9 +22,14 @@ def take(case): bytearray(8 * 2**30)
 def raise_key(case): raise KeyError("seen")
 def status(case): raise SystemExit(3)
 def warn(case): print("Traceback of another library", file=sys.stderr)
-def half(case): case.begin(); Path("out/.m.part").touch()
+def half(case): case.begin(); Path("out/.dejavu-x1").mkdir()
 def refuse(case): case.begin(); Path("out/m").touch(); raise InputError("refused")
 def change(case): Path("in/m").touch(); case.begin(); Path("in/m").write_text("x")
+def write(case, words): case.words = words.split(); case.begin(); Path("in/m").write_text("x")
+def destroy(case): Path("in/m").touch(); write(case, "localize in/map in/m --out in/m")
+def elsewhere(case): Path("in/m").touch(); write(case, "learn a.npy --map=out/m")
+def remove(case): case.words = ["info"]; case.begin(); shutil.rmtree(".dejavu-notes")
+def replace(case): Path("in/m").touch(); write(case, "localize in/map in/q.npy --out in")
 def run_code(case): import fuzz_canary
 def wrong(case): raise readers.Wrong("damage")
 def well(case): case.begin(); Path("out/m").touch()
@@ -51,12 +56,13 @@ def test_no_case_goes_wrong() -> None:
 
 def test_every_mistake_is_found() -> None:
     errors = ["crash", "end", "spin", "take", "raise_key", "status", "warn"]
-    wrong = [*errors, "half", "refuse", "change", "run_code", "wrong"]
-    done = run("-c", MISTAKES, *wrong, "well")
+    wrong = [*errors, "half", "refuse", "change", "destroy", "elsewhere", "remove", "run_code", "wrong"]
+    every = [*wrong, "well", "replace"]
+    done = run("-c", MISTAKES, *every)
     assert done.returncode == 1, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
     broken = {row[0]: row[1:5] for row in rows if len(row) == 6 and row[1] == "2"}
-    assert broken == {name: ["2", "0", "0", "2"] for name in wrong} | {"well": ["2", "2", "0", "0"]}
+    assert broken == {name: ["2", "0", "0", "2"] if name in wrong else ["2", "2", "0", "0"] for name in every}
     for kind in ("process killed 11", "Hang", "MemoryError", "KeyError", "exit status 3", "stderr"):
         assert f"2 x {kind}" in done.stdout
     assert "python -m tests.fuzz --seed 0 --reader 'raise_key' --case 0" in done.stdout
