@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, get_type_hints
 
 import torch
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import ground_truth_in_places
@@ -135,6 +136,10 @@ class DejaVu(nn.Module):
             raise InputError(f"the threshold is {threshold}; expected a number, or None")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
+        for module in self.features.modules():  # no file can be loaded into expanded ones
+            for name, buffer in module.named_buffers(recurse=False):
+                if not is_lazy(buffer):
+                    setattr(module, name, buffer.contiguous())
         self.mapper = SpectralMapper() if mapper is None else mapper
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()

@@ -14,7 +14,6 @@ import pytorch_lightning as pl
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
-from torch.nn.parameter import is_lazy
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -145,10 +144,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         if self.made and isinstance(backbone, Embedding) and has_descriptor(backbone):
             backbone = backbone.without_code()
         self.dejavu = DejaVu(backbone, whitening, mapper, batch_size=batch_size, preprocess=preprocess)
-        for module in backbone.modules():  # a checkpoint cannot be loaded into expanded ones
-            for name, buffer in module.named_buffers(recurse=False):
-                if not is_lazy(buffer):
-                    setattr(module, name, buffer.contiguous())
         if start is not None:
             start_from(backbone, start)
         self.frozen = [module.eval() for module in freeze_parts(backbone, freeze or [], batch_norm)]

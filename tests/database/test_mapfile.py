@@ -707,6 +707,24 @@ def test_a_header_nested_without_end_is_refused(path: Path, whole_maps: list[Pat
         DejaVu.load(path)
 
 
+class Masked(nn.Module):
+    """Features with a buffer that is expanded, and infinite in part."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mask", torch.tensor([0.0, -torch.inf]).expand(4, 2))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return frames.flatten(1)[:, :32] + self.mask[:, 0].sum()
+
+
+def test_buffers_of_a_network_may_be_expanded_and_infinite(path: Path) -> None:
+    model = template_model(Masked(), WINDOW).learn(pictures())
+    model.save(path)
+    loaded = DejaVu.load(path, Masked())
+    assert torch.equal(loaded.features.mask, model.features.mask)
+
+
 def test_names_of_another_number_are_refused_before_they_are_made(path: Path, whole_maps: list[Path]) -> None:
     many = encode_names([f"{i:05}.png" for i in range(10_000)])
     craft(spectral(path, whole_maps), names=many)
