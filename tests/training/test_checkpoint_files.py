@@ -121,8 +121,8 @@ def test_a_pickle_runs_nothing_whatever_the_config_says(
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda path, last: None, ["No such file"]),
-        (lambda path, last: path.mkdir(), ["is a directory"]),
+        (lambda path, last: None, ["is not there"]),
+        (lambda path, last: path.mkdir(), ["is a folder"]),
         (lambda path, last: os.mkfifo(path), ["is no regular file"]),
         (lambda path, last: path.touch(), ["cannot be read"]),
         (lambda path, last: path.write_text("no checkpoint"), ["cannot be read"]),
