@@ -39,7 +39,7 @@ ARROWS = {
     "periods": "types memory",
     "database": "types memory data periods",
     "recognition": "types",
-    "motion": "types data",
+    "motion": "data memory types",
     "model": "types text data features periods database recognition motion",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
+from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError
 
 Corners = Sequence[Sequence[float]]
@@ -91,6 +92,10 @@ def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, 
         )
     if min(frames.shape[-2:]) < 2:
         raise InputError(f"frames of {frames.shape[-2]} x {frames.shape[-1]} pixels; expected at least 2 x 2")
+    # the positions in the frame, as they are and as they are made, and the patches
+    check_room(
+        32.0 * len(frames) * height * width, f"the ground in {len(frames)} x {height} x {width} pixels"
+    )
     from kornia.color import rgb_to_grayscale  # loading kornia takes a third of a second
     from kornia.geometry.transform import get_perspective_transform, warp_perspective
 
