@@ -33,13 +33,14 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import AugmentedTraverse, Views
-from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.features.views import STRETCH, AugmentedTraverse, Stretches, Views
+from dejavu_torch.features.whitening import STRENGTHS, Whitening
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.text import one_line
@@ -56,6 +57,7 @@ from dejavu_torch.types import (
 log = logging.getLogger("dejavu_torch")
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
+LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors whitened at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
 
@@ -93,6 +95,8 @@ class DejaVu(nn.Module):
             keeps the features; None is Whitening ahead of a SpectralMapper, "none" ahead of templates.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
+        precision: accept a match instead where it is at least as probably right, above 0 and below 1; of a
+            map that is calibrated, see `calibrate`.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
         velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
@@ -122,6 +126,7 @@ class DejaVu(nn.Module):
         batch_size: int = 64,
         preprocess: Preprocess | None = None,
         velocity: GroundOdometry | None = None,
+        precision: float | None = None,
     ) -> None:
         super().__init__()
         if whitening not in (None, "none") and not isinstance(whitening, Whitening):
@@ -134,6 +139,9 @@ class DejaVu(nn.Module):
             raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
         if threshold is not None and not threshold > -math.inf:
             raise InputError(f"the threshold is {threshold}; expected a number, or None")
+        check_precision(precision)
+        if precision is not None and threshold not in (None, math.inf):
+            raise InputError(f"a threshold, {threshold}, and a precision, {precision}; expected one of them")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
         for module in self.features.modules():  # no file can be loaded into expanded ones
@@ -145,6 +153,7 @@ class DejaVu(nn.Module):
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
         self.threshold = None if threshold == math.inf else threshold
+        self.precision = precision
         self.batch_size = batch_size
         self.velocity = velocity
         self.map: PlaceMap = self.mapper.empty()
@@ -152,6 +161,7 @@ class DejaVu(nn.Module):
         self.frame_shape: tuple[int, ...] | None = None  # of the reference, or (D,) of ready features
         self.frame_names: list[str] = []  # of the reference's frames; empty where they have none
         self.trained: Training | None = None
+        self.calibration: Calibration | None = None
 
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
@@ -234,9 +244,17 @@ class DejaVu(nn.Module):
                 the first counts; frames that show none are left out.
 
         Raises:
-            InputError: no whitening that could learn from it, or nothing says which places it shows.
+            InputError: no whitening that could learn from it, or as of `places_shown`.
         """
         self._require_learning_whitening(second.name)
+        return self.places_shown(reference, second, truth)
+
+    def places_shown(self, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
+        """As `views`, for `calibrate`.
+
+        Raises:
+            InputError: nothing says which places it shows, or it shows none.
+        """
         second = self.resample(second, getattr(reference, "step", None))
         frames, shown = _count(reference), _count(second)
         found = ground_truth_of(truth, reference, second, frames, shown)
@@ -307,8 +325,57 @@ class DejaVu(nn.Module):
             route.positions = positions
             route.check()
         self.map, self.step, self.frame_names = route, step, names
-        self.frame_shape, self.trained = shape or None, None
+        self.frame_shape, self.trained, self.calibration = shape or None, None, None
         return self
+
+    def calibrate(self, reference: Traverse | Tensor | None, views: Views | None = None) -> DejaVu:
+        """Find out how probably answers are right that stand out so much; `Match.probability` then tells it.
+
+        Args:
+            reference: the traverse that the map was learned from. Every 10th stretch of 20 of its frames is
+                looked up in changed light and view: `Augmentation` of 1.5 times the strengths of the
+                whitening, which has seen the plain ones.
+            views: frames of another traverse of the same places instead, which tell of its own changes;
+                those that show no place are left out.
+
+        Returns:
+            self, with `self.calibration`.
+
+        Raises:
+            InputError: no map, ready features, whose changes cannot be drawn, or no right answer.
+
+        Example:
+            >>> from dejavu_torch import open_source
+            >>> route = open_source("sim:aerial?frames=200")
+            >>> model = DejaVu(precision=0.99).learn(route).calibrate(route)
+            >>> match = model.localize(open_source("sim:aerial?frames=200&traverse=1"))
+            >>> bool((match.accepted == (match.probability >= 0.99)).all())
+            True
+        """
+        self._require_map()
+        if views is None:
+            if reference is None:
+                raise InputError("neither a reference nor views to calibrate by; expected one of them")
+            strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
+            views = Stretches(as_traverse(reference), self.map.places, strengths).views
+            length = STRETCH
+        else:
+            length = LONGEST_TRIAL
+        descriptors = self.extract_all(views.traverse)
+        parts = zip(descriptors.split(length), views.places.split(length), strict=True)
+        self.calibration = calibrated(self.map, (Trial(*part) for part in parts))
+        return self
+
+    def calibrate_if_possible(self, reference: Traverse, views: Views | None = None) -> None:
+        """As `calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
+        reference."""
+        if views is not None:
+            self.calibrate(reference, views)
+        elif self.calibration is None and len(reference.frame_shape) == 3 and self.map.summary().covered:
+            try:
+                self.calibrate(reference)
+            except InputError as error:
+                log.warning("the map is not calibrated: %s", error)
 
     def describe(self, frames: Tensor) -> Tensor:
         """Features of frames: preprocess, then features. (B,C,H,W) -> (B,D)"""
@@ -347,8 +414,8 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        matches = list(self.matches(queries, progress, sequence))
-        return Match(*map(torch.cat, zip(*matches, strict=True)))
+        matches = self.matches(queries, progress, sequence)
+        return Match.joined(matches)
 
     def localize_descriptors(
         self, descriptors: Tensor, sequence: SequenceModel | None = None, order: Tensor | None = None
@@ -358,7 +425,8 @@ class DejaVu(nn.Module):
         Args:
             order: (N,) which frame each place of a shuffled map is; the match then counts frames.
         """
-        return self.found(descriptors, Matching(sequence), order).match(self.threshold_of(sequence))
+        found = self.found(descriptors, self.matching(sequence), order)
+        return found.match(self.threshold_of(sequence), self.precision)
 
     def found(self, descriptors: Tensor, matching: Matching, order: Tensor | None = None) -> Found:
         """All that a matching finds, of descriptors and in an order as of `localize_descriptors`."""
@@ -373,9 +441,10 @@ class DejaVu(nn.Module):
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
-        threshold = self.threshold_of(sequence)
-        for part in self._found(self._checked(queries, progress, sequence), Matching(sequence)):
-            yield part.match(threshold)
+        self.check_precision(sequence)
+        threshold, matching = self.threshold_of(sequence), self.matching(sequence)
+        for part in self._found(self._checked(queries, progress, sequence), matching):
+            yield part.match(threshold, self.precision)
 
     def candidates(
         self,
@@ -434,6 +503,25 @@ class DejaVu(nn.Module):
                 self.check_queries(shape, features.shape[1], queries.name)
             yield self.whitened(features)
 
+    def matching(self, sequence: SequenceModel | None) -> Matching:
+        """A way to match queries, with probabilities where the map is calibrated for it."""
+        calibration = self.calibration
+        return Matching(sequence, platt=None if calibration is None else calibration.of(sequence))
+
+    def check_precision(self, sequence: SequenceModel | None) -> None:
+        """Refuse a precision that nothing tells of.
+
+        Raises:
+            InputError: the map is not calibrated, or not for this way of matching.
+        """
+        if self.precision is None or self.matching(sequence).platt is not None:
+            return
+        if self.calibration is None:
+            seen = "the map is not calibrated"
+        else:
+            seen = "the map is calibrated for single queries and for a filter that always searches"
+        raise InputError(f"the precision is {self.precision}, but {seen}; expected a threshold, or none")
+
     def threshold_of(self, sequence: SequenceModel | None) -> float | None:
         """What the score of a query, or of a sequence, has to be below to be accepted."""
         return self.threshold if sequence is None else sequence.threshold_of(self.threshold)
@@ -451,7 +539,8 @@ class DejaVu(nn.Module):
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         parts = (part for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence
-        if sequence is not None and not matching.lengths and order is None:  # not all scores may be needed
+        alone = not matching.lengths and matching.platt is None and order is None
+        if sequence is not None and alone:  # not all scores may be needed
             return matching._replace(sequence=None).stream(self.map.sequences(parts, sequence))
         scores: Iterator[Tensor] = map(self.map.scores, parts)
         if order is not None:
@@ -522,8 +611,10 @@ class DejaVu(nn.Module):
         """
         with opened(Path(path)) as (tensors, header):
             parts = _build_parts(header, features, tensors)
-            model = cls(**parts, threshold=header.threshold, batch_size=header.batch_size)
-            model.frame_shape, model.step, model.trained = header.frame_shape, header.step, header.trained
+            settings = {name: getattr(header, name) for name in ("threshold", "precision", "batch_size")}
+            model = cls(**parts, **settings)
+            for name in ("frame_shape", "step", "trained", "calibration"):
+                setattr(model, name, getattr(header, name))
             own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("map.")}
             model.map.load_state_dict(_map_state(model.map, own, header))
             loaded = model.load_state_dict(tensors, strict=False)
@@ -558,7 +649,7 @@ class DejaVu(nn.Module):
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         parts = {name: getattr(self, name) for name in PARTS}
         header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
-        header |= {"threshold": self.threshold, "batch_size": self.batch_size}
+        header |= {name: getattr(self, name) for name in ("threshold", "precision", "batch_size")}
         header |= self.get_extra_state()
         header["map"] = self.map.get_extra_state()
         tensors = {f"map.{name}": tensor for name, tensor in self.map.packed().items()}
@@ -584,7 +675,16 @@ class DejaVu(nn.Module):
         """What the state_dict holds beside the tensors and the map's own state."""
         trained = self.trained and self.trained._asdict()
         names = encode_names(self.frame_names) if self.frame_names else None
-        return {"frame_shape": self.frame_shape, "step": self.step, "trained": trained, "names": names}
+        calibration = self.calibration and {
+            name: platt and platt._asdict() for name, platt in self.calibration._asdict().items()
+        }
+        return {
+            "frame_shape": self.frame_shape,
+            "step": self.step,
+            "trained": trained,
+            "names": names,
+            "calibration": calibration,
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` gave.
@@ -593,12 +693,23 @@ class DejaVu(nn.Module):
             InputError: a state of other entries, or of other types.
         """
         told = checked_fields(state, STATE_TYPES, "the model's state")
-        self.frame_shape, self.step, self.trained = (told[n] for n in ("frame_shape", "step", "trained"))
+        for name in ("frame_shape", "step", "trained", "calibration"):
+            setattr(self, name, told[name])
         self.frame_names = [] if told["names"] is None else decode_names(told["names"])
 
     def _require_map(self) -> None:
         if not self.map.places:
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
+
+
+def check_precision(precision: float | None) -> None:
+    """Refuse a precision that no answers can be asked for.
+
+    Raises:
+        InputError: not above 0 and below 1.
+    """
+    if precision is not None and not 0 < precision < 1:
+        raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
 
 
 def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -632,16 +743,19 @@ class Header(NamedTuple):
     mapper: Recipe
     velocity: Recipe | None
     threshold: float | None
+    precision: float | None
     batch_size: int
     frame_shape: tuple[int, ...] | None
     step: float | None
     trained: Training | None
     names: str | None
+    calibration: Calibration | None
     map: dict[str, Any]
 
 
 HEADER_TYPES = get_type_hints(Header)
-STATE_TYPES = {name: HEADER_TYPES[name] for name in ("frame_shape", "step", "trained", "names")}
+STATE = ("frame_shape", "step", "trained", "names", "calibration")
+STATE_TYPES = {name: HEADER_TYPES[name] for name in STATE}
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
@@ -170,12 +170,24 @@ class Match(NamedTuple):
 
     index: (Q,) int64, the reported place, -1 where no place has a finite score.
     score: (Q,) float, the lowest S; lower is better, +inf where nothing covers.
-    accepted: (Q,) bool, score below the threshold.
+    accepted: (Q,) bool, score below the threshold, or probability at least the precision asked for.
+    probability: (Q,) float64 of being right, where the map is calibrated; else None.
     """
 
     index: Tensor  # type: ignore[assignment]  # the field shadows tuple.index
     score: Tensor
     accepted: Tensor
+    probability: Tensor | None = None
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Match:
+        """The same of every column."""
+        return Match(*(None if column is None else change(column) for column in self))  # type: ignore[arg-type]
+
+    @staticmethod
+    def joined(parts: Iterable[Match]) -> Match:
+        """Matches of queries one behind the other as one."""
+        columns = zip(*parts, strict=True)
+        return Match(*(None if column[0] is None else torch.cat(column) for column in columns))  # type: ignore[arg-type]
 
 
 class Training(NamedTuple):

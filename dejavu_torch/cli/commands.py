@@ -18,7 +18,7 @@ from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import REGISTRY, DejaVu
+from dejavu_torch.model import REGISTRY, DejaVu, check_precision
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report
     from dejavu_torch.experiments.compare import Comparison
 
+NO_CALIBRATION = "none"
 COMPARED = ("map.safetensors", "matches.csv")  # beside a report of them
 APART = 5  # places: any two candidates of a query are further apart
 
@@ -82,6 +83,8 @@ def run_learn(
     seed: int = 0,
     second: str | None = None,
     second_truth: str | None = None,
+    calibration: str | None = None,
+    calibration_truth: str | None = None,
     model: DejaVu,
     command: str,
 ) -> None:
@@ -94,17 +97,26 @@ def run_learn(
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
+        calibration: another traverse of the same places, which tells how probably answers are right; changed
+            frames of the route itself if not given, none if "none"
+        calibration_truth: which places it shows, as --truth
     """
     if map.suffix != ".safetensors":
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
     check_output_file(map)
-    check_not_read(map, source, second, second_truth)
+    check_not_read(map, source, second, second_truth, calibration, calibration_truth)
+    if calibration == NO_CALIBRATION and model.precision is not None:
+        raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
     _set_seed(model, seed)
     traverse = model.resample(open_source(source), progress=True)
     _print_steps(traverse)
     traverse, views = _with_second(model, traverse, second, second_truth)
+    known = _with_calibration(model, traverse, calibration, calibration_truth)
     model.learn(traverse, progress=True, second=views)
+    if calibration != NO_CALIBRATION:
+        model.calibrate_if_possible(traverse, known)
+    model.check_precision(None)
     model.save(map)
     print_map(model)
     if model.map.summary().covered:
@@ -119,6 +131,7 @@ def run_localize(
     *,
     out: Path,
     threshold: float | None = None,
+    precision: float | None = None,
     top: int | None = None,
     corners: list[list[float]] | None = None,
     as_is: bool = False,
@@ -133,8 +146,9 @@ def run_localize(
     Args:
         map: map file
         source: as of `dejavu learn`
-        out: csv of query,place,score,accepted[,rank],query_name,place_name
+        out: csv of query,place,score,accepted[,probability][,rank],query_name,place_name
         threshold: accept a match whose score is below
+        precision: accept instead what is at least as probably right, such as .99
         top: write so many places of each query, no two within 5 of each other, a row each with its rank
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         as_is: take the frames as they are, though the map's are resampled
@@ -157,8 +171,11 @@ def run_localize(
         model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
     if as_is:
         model.velocity = None
-    model.threshold = model.threshold if threshold is None else threshold
+    _accept_by(model, threshold, precision)
     if top is not None:
+        if precision is not None:
+            raise InputError(f"--precision {precision} is of one place, --top {top} of several; expected one")
+        model.precision = None
         check_candidates(top, APART, model.map.places)
     query = open_source(source)
     if model.step is not None:
@@ -167,6 +184,7 @@ def run_localize(
     matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
     if matcher is not None:
         matcher.check(None, model.map.places)
+    model.check_precision(matcher)
     threshold = model.threshold_of(matcher)
     matches = model.matches(query, "localizing", matcher)
     if top is not None:
@@ -175,7 +193,7 @@ def run_localize(
     total, accepted = _write_matches(out, matches, query, model, top)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
-    elif threshold is None:
+    elif threshold is None and model.precision is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
@@ -200,6 +218,9 @@ def run_compare(
     filter: bool = False,
     moves: list[float] | None = None,
     top: int | None = None,
+    calibration: str | None = None,
+    calibration_truth: str | None = None,
+    distractors: list[str] | str | None = None,
     model: DejaVu,
     command: str,
 ) -> None:
@@ -223,6 +244,9 @@ def run_compare(
         filter: as of `dejavu localize`
         moves: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
+        calibration: as of `dejavu learn`; a third traverse
+        calibration_truth: which places it shows, as --truth
+        distractors: another route, or a list of several, '[A,B]': how many of its frames are accepted
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
@@ -233,11 +257,17 @@ def run_compare(
     if map is not None:
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
-        model.threshold = model.threshold if given.threshold is None else given.threshold
+        _accept_by(model, given.threshold, given.precision)
     first, queries = open_source(reference), open_source(query)
     _check_report_folder(out, COMPARED, [reference, query, second], [truth, second_truth])
+    others = [distractors] if isinstance(distractors, str) else distractors or []
+    read = [reference, query, second, calibration]
+    for other in others:
+        if other in read:
+            raise InputError(f"--distractors {other} is one of the traverses; expected another route")
     _set_seed(model, seed)
     first, views = _with_second(model, first, second, second_truth, queries)
+    known = _with_calibration(model, first, calibration, calibration_truth, queries)
     result = compare(
         first,
         queries,
@@ -250,6 +280,8 @@ def run_compare(
         second=views,
         sequence=matcher,
         top=1 if top is None else top,
+        calibration=known,
+        distractors=[open_source(other) for other in others],
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map, top)
@@ -496,6 +528,31 @@ def _with_second(
         raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
     reference = model.resample(reference, progress=True)
     return reference, model.views(reference, traverse, truth)
+
+
+def _with_calibration(
+    model: DejaVu, reference: Traverse, source: str | None, truth: str | None, query: Traverse | None = None
+) -> Views | None:
+    """The traverse that a map is calibrated by."""
+    if source in (None, NO_CALIBRATION):
+        if truth is not None:
+            seen = f"--calibration_truth {truth} is of no traverse"
+            raise InputError(f"{seen}; expected --calibration SOURCE with it")
+        return None
+    traverse = open_source(str(source))
+    for other in (reference, query):
+        if other is not None and Path(traverse.name).resolve() == Path(other.name).resolve():
+            raise InputError(f"--calibration {source} is {other.name} itself; expected another traverse")
+    return model.places_shown(reference, traverse, truth)
+
+
+def _accept_by(model: DejaVu, threshold: float | None, precision: float | None) -> None:
+    """What a model accepts from now on, where one of the two is given."""
+    if threshold is not None and precision is not None:
+        raise InputError(f"--threshold {threshold} and --precision {precision}; expected one of them")
+    check_precision(precision)
+    if threshold is not None or precision is not None:
+        model.threshold, model.precision = threshold, precision
 
 
 def _print_steps(traverse: Traverse) -> None:

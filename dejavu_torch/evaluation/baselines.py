@@ -165,7 +165,7 @@ def baselines_of(
         else:  # training anew is a run of its own
             found["null"] = null(f"templates of shuffled {one}s", same_plan=True)
     if leave_out is not None:
-        index, score, _ = leave_out_match(model, reference, leave_out)
+        index, score, *_ = leave_out_match(model, reference, leave_out)
         itself = Found(Candidates(index[:, None], score[:, None]))
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     return found

@@ -158,8 +158,8 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
             )
             if route.temperature is not None:
                 scores = log_posterior(scores, route.temperature)
-            matches.append(Match(*(column.cpu() for column in best_match(scores, model.threshold))))
-    return Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
+            matches.append(best_match(scores, model.threshold).map(Tensor.cpu))
+    return Match.joined(matches)
 
 
 def _distances_without(

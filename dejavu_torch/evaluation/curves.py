@@ -228,4 +228,4 @@ def _judged(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> tuple[
             f"of {len(kept)} queries {int(truth.judged.sum())} are in the truth and none is left to judge; "
             "expected at least one in the truth that does not report an ignored place"
         )
-    return Match(*(column[kept] for column in match)), GroundTruth(*(column[kept] for column in truth))
+    return match.map(lambda column: column[kept]), GroundTruth(*(column[kept] for column in truth))

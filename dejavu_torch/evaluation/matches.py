@@ -1,8 +1,9 @@
-"""Matches as a csv of query,place,score,accepted[,rank],query_name,place_name."""
+"""Matches as a csv of query,place,score,accepted[,probability][,rank],query_name,place_name."""
 
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -59,20 +60,26 @@ def write_matches(
     """
     total = accepted = 0
     each = 1 if ranks is None else ranks
+    matches = iter(matches)
+    start = next(matches, None)
+    known = start is not None and start.probability is not None
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*NUMBERS, *([] if ranks is None else ["rank"]), *NAMES])
-        for match in matches:
+        also = [*(["probability"] if known else []), *([] if ranks is None else ["rank"])]
+        writer.writerow([*NUMBERS, *also, *NAMES])
+        for match in () if start is None else itertools.chain([start], matches):
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
             first, total = total, total + len(match.index) // each
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places = match.index if frame_of is None else frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
-            columns = (queries.repeat_interleave(each), places, match.score, match.accepted, rank)
-            for query, place, score, good, at in zip(*(column.tolist() for column in columns), strict=True):
+            right = match.score if match.probability is None else match.probability
+            columns = (queries.repeat_interleave(each), places, match.score, match.accepted, right, rank)
+            rows = zip(*(column.tolist() for column in columns), strict=True)
+            for query, place, score, good, p, at in rows:
                 names = _name(query_name, query), _name(place_name, place)
-                ranked = [] if ranks is None else [at]
-                writer.writerow([query, place, f"{score:.{digits}g}", int(good), *ranked, *names])
+                also = [*([f"{p:.6g}"] if known else []), *([] if ranks is None else [at])]
+                writer.writerow([query, place, f"{score:.{digits}g}", int(good), *also, *names])
                 accepted += good and at == 1
     return total, accepted
 

@@ -16,13 +16,14 @@ import jinja2
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.rejection import rejection_line
 from dejavu_torch.text import printable
 
 PICTURES = (
     *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "sequences"),
     *("ground", "velocity", "chunks"),
     *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
-    *("spectrum", "components", "posterior"),
+    *("spectrum", "components", "posterior", "reliability"),
 )
 LATE = 0.1  # recall at which a curve starts late
 HEADING = 11  # letters of a line of a heading
@@ -208,6 +209,8 @@ def summary(report: Report) -> str:
     if facts.get("threshold_of_full_precision") is not None:
         threshold = facts["threshold_of_full_precision"]
         lines.append(f"Here --threshold {threshold:.9g} would accept right places only")
+    if "rejection" in facts:
+        lines += [line for line in [rejection_line(facts["rejection"])] if line]
     if any(is_late(one) for one in report.shown().values()):
         lines.append(_LATE)
     if "seconds_learn" in facts:

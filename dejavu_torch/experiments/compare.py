@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
@@ -30,6 +30,7 @@ from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqsl
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.rejection import Fitted, draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
@@ -81,6 +82,8 @@ def compare(
     others: Mapping[str, tuple[str, DejaVu]] | None = None,
     sequence: SequenceModel | None = None,
     top: int = 1,
+    calibration: Views | None = None,
+    distractors: Sequence[Traverse] = (),
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -102,6 +105,9 @@ def compare(
             resamples.
         sequence: scores consecutive queries together, on the map and on all that it is set beside.
         top: how many candidates of each query are wanted.
+        calibration: see `DejaVu.calibrate`; another traverse than the query. None takes changed frames of the
+            reference, where the model's map is not calibrated yet.
+        distractors: routes that are not on the map: how many of their frames are accepted.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -140,6 +146,8 @@ def compare(
         else:
             places = model.describe_reference(reference, second, text)
             model.learn_features(places, reference)
+        model.calibrate_if_possible(reference, calibration)
+        model.check_precision(sequence)
     with timed(seconds, "localize"):
         model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)
@@ -147,8 +155,10 @@ def compare(
             sequence.check(len(queries), model.map.places)
         ranks = max(top, min(max(RANKS), model.map.places))
         matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
-        found = model.found(queries, matching._replace(ranks=ranks, apart=tolerance))
-    match, candidates = found.match(model.threshold_of(sequence)), found.candidates
+        wanted = matching._replace(ranks=ranks, apart=tolerance, platt=model.matching(sequence).platt)
+        found = model.found(queries, wanted)
+    match, candidates = found.match(model.threshold_of(sequence), model.precision), found.candidates
+    off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
@@ -161,6 +171,7 @@ def compare(
     scored = contenders["map"].scores is not None
     storage, noise = _at_other_sizes(run, seed, progress) if scored else (None, {})
     pictures = draw_pictures(run, contenders, storage)
+    pictures |= draw_reliability(run.scored, known, tolerance)
     carried = all(source_of(one).place is not None for one in (reference, query))
     facts = {
         **_map_facts(model.summary(), places),
@@ -174,9 +185,18 @@ def compare(
             describe_ground_truth(truth, interpolate, carried),
         ),
         **candidate_facts(model.map.scored(candidates.index), known, tolerance),
+        **rejection_facts(run.scored, known, tolerance, off_map),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
     return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run, candidates)
+
+
+def _probability(model: DejaVu, traverse: Traverse, sequence: SequenceModel | None) -> Tensor:
+    """Of what is found for frames that are not on the map, (n,)."""
+    frames = Fitted(traverse, model.frame_shape or ())
+    found = model.found(model.extract_all(frames), model.matching(sequence)).probability
+    assert found is not None
+    return found
 
 
 @contextmanager

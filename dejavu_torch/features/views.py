@@ -12,6 +12,10 @@ from torch import Tensor
 from dejavu_torch.types import InputError, Traverse
 
 BLOCK = 64  # frames augmented at once
+STRETCH, EVERY = 20, 10  # frames of a stretch, and which of the stretches are taken
+STRONGER = 1.5  # than what a whitening knows, since it has seen the frames themselves
+FEWEST, MOST = 600, 1200  # frames of all stretches together
+LARGEST = {"scale": 0.9, "rotation": 180.0, "gamma": 10.0, "blur": 20.0}  # strengths that make sense; else 1
 
 
 class Views(NamedTuple):
@@ -82,3 +86,65 @@ class AugmentedTraverse(Traverse):
         """The copies with the frames that they show."""
         blocks = torch.tensor(self.shown).split(self.block)
         return Views(self, torch.cat([block.repeat(self.copies) for block in blocks]))
+
+
+class Stretches(Traverse):
+    """Stretches of a traverse, each frame as it may look on another visit: what a map is calibrated by.
+
+    Every 10th stretch of 20 frames is taken, of a short traverse fewer frames; several times where that is
+    little, and of a long one not all. Each frame is changed for itself, 1.5 times as much as by `strengths`.
+
+    Args:
+        traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
+        seed: of the changes.
+
+    Raises:
+        InputError: ready features.
+    """
+
+    def __init__(self, traverse: Traverse, frames: int, strengths: Mapping[str, Any], seed: int = 0) -> None:
+        from dejavu_torch.features.augmentation import Augmentation
+
+        if len(traverse.frame_shape) != 3:
+            raise InputError(f"{traverse.name} holds ready features; expected frames to calibrate by")
+        length = min(STRETCH, max(1, frames // EVERY))
+        starts = range(0, frames - length + 1, EVERY * length)
+        self.starts = starts[:: max(1, len(starts) * length // MOST)]
+        self.times = max(1, -(-FEWEST // (len(self.starts) * length)))
+        self.traverse, self.stretch, self.seed = traverse, length, seed
+        self.augmentation = Augmentation(**{name: _stronger(name, one) for name, one in strengths.items()})
+        self.name, self.length = f"changed frames of {traverse.name}", len(self.places)
+
+    @property
+    def places(self) -> Tensor:
+        """The frame that each shows, (n,) int64."""
+        one = torch.tensor(self.starts)[:, None] + torch.arange(self.stretch)
+        return one.flatten().repeat(self.times)
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        state = torch.Generator().manual_seed(self.seed).get_state()
+        for _ in range(self.times):
+            for start in self.starts:
+                for frames in self.traverse.between(start, start + self.stretch):
+                    with torch.random.fork_rng(devices=[]):
+                        torch.set_rng_state(state)
+                        changed: Tensor = self.augmentation.train()(frames)
+                        state = torch.get_rng_state()
+                    yield from changed.split(size)
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """See `Traverse`."""
+        return self.traverse.frame_shape
+
+    @property
+    def views(self) -> Views:
+        """The frames with the places that they show."""
+        return Views(self, self.places)
+
+
+def _stronger(name: str, strength: Any) -> Any:
+    most = LARGEST.get(name, 1.0)
+    if isinstance(strength, (list, tuple)):
+        return type(strength)(min(STRONGER * one, most) for one in strength)
+    return min(STRONGER * strength, most)

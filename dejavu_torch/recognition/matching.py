@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.recognition.calibration import Platt, Track, evidence_of
 from dejavu_torch.recognition.candidates import Candidates, best_candidates
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -23,20 +24,29 @@ class Found(NamedTuple):
     """Places of queries.
 
     candidates: (Q,k), the best places of each. sequences: by T, (Q,) the best by a sequence of T queries.
+    probability: (Q,) float64 of the first candidate being right, None where that is not known.
     """
 
     candidates: Candidates
     sequences: Mapping[int, Match] = MappingProxyType({})
+    probability: Tensor | None = None
 
-    def match(self, threshold: float | None = None) -> Match:
-        """The first candidate of each query, accepted as by `best_match`."""
-        return Candidates(*(column[:, :1] for column in self.candidates)).as_match(threshold)
+    def match(self, threshold: float | None = None, precision: float | None = None) -> Match:
+        """The first candidate of each query, accepted as by `best_match`, or where it is at least as probably
+        right as `precision`."""
+        match = Candidates(*(column[:, :1] for column in self.candidates)).as_match(threshold)
+        if self.probability is None:
+            return match
+        accepted = match.accepted if precision is None else self.probability >= precision
+        return match._replace(accepted=accepted, probability=self.probability)
 
     def moved(self, place: Callable[[Tensor], Tensor]) -> Found:
         """The same with other numbers of the places; -1, where none is found, must stay."""
-        return Found(
-            self.candidates._replace(index=place(self.candidates.index)),
-            {length: match._replace(index=place(match.index)) for length, match in self.sequences.items()},
+        return self._replace(
+            candidates=self.candidates._replace(index=place(self.candidates.index)),
+            sequences={
+                length: match._replace(index=place(match.index)) for length, match in self.sequences.items()
+            },
         )
 
 
@@ -47,12 +57,14 @@ class Matching(NamedTuple):
     lengths: each T that is matched beside that by a `SequenceMatcher`, at the speeds of `sequence` if that is
         one; only where there is a sequence.
     ranks: candidates of a query. apart: places, any two of them differ by more.
+    platt: makes probabilities of how single queries stand out, or the track of a filter; None makes none.
     """
 
     sequence: SequenceModel | None = None
     lengths: tuple[int, ...] = ()
     ranks: int = 1
     apart: int = 0
+    platt: Platt | None = None
 
     @property
     def single(self) -> bool:
@@ -71,29 +83,42 @@ class Matching(NamedTuple):
     @torch.no_grad()
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Found]:
         """As `found`, a part of the queries at a time, on the CPU and without gradients."""
-        parts: Iterable[tuple[Tensor, dict[int, Tensor]]] = ((scores, {}) for scores in batches)
-        if self.sequence is not None:
-            small = (part for scores in batches for part in scores.split(max(1, AT_ONCE // scores.shape[1])))
-            parts = _beside(self.sequence, small, sorted(self.lengths))
-        for scores, sums in parts:
+        for scores, sums, evidence in self._parts(batches):
             candidates = best_candidates(scores, self.ranks, self.apart)
             yield Found(
                 Candidates(*(column.cpu() for column in candidates)),
-                {
-                    length: Match(*(column.cpu() for column in best_match(part)))
-                    for length, part in sums.items()
-                },
+                {length: best_match(part).map(Tensor.cpu) for length, part in sums.items()},
+                None if self.platt is None or evidence is None else self.platt.probability(evidence).cpu(),
             )
+
+    def _parts(self, batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, dict[int, Tensor], Tensor | None]]:
+        """The scores to match by, those by other sequences, and how much each query stands out."""
+        if self.sequence is None:
+            for scores in batches:
+                yield scores, {}, None if self.platt is None else evidence_of(scores)
+            return
+        small: Iterator[Tensor] = (
+            part for scores in batches for part in scores.split(max(1, AT_ONCE // scores.shape[1]))
+        )
+        single: Iterator[Tensor | None] = itertools.repeat(None)
+        if self.platt is not None:
+            small, single = itertools.tee(small)  # in step: one batch is held
+        track = Track()
+        for (scores, sums), own in zip(
+            _beside(self.sequence, small, sorted(self.lengths)), single, strict=False
+        ):
+            yield scores, sums, None if own is None else track(scores, own)
 
 
 def joined(parts: Iterable[Found]) -> Found:
     """What was found of all queries, from what was found of some at a time."""
-    candidates, sequences = zip(*parts, strict=True)
-    together = {
-        length: Match(*map(torch.cat, zip(*(part[length] for part in sequences), strict=True)))
-        for length in sequences[0]
-    }
-    return Found(Candidates(*map(torch.cat, zip(*candidates, strict=True))), together)
+    candidates, sequences, probability = zip(*parts, strict=True)
+    together = {length: Match.joined(part[length] for part in sequences) for length in sequences[0]}
+    return Found(
+        Candidates(*map(torch.cat, zip(*candidates, strict=True))),
+        together,
+        None if probability[0] is None else torch.cat(probability),
+    )
 
 
 def _beside(

@@ -65,6 +65,7 @@ class MapExport(Callback):
         except InputError as error:
             log.warning("no map is written: %s", error)
             return
+        model.calibrate_if_possible(task.data.reference)
         folder.mkdir(parents=True, exist_ok=True)
         model.save(folder / self.name)
         self.written = (folder / self.name, model)

@@ -1,0 +1,164 @@
+"""Whether the probabilities of a calibrated map hold, and what accepting by them keeps and lets in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.ground_truth import counted, is_right
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Picture, canvas
+from dejavu_torch.recognition.calibration import calibration_error
+from dejavu_torch.resize import resize_frames
+from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+
+ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions that a report tells of
+BINS = 10
+
+
+class Accepted(NamedTuple):
+    """What is accepted with at least the probability `asked`, in shares.
+
+    precision: right ones among the accepted, None where none is. kept: accepted ones among the right.
+    """
+
+    asked: float
+    precision: float | None
+    kept: float
+
+
+class Fitted(Traverse):
+    """Frames brought to another shape (C,H,W): sizes are resized, colours made grey or grey ones repeated.
+
+    Raises:
+        InputError: ready features.
+    """
+
+    def __init__(self, traverse: Traverse, shape: tuple[int, ...]) -> None:
+        if len(traverse.frame_shape) != 3 or len(shape) != 3:
+            raise InputError(f"{traverse.name} has no frames of the map's kind; expected frames")
+        self.traverse, self.shape = traverse, shape
+        self.name, self.length = traverse.name, traverse.length
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        from kornia.color import rgb_to_grayscale  # kornia takes a second to import
+
+        channels, *sides = self.shape
+        for batch in self.traverse.batches(size):
+            frames = resize_frames(batch, (sides[0], sides[1]))
+            if frames.shape[1] != channels:
+                grey = rgb_to_grayscale(frames) if frames.shape[1] == 3 else frames
+                frames = grey.expand(-1, channels, -1, -1)
+            yield frames
+
+
+def rejection_facts(
+    match: Match, truth: GroundTruth | None, tolerance: int, off_map: Mapping[str, Tensor]
+) -> dict[str, Any]:
+    """What report.json holds of the probabilities of matches; nothing where they have none.
+
+    Args:
+        match, truth, tolerance: as of `evaluate`.
+        off_map: by the name of another route, the probabilities (n,) of what was found for its frames; none
+            of these is right.
+
+    Returns:
+        `rejection`, with the scores of the answers in the order of their probability, the expected
+        calibration error, an `Accepted` for each of `ASKED`, and of other routes how many frames there are
+        and what share of them is accepted.
+    """
+    if match.probability is None:
+        return {}
+    facts: dict[str, Any] = {
+        "off_map": {
+            name: {
+                "frames": len(found),
+                "accepted": {f"{asked:g}": float((found >= asked).double().mean()) for asked in ASKED},
+            }
+            for name, found in off_map.items()
+        }
+    }
+    if truth is not None:
+        probability, right = judged(match, truth, tolerance)
+        scores = evaluate(match._replace(score=1 - match.probability), truth, tolerance)
+        facts |= {
+            "auc": scores.auc,
+            "recall_at_100_precision": scores.recall_at_100_precision,
+            "expected_calibration_error": calibration_error(probability, right, BINS),
+            "precision": [accepted_at(asked, probability, right)._asdict() for asked in ASKED],
+        }
+    return {"rejection": facts}
+
+
+def judged(match: Match, truth: GroundTruth, tolerance: int) -> tuple[Tensor, Tensor]:
+    """Probability (n,) of the queries that the scores count, and whether they are right (n,) bool."""
+    assert match.probability is not None
+    kept = counted(match.index, truth, tolerance)
+    return match.probability[kept], is_right(match.index[kept], truth.positives[kept], tolerance)
+
+
+def accepted_at(asked: float, probability: Tensor, right: Tensor) -> Accepted:
+    """What is accepted of answers (n,) with these probabilities.
+
+    Example:
+        >>> accepted_at(0.5, torch.tensor([0.9, 0.6, 0.2]), torch.tensor([True, False, True]))
+        Accepted(asked=0.5, precision=0.5, kept=0.5)
+    """
+    accepted = probability >= asked
+    hits = int((accepted & right).sum())
+    return Accepted(
+        asked, hits / int(accepted.sum()) if accepted.any() else None, hits / max(1, int(right.sum()))
+    )
+
+
+def rejection_line(facts: Mapping[str, Any]) -> str:
+    """The facts of `rejection_facts` in a sentence or two."""
+    text = []
+    if "expected_calibration_error" in facts:
+        last = facts["precision"][-1]
+        text.append(
+            f"Probabilities are {facts['expected_calibration_error']:.3f} away from the share of right "
+            "answers (expected calibration error)"
+        )
+        kept = f"--precision {last['asked']:g} accepts {100 * last['kept']:.1f}\xa0% of the right answers"
+        told = last["precision"]
+        text.append(kept if told is None else f"{kept}, at a precision of {100 * told:.2f}\xa0%")
+    for name, one in facts["off_map"].items():
+        share = 100 * one["accepted"][f"{ASKED[-1]:g}"]
+        text.append(f"It accepts {share:.2f}\xa0% of the {one['frames']} frames of {name}, off the map")
+    return ". ".join(text)
+
+
+def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) -> dict[str, Picture]:
+    """Shares of right answers over their probability; nothing without probabilities or truth."""
+    if match.probability is None or truth is None:
+        return {}
+    probability, right = judged(match, truth, tolerance)
+    if not len(right):
+        return {}
+    bin_of = (probability * BINS).long().clamp(0, BINS - 1)
+    counts = torch.bincount(bin_of, minlength=BINS)
+    means, shares = (
+        torch.zeros(BINS, dtype=torch.float64).index_add_(0, bin_of, one.double()) / counts.clamp(min=1)
+        for one in (probability, right)
+    )
+    figure, (above, below) = canvas(4.2, 2, sharex=True, height_ratios=[3, 1])
+    above.plot([0, 1], [0, 1], color=GREY, linewidth=0.8, linestyle=":")
+    filled = counts > 0
+    above.plot(means[filled], shares[filled], color=DARK, linewidth=1)
+    sizes = 14 + 120 * (counts[filled] / counts.max()).sqrt()
+    above.scatter(means[filled], shares[filled], s=sizes, color=RIGHT, zorder=3)
+    above.set(ylabel="share that is right", xlim=(-0.03, 1.03), ylim=(-0.06, 1.06))
+    below.bar((torch.arange(BINS) + 0.5) / BINS, counts, width=0.9 / BINS, color=GREY)
+    below.set(xlabel="probability that the map gives", ylabel="queries", yscale="symlog", ylim=(0, None))
+    error = calibration_error(probability, right, BINS)
+    picture = Picture(
+        (figure, (above, below)),
+        "can the probabilities be trusted?",
+        "Answers of like probability, and how many of them are right. On the dotted line a probability is "
+        f"what it says; the expected calibration error is {error:.3f}.",
+    )
+    return {"reliability": picture}

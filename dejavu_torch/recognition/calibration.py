@@ -1,0 +1,208 @@
+"""How probable it is that an answer is right: Platt scaling of how it stands out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.recognition.candidates import best_candidates
+from dejavu_torch.recognition.filter import PlaceFilter, moments_of
+from dejavu_torch.recognition.select import best_match
+from dejavu_torch.types import InputError, Scorer, SequenceModel
+
+TOLERANCE = 5  # places within which an answer is right
+MARGIN = 2.0  # weight of the margin beside the score itself
+SPREADS = 3.0  # nats that a filter's track counts for each standard deviation it stands out by
+MEMORY = 0.9  # of what a track told, from one query to the next
+NEAR = 2  # places around an answer whose best score counts for a track
+SURE = 1e-6  # least distance of a filter's probability from 0 and 1
+STEPS = 100  # of Newton's method at most
+
+
+class Platt(NamedTuple):
+    """p = 1 / (1 + exp(-(slope * evidence + offset)))"""
+
+    slope: float
+    offset: float
+
+    def probability(self, evidence: Tensor) -> Tensor:
+        """Of evidence (Q,): (Q,) float64, 0 where it is -inf."""
+        finite = evidence.double().nan_to_num(neginf=0.0)
+        p = torch.sigmoid(self.slope * finite + self.offset)
+        return torch.where(evidence.isneginf(), 0.0, p)
+
+
+class Calibration(NamedTuple):
+    """What turns evidence into probabilities; None for a kind of matching that is not calibrated.
+
+    single: of queries by themselves. filter: of a `PlaceFilter` with its defaults.
+    """
+
+    single: Platt | None
+    filter: Platt | None
+
+    def of(self, sequence: SequenceModel | None) -> Platt | None:
+        """The one for a way of matching; a filter that does not score all places has none."""
+        if sequence is None:
+            return self.single
+        return self.filter if isinstance(sequence, PlaceFilter) and sequence.search_every == 1 else None
+
+
+class Trial(NamedTuple):
+    """Consecutive queries whose places are known.
+
+    descriptors: (T,K). places: (T,) int64, of each the place that it shows; -1 for none.
+    """
+
+    descriptors: Tensor
+    places: Tensor
+
+
+def fit(evidence: Tensor, right: Tensor) -> Platt:
+    """The slope and offset under which the answers that were seen are most likely.
+
+    Shape: evidence (n,) float and right (n,) bool -> Platt.
+
+    Convention: what is aimed at is not 1 and 0, but (r + 1) / (r + 2) and 1 / (w + 2) of r right and w wrong
+        answers, so that the fit is finite where evidence tells all apart, or no answer was wrong. Evidence of
+        -inf is left out. A slope is never negative: where less evidence went with right answers, the share of
+        right ones is the probability of each.
+
+    Source: Platt, Advances in Large Margin Classifiers (1999); by Newton's method, as of Lin, Lin and Weng,
+        Machine Learning 68 (2007).
+
+    Raises:
+        InputError: no right answer.
+
+    Example:
+        >>> platt = fit(torch.tensor([0.0, 1, 2, 3]), torch.tensor([False, False, True, True]))
+        >>> platt.probability(torch.tensor([0.0, 1.5, 3])).round(decimals=1)
+        tensor([0.2000, 0.5000, 0.8000], dtype=torch.float64)
+    """
+    known = ~evidence.isneginf()
+    if not bool((right & known).any()):
+        raise InputError(f"none of {len(right)} answers is right; expected some, to calibrate by")
+    x, y = evidence[known].double(), right[known]
+    mean, spread = x.mean(), x.std(correction=0)
+    columns = torch.stack([(x - mean) / (spread if spread > 0 else 1), torch.ones_like(x)], 1)
+    hits, misses = int(y.sum()), int((~y).sum())
+    aim = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
+    found = torch.tensor([0.0, math.log((hits + 1) / (misses + 1))], dtype=torch.float64)
+    ridge = 1e-9 * torch.eye(2, dtype=torch.float64)
+
+    def loss(at: Tensor) -> float:
+        logits = columns @ at
+        return float((torch.nn.functional.softplus(logits) - aim * logits).sum())
+
+    for _ in range(STEPS):
+        p = torch.sigmoid(columns @ found)
+        gradient = columns.T @ (p - aim)
+        curvature = (columns * (p * (1 - p))[:, None]).T @ columns + ridge
+        step = torch.linalg.solve(curvature, gradient)
+        before, size = loss(found), 1.0
+        while loss(found - size * step) > before and size > 1e-8:
+            size /= 2
+        found = found - size * step
+        if float((size * step).abs().max()) < 1e-9:
+            break
+    slope = float(found[0] / (spread if spread > 0 else 1))
+    if slope < 0:
+        share = (hits + 1) / (hits + misses + 2)
+        return Platt(0.0, math.log(share / (1 - share)))
+    return Platt(slope, float(found[1] - slope * mean))
+
+
+def evidence_of(scores: Tensor) -> Tensor:
+    """How much the best place of each query stands out, (Q,N) -> (Q,); -inf where none is found.
+
+    Minus its score, and `MARGIN` times how much lower it is than the best beyond `TOLERANCE` places.
+    """
+    candidates = best_candidates(scores, min(2, scores.shape[1]), TOLERANCE)
+    best, second = candidates.score[:, 0], candidates.score[:, -1]
+    margin = torch.where(second.isfinite(), second - best, 0)
+    return torch.where(best.isfinite(), MARGIN * margin - best, -math.inf)
+
+
+class Track:
+    """How much a filter's answers stand out, one behind the other, which a single posterior cannot tell: off
+    the map it follows the best of places that are all wrong.
+
+    The log odds of the answer, and `SPREADS` times how many standard deviations single queries have scored
+    below their mean there lately.
+    """
+
+    def __init__(self) -> None:
+        self.told = self.weight = 0.0
+
+    def __call__(self, found: Tensor, scores: Tensor) -> Tensor:
+        """Of the filter's scores and those of single queries, each (B,N) -> (B,)."""
+        match = best_match(found)
+        near = match.index.clamp(min=0)[:, None] + torch.arange(-NEAR, NEAR + 1, device=found.device)
+        mean, spread, _ = moments_of(scores)
+        own = scores.gather(1, near.clamp(0, scores.shape[1] - 1)).amin(1)
+        deviations = torch.where(own.isfinite(), (mean[:, 0] - own) / spread[:, 0], 0)
+        lately = []
+        for one in deviations.tolist():
+            self.told = MEMORY * self.told + (1 - MEMORY) * one
+            self.weight = MEMORY * self.weight + 1 - MEMORY
+            lately.append(self.told / self.weight)
+        p = (-match.score.double()).exp().clamp(SURE, 1 - SURE)
+        stood = torch.tensor(lately, dtype=torch.float64, device=p.device)
+        return torch.where(match.score.isfinite(), p.logit() + SPREADS * stood, -math.inf)
+
+
+@torch.no_grad()
+def calibrated(route: Scorer, trials: Iterable[Trial]) -> Calibration:
+    """Fit on queries whose places are known, and on the same with the place and its surroundings, twice the
+    tolerance to each side, left out: answers off the map, of which none is right.
+
+    Raises:
+        InputError: no right answer of single queries, or none whose place is known.
+    """
+    kinds: dict[str, list[tuple[Tensor, Tensor]]] = {"single": [], "filter": []}
+    for descriptors, places in trials:
+        known = places >= 0
+        scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
+        near = places.clamp(min=0)[:, None] + torch.arange(
+            -2 * TOLERANCE, 2 * TOLERANCE + 1, device=scores.device
+        )
+        away = scores.scatter(1, near.clamp(0, scores.shape[1] - 1), math.inf)
+        for one, is_there in ((scores, True), (away, False)):
+            filtered = PlaceFilter()(one)
+            for kind, found, evidence in (
+                ("single", one, evidence_of(one)),
+                ("filter", filtered, Track()(filtered, one)),
+            ):
+                index = best_match(found).index
+                right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & is_there
+                kinds[kind].append((evidence[known].cpu(), right[known].cpu()))
+    if not kinds["single"]:
+        raise InputError("there are no queries to calibrate by; expected some")
+    single, filtered_ = (tuple(map(torch.cat, zip(*pairs, strict=True))) for pairs in kinds.values())
+    return Calibration(fit(*single), fit(*filtered_) if bool(filtered_[1].any()) else None)
+
+
+def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> float:
+    """Expected calibration error: how far probabilities lie from the shares of right answers, on average.
+
+    Args:
+        bins: of equal width, in which queries of like probability are compared.
+
+    Shape: probability (n,) and right (n,) bool -> a number from 0 to 1; NaN without answers.
+
+    Source: Naeini, Cooper and Hauskrecht, AAAI 2015.
+
+    Example:
+        >>> calibration_error(torch.tensor([0.9, 0.9, 0.9, 0.9]), torch.tensor([True, True, True, False]))
+        0.15
+    """
+    if not len(right):
+        return math.nan
+    bin_of = (probability * bins).long().clamp(0, bins - 1)
+    both = torch.stack([probability.double(), right.double()], 1)
+    sums = torch.zeros(bins, 2, dtype=torch.float64).index_add_(0, bin_of, both)
+    return round(float((sums[:, 0] - sums[:, 1]).abs().sum()) / len(right), 12)

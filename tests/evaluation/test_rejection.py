@@ -1,0 +1,82 @@
+"""What accepting by probability keeps and lets in, and the picture of it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import refused
+
+from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.evaluation.rejection import (
+    Fitted,
+    accepted_at,
+    draw_reliability,
+    rejection_facts,
+    rejection_line,
+)
+from dejavu_torch.types import Match
+
+TRUTH = as_ground_truth(torch.tensor([[0], [1], [2], [3], [-1]]))
+MATCH = Match(
+    torch.tensor([0, 1, 9, 3, 4]),
+    torch.tensor([0.3, 0.2, 0.1, 0.4, 0.5]),  # the wrong one has the best score
+    torch.ones(5, dtype=torch.bool),
+    torch.tensor([0.99, 0.995, 0.3, 0.9, 0.2], dtype=torch.float64),
+)
+
+
+def test_the_figures_of_a_rejection() -> None:
+    facts = rejection_facts(MATCH, TRUTH, 0, {"sea": torch.tensor([0.1, 0.6, 0.995, 0.2])})["rejection"]
+    assert facts["recall_at_100_precision"] == 0.75  # in the order of probability: all but the wrong one
+    assert facts["auc"] == 0.75
+    at = {one["asked"]: one for one in facts["precision"]}
+    assert at[0.5] == {"asked": 0.5, "precision": 1.0, "kept": 1.0}
+    assert at[0.99] == {"asked": 0.99, "precision": 1.0, "kept": 2 / 3}
+    told = abs(0.99 + 0.995 + 0.9 - 3) + 0.3 + 0.2
+    assert facts["expected_calibration_error"] == pytest.approx(told / 5)
+    assert facts["off_map"] == {
+        "sea": {"frames": 4, "accepted": {"0.5": 0.5, "0.8": 0.25, "0.9": 0.25, "0.95": 0.25, "0.99": 0.25}}
+    }
+    line = rejection_line(facts)
+    assert "66.7\xa0% of the right answers, at a precision of 100.00\xa0%" in line
+    assert "25.00\xa0% of the 4 frames of sea" in line
+
+
+def test_nothing_is_accepted_where_nothing_is_sure() -> None:
+    none = accepted_at(0.99, torch.tensor([0.5]), torch.tensor([True]))
+    assert (none.precision, none.kept) == (None, 0.0)
+    assert "at a precision" not in rejection_line(
+        rejection_facts(MATCH._replace(probability=MATCH.score / 2), TRUTH, 0, {})["rejection"]
+    )
+
+
+def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
+    plain = MATCH._replace(probability=None)
+    assert rejection_facts(plain, TRUTH, 0, {}) == draw_reliability(plain, TRUTH, 0) == {}
+    assert rejection_facts(MATCH, None, 0, {}) == {"rejection": {"off_map": {}}}
+    assert draw_reliability(MATCH, None, 0) == {}
+    assert rejection_line({"off_map": {}}) == ""
+
+
+def test_the_picture_shows_the_share_that_is_right() -> None:
+    figure, (above, below) = draw_reliability(MATCH, TRUTH, 0)["reliability"].plot
+    (points,) = above.collections
+    drawn = [tuple(point) for point in points.get_offsets().tolist()]
+    assert drawn == [
+        (pytest.approx(0.2), 0.0),
+        (pytest.approx(0.3), 0.0),
+        (pytest.approx((0.9 + 0.99 + 0.995) / 3), 1.0),
+    ]
+    assert [bar.get_height() for bar in below.patches] == [0, 0, 1, 1, 0, 0, 0, 0, 0, 3]
+    assert figure.get_size_inches()[0] == 4
+
+
+@pytest.mark.parametrize("shape", [(1, 8, 6), (3, 20, 30)])
+def test_frames_of_another_route_are_brought_to_the_map_s(shape: tuple[int, ...]) -> None:
+    for channels in (1, 3):
+        fitted = Fitted(as_traverse(torch.rand(5, channels, 10, 12)), shape)
+        assert [batch.shape for batch in fitted.batches(3)] == [(3, *shape), (2, *shape)]
+        assert fitted.length == 5
+    with refused("frames of the map's kind"):
+        Fitted(as_traverse(torch.rand(5, 4)), shape)

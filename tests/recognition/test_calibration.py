@@ -1,0 +1,286 @@
+"""Probabilities of being right: the fit, what it is fitted to, and the models and files that carry it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from torch import Tensor
+
+from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, open_source
+from dejavu_torch.features.views import Stretches, Views
+from dejavu_torch.recognition.calibration import (
+    Calibration,
+    Platt,
+    Track,
+    Trial,
+    calibrated,
+    calibration_error,
+    evidence_of,
+    fit,
+)
+from dejavu_torch.types import Match
+
+INF = math.inf
+ROUTE, AGAIN = "sim:aerial?frames=160", "sim:aerial?frames=160&traverse=1"
+
+
+class Table:
+    """A map on which each query is the row of scores itself."""
+
+    places = 40
+
+    def scores(self, queries: Tensor) -> Tensor:
+        return queries
+
+    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+        return queries[:, start:stop]
+
+
+def answers(seed: int, count: int = 200) -> tuple[Tensor, Tensor]:
+    draw = torch.Generator().manual_seed(seed)
+    evidence = torch.randn(count, generator=draw, dtype=torch.float64)
+    return evidence, torch.rand(count, generator=draw) < torch.sigmoid(2 * evidence - 1)
+
+
+# the fit
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_fit_is_the_most_likely_one(seed: int) -> None:
+    evidence, right = answers(seed)
+    hits, misses = int(right.sum()), int((~right).sum())
+    aim = torch.where(right, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
+
+    def loss(at: list[float]) -> float:
+        p = torch.sigmoid(at[0] * evidence + at[1])
+        return -float((aim * p.log() + (1 - aim) * (1 - p).log()).sum())
+
+    expected = minimize(loss, [1.0, 0.0], tol=1e-12).x
+    assert fit(evidence, right) == pytest.approx(tuple(expected), abs=1e-3)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
+def test_the_unit_and_zero_of_evidence_do_not_matter(unit: float, zero: float) -> None:
+    evidence, right = answers(0)
+    other = fit(unit * evidence + zero, right).probability(unit * evidence + zero)
+    torch.testing.assert_close(other, fit(evidence, right).probability(evidence), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 50])
+def test_what_is_told_apart_wholly_stays_finite(wrong: int) -> None:
+    right = torch.arange(100) >= wrong
+    p = fit(torch.arange(100.0), right).probability(torch.arange(100.0))
+    assert bool(((p > 0) & (p < 1)).all())
+    assert bool((p.diff() >= 0).all())
+    assert float(p.mean()) == pytest.approx(float(right.double().mean()), abs=0.02)
+
+
+def test_evidence_that_tells_nothing_or_the_opposite_gives_the_share() -> None:
+    right = torch.arange(8) % 4 != 0
+    for evidence in (torch.zeros(8), -right.double()):
+        platt = fit(evidence, right)
+        assert platt.slope == pytest.approx(0, abs=1e-6)
+        assert platt.probability(evidence).tolist() == pytest.approx([0.7] * 8, abs=0.03)
+
+
+def test_no_right_answer_is_refused_and_no_answer_has_no_probability() -> None:
+    with refused("none of 3 answers is right"):
+        fit(torch.zeros(3), torch.zeros(3, dtype=torch.bool))
+    assert Platt(1.0, 9.0).probability(torch.tensor([-INF, 0.0])).tolist() == [
+        0,
+        pytest.approx(0.99988, abs=1e-5),
+    ]
+
+
+def test_the_error_of_a_calibration() -> None:
+    p = torch.tensor([0.05, 0.05, 0.95, 0.95, 1.0])
+    right = torch.tensor([False, True, True, True, True])
+    # bins [0, .1): .05 told, .5 seen; [.9, 1]: .9667 told, 1 seen
+    assert calibration_error(p, right) == pytest.approx((2 * 0.45 + 3 * (1 - 2.9 / 3)) / 5)
+    assert math.isnan(calibration_error(torch.zeros(0), torch.zeros(0, dtype=torch.bool)))
+
+
+# evidence
+
+
+def test_single_evidence_is_the_margin_beyond_the_tolerance_and_the_score() -> None:
+    scores = torch.full((3, 30), 9.0)
+    scores[0, 10:17] = torch.tensor(
+        [1.0, 0, 0, 0, 0, 2.0, 4.0]
+    )  # best at 11, 4 lies 5 behind it: the next is 9
+    scores[1, 3], scores[1, 20] = 1.0, 3.0
+    scores[2] = INF
+    assert evidence_of(scores).tolist() == [2 * 9 - 0, 2 * 2 - 1, -INF]
+    assert evidence_of(torch.tensor([[2.0]])).tolist() == [-2]  # nothing to compare with
+
+
+def test_a_track_remembers_how_its_answers_stood_out() -> None:
+    single = torch.full((3, 20), 1.0)
+    single[:, 4] = torch.tensor([0.0, 0.0, 1.0])
+    found = torch.full((3, 20), 5.0)
+    found[:, 4] = math.log(2)  # even odds
+    spread = single[0].std(correction=0)
+    stood = float((single[0].mean() - 0) / spread)
+    second = (0.09 * stood + 0.1 * stood) / 0.19
+    third = (0.9 * 0.19 * second + 0.1 * 0) / 0.271
+    expected = [3 * stood, 3 * second, 3 * third]
+    track = Track()
+    assert track(found, single).tolist() == pytest.approx(expected, rel=1e-5)
+    other = Track()
+    parts = torch.cat([other(found[:1], single[:1]), other(found[1:], single[1:])])
+    assert parts.tolist() == pytest.approx(expected, rel=1e-5)  # whatever the batches
+
+
+def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
+    draw = torch.Generator().manual_seed(0)
+    places = torch.arange(40)
+    scores = 1 + 0.1 * torch.randn(40, 40, generator=draw)
+    scores[places, places] = 0.3
+    own = calibrated(Table(), [Trial(scores[:20], places[:20]), Trial(scores[20:], places[20:])])
+    assert own.single is not None
+    there = own.single.probability(evidence_of(scores))
+    away = own.single.probability(evidence_of(1 + 0.1 * torch.randn(40, 40, generator=draw)))
+    assert (float(there.mean()) > 0.9, float(away.mean()) < 0.1) == (True, True)
+    known = places.where(places % 2 == 0, -1)  # what is not known does not count
+    half = calibrated(Table(), [Trial(scores, known)])
+    assert half.single == calibrated(Table(), [Trial(scores[::2], places[::2])]).single
+    with refused("none of 80 answers"):
+        calibrated(Table(), [Trial(scores, (places + 20) % 40)])
+    with refused("no queries"):
+        calibrated(Table(), [])
+
+
+# frames to calibrate by
+
+
+@pytest.mark.parametrize(
+    ("frames", "stretch", "starts"), [(160, 16, [0]), (1000, 20, [0, 200, 400, 600, 800]), (7, 1, [0])]
+)
+def test_every_tenth_stretch_is_taken(frames: int, stretch: int, starts: list[int]) -> None:
+    route = open_source(f"sim:aerial?frames={frames}")
+    changed = Stretches(route, frames, {"noise": 0.01})
+    once = changed.places[: len(starts) * stretch]
+    assert once.tolist() == [start + i for start in starts for i in range(stretch)]
+    assert changed.length is not None
+    assert 600 <= changed.length <= 1200
+    assert torch.equal(changed.places, once.repeat(changed.length // len(once)))
+
+
+def test_changed_frames_show_their_places_whatever_the_batch() -> None:
+    route = open_source("sim:aerial?frames=300")
+    frames = torch.cat(list(route.batches(64)))
+    nothing = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion"), 0.0)
+    plain = {**nothing, "colour": [0, 0], "shift": [0, 0], "exposure": [0, 0], "noise": 0.0}
+    same = Stretches(route, 300, plain)
+    torch.testing.assert_close(torch.cat(list(same.batches(50))), frames[same.places])
+    changed = Stretches(route, 300, {**plain, "noise": 0.1})
+    once = torch.cat(list(changed.batches(7)))
+    assert torch.equal(once, torch.cat(list(changed.batches(64))))
+    assert (once - frames[changed.places]).std() == pytest.approx(
+        0.15 * 0.7**0.5, rel=0.3
+    )  # 1.5 times as much
+    with refused("ready features"):
+        Stretches(open_source_of(torch.rand(30, 4)), 30, plain)
+
+
+def open_source_of(features: Tensor):  # type: ignore[no-untyped-def]
+    from dejavu_torch.data.arrays import as_traverse
+
+    return as_traverse(features)
+
+
+# models
+
+
+@pytest.fixture(scope="module")
+def model() -> DejaVu:
+    route = open_source(ROUTE)
+    return DejaVu().learn(route).calibrate(route)
+
+
+def test_probabilities_hold_on_another_day_and_off_the_map(model: DejaVu) -> None:
+    for sequence in (None, PlaceFilter()):
+        match = model.localize(open_source(AGAIN), sequence=sequence)
+        assert match.probability is not None
+        right = (match.index - torch.arange(160)).abs() <= 5
+        assert calibration_error(match.probability, right) < 0.1
+        strange = torch.cat(list(open_source("sim:aerial?frames=160&seed=5").batches(64)))
+        off = model.localize(strange.flip(2), sequence=sequence).probability
+        assert off is not None
+        assert float((off >= 0.99).double().mean()) < 0.01 < float((match.probability >= 0.9).double().mean())
+
+
+def test_batches_and_files_do_not_change_probabilities(model: DejaVu, tmp_path: Path) -> None:
+    queries = torch.cat(list(open_source(AGAIN).batches(64)))[:40]
+    model.save(tmp_path / "map.safetensors")
+    again = DejaVu.load(tmp_path / "map.safetensors")
+    assert again.calibration == model.calibration
+    again.batch_size = 7
+    for sequence in (None, PlaceFilter()):
+        whole, parts = (one.localize(queries, sequence=sequence).probability for one in (model, again))
+        torch.testing.assert_close(whole, parts, atol=1e-5, rtol=0)
+
+
+def test_precision_accepts_what_is_probable_enough(model: DejaVu, tmp_path: Path) -> None:
+    queries = torch.cat(list(open_source(AGAIN).batches(64)))
+    sure = DejaVu(**(model.settings() | {"precision": 0.99}))
+    sure.load_state_dict(model.state_dict())
+    match = sure.localize(queries)
+    assert match.probability is not None
+    assert torch.equal(match.accepted, match.probability >= 0.99)
+    assert 0 < int(match.accepted.sum()) < 160
+    sure.save(tmp_path / "map.safetensors")
+    assert DejaVu.load(tmp_path / "map.safetensors").precision == 0.99
+    with refused("calibrated for single queries and for a filter", "0.99"):
+        sure.localize(queries, sequence=SequenceMatcher(5))
+    sure.learn_features(torch.rand(64, 8))  # another map
+    with refused("not calibrated", "0.99"):
+        sure.localize(torch.rand(2, 8))
+
+
+def test_a_map_without_calibration_tells_no_probability() -> None:
+    features = torch.rand(64, 8)
+    model = DejaVu(whitening="none").learn(features)
+    assert model.localize(features).probability is None
+    with refused("ready features"):
+        model.calibrate(features)
+    with refused("no map"):
+        DejaVu().calibrate(features)
+    with refused("neither a reference nor views"):
+        model.calibrate(None)
+    model.calibrate(None, Views(open_source_of(features + 0.01), torch.arange(64)))
+    assert model.localize(features).probability is not None
+
+
+@pytest.mark.parametrize("precision", [0.0, 1.0, -1.0, math.nan])
+def test_a_precision_is_a_share(precision: float) -> None:
+    with refused("precision", "above 0 and below 1"):
+        DejaVu(precision=precision)
+
+
+def test_a_threshold_or_a_precision() -> None:
+    with refused("threshold", "precision", "one of them"):
+        DejaVu(threshold=1.0, precision=0.9)
+
+
+def test_matches_join_and_change_with_and_without_probability() -> None:
+    one = Match(torch.tensor([1]), torch.tensor([0.5]), torch.tensor([True]))
+    assert Match.joined([one, one]).probability is None
+    sure = one._replace(probability=torch.tensor([0.9]))
+    assert Match.joined([sure, sure]).map(lambda column: column[1:]).probability == torch.tensor([0.9])
+
+
+def test_a_calibration_is_of_its_way_of_matching() -> None:
+    single, followed = Platt(1.0, 0.0), Platt(2.0, 0.0)
+    both = Calibration(single, followed)
+    assert both.of(None) is single
+    assert both.of(PlaceFilter()) is followed
+    assert both.of(PlaceFilter(search_every=3)) is None
+    assert both.of(SequenceMatcher(3)) is None

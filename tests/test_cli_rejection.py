@@ -1,0 +1,129 @@
+"""Probabilities in the commands: --precision, --calibration, --distractors."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import fails, report_of, run
+
+from dejavu_torch import DejaVu
+
+ROUTE, AGAIN, THIRD, SEA = (
+    f"sim:{name}"
+    for name in (
+        "aerial?frames=64",
+        "aerial?frames=64&traverse=1",
+        "aerial?frames=64&traverse=2",
+        "outdoor?frames=50",
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("learned") / "map.safetensors"
+    run("learn", ROUTE, "--map", path)
+    return path
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_learned_map_tells_probabilities_and_accepts_by_them(learned: Path, tmp_path: Path) -> None:
+    for sequence in ((), ("--filter",)):
+        run("localize", learned, AGAIN, "--precision", ".9", "--out", tmp_path / "m.csv", *sequence)
+        found = rows(tmp_path / "m.csv")
+        assert [row["accepted"] == "1" for row in found] == [
+            float(row["probability"]) >= 0.9 for row in found
+        ]
+        assert 0 < sum(row["accepted"] == "1" for row in found)
+
+
+def test_a_precision_is_kept_in_the_map_until_another_or_a_threshold_is_given(tmp_path: Path) -> None:
+    path, out = tmp_path / "map.safetensors", tmp_path / "m.csv"
+    run("learn", ROUTE, "--map", path, "--precision", ".95")
+    accepted = []
+    for words in ((), ("--precision", ".95"), ("--precision", ".5"), ("--threshold", "9")):
+        run("localize", path, AGAIN, "--out", out, *words)
+        accepted.append(sum(row["accepted"] == "1" for row in rows(out)))
+    assert accepted[0] == accepted[1] <= accepted[2] <= accepted[3] == 64
+
+
+def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    others = f"[{SEA},{SEA}&seed=3]"
+    words = ("--precision", ".9", "--calibration", THIRD, "--distractors", others)
+    run("compare", ROUTE, AGAIN, *words, "--out", out)
+    report = report_of(out)
+    facts = report["rejection"]
+    assert facts["expected_calibration_error"] < 0.1
+    assert [one["frames"] for one in facts["off_map"].values()] == [50, 50]
+    asked = {one["asked"]: one for one in facts["precision"]}
+    assert report["accepted_right"] == pytest.approx(asked[0.9]["kept"] * report["recall_at_1"] * 64)
+    assert (out / "reliability.png").exists()
+    run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", "--out", tmp_path / "again")
+    again = report_of(tmp_path / "again")
+    assert (again["accepted"], again["accepted_right"]) == (report["accepted"], report["accepted_right"])
+
+
+def test_no_calibration_where_none_is_wanted_or_can_be(
+    learned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "map.safetensors"
+    run("learn", ROUTE, "--map", path, "--calibration", "none")
+    assert DejaVu.load(path).calibration is None
+    error = fails(capsys, "localize", path, AGAIN, "--precision", ".9", "--out", tmp_path / "m.csv")
+    assert "the map is not calibrated" in error
+    np.save(tmp_path / "features.npy", np.random.default_rng(0).random((64, 8), np.float32))
+    error = fails(
+        capsys, "learn", tmp_path / "features.npy", "--map", tmp_path / "n.safetensors", "--precision", ".9"
+    )
+    assert "the map is not calibrated" in error
+    assert not (tmp_path / "n.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--precision", "0"), ("precision is 0", "above 0")),
+        (("--precision", "1"), ("precision is 1", "below 1")),
+        (("--precision", ".9", "--threshold", "1"), ("--threshold", "--precision", "one of them")),
+        (("--precision", ".9", "--top", "3"), ("--precision", "--top 3")),
+        (("--precision", ".9", "--sequence", "5"), ("precision is 0.9", "calibrated for single queries")),
+    ],
+)
+def test_precisions_that_cannot_be_asked_for(
+    learned: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    told: tuple[str, ...],
+) -> None:
+    error = fails(capsys, "localize", learned, AGAIN, "--out", tmp_path / "m.csv", *words)
+    assert [word for word in told if word not in error] == [], error
+    assert not (tmp_path / "m.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--calibration", AGAIN), ("itself", "another traverse")),
+        (("--calibration", ROUTE), ("itself", "another traverse")),
+        (("--calibration", THIRD, "--calibration_truth", "60"), ("none of",)),
+        (("--calibration_truth", "0"), ("--calibration SOURCE",)),
+        (("--calibration", "nowhere"), ("nowhere is not there",)),
+        (("--distractors", AGAIN), ("another route",)),
+        (("--distractors", "nowhere"), ("nowhere is not there",)),
+    ],
+)
+def test_traverses_that_do_not_serve(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: tuple[str, ...]
+) -> None:
+    error = fails(capsys, "compare", ROUTE, AGAIN, "--out", tmp_path / "out", *words)
+    assert [word for word in told if word not in error] == [], error
+    assert not (tmp_path / "out").exists()
