@@ -29,7 +29,7 @@ MATCH = Match(
 def test_the_figures_of_a_rejection() -> None:
     facts = rejection_facts(MATCH, TRUTH, 0, {"sea": torch.tensor([0.1, 0.6, 0.995, 0.2])})["rejection"]
     assert facts["recall_at_100_precision"] == 0.75  # in the order of probability: all but the wrong one
-    assert facts["auc"] == 0.75
+    assert facts["auc"] == 0.5  # from the recall of the first answer on
     at = {one["asked"]: one for one in facts["precision"]}
     assert at[0.5] == {"asked": 0.5, "precision": 1.0, "kept": 1.0}
     assert at[0.99] == {"asked": 0.99, "precision": 1.0, "kept": 2 / 3}
