@@ -41,7 +41,7 @@ def test_a_learned_map_tells_probabilities_and_accepts_by_them(learned: Path, tm
         assert [row["accepted"] == "1" for row in found] == [
             float(row["probability"]) >= 0.9 for row in found
         ]
-        assert 0 < sum(row["accepted"] == "1" for row in found)
+        assert any(row["accepted"] == "1" for row in found)
 
 
 def test_a_precision_is_kept_in_the_map_until_another_or_a_threshold_is_given(tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> 
     run("compare", ROUTE, AGAIN, *words, "--out", out)
     report = report_of(out)
     facts = report["rejection"]
-    assert facts["expected_calibration_error"] < 0.1
+    assert facts["expected_calibration_error"] < 0.2
     assert [one["frames"] for one in facts["off_map"].values()] == [50, 50]
     asked = {one["asked"]: one for one in facts["precision"]}
     assert report["accepted_right"] == pytest.approx(asked[0.9]["kept"] * report["recall_at_1"] * 64)
