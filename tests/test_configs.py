@@ -95,7 +95,8 @@ def test_a_config_stands_in_its_place() -> None:
         ["fit", "--config", "paper", "-c", "default", "--config=train_small", "--other", "paper"]
     )
     paths = [str(find_config(name)) for name in ("paper", "default", "train_small")]
-    assert found == ["fit", "--config", paths[0], "-c", paths[1], f"--config={paths[2]}", "--other", "paper"]
+    named = ["--config", paths[0], "--config", paths[1], f"--config={paths[2]}"]
+    assert found == ["fit", *named, "--other", "paper"]
 
 
 def test_a_config_without_a_name_is_refused() -> None:
