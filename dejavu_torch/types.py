@@ -165,29 +165,45 @@ class FrequencyLayer:
 Plan = tuple[FrequencyLayer, ...]
 
 
-class Match(NamedTuple):
-    """Where each query was found (eq. 5) and whether to believe it (eq. 6).
+class _Reported(NamedTuple):
+    index: Tensor  # type: ignore[assignment]  # the field shadows tuple.index
+    score: Tensor
+    accepted: Tensor
+
+
+class Match(_Reported):
+    """Where each query was found (eq. 5) and whether to believe it (eq. 6): index, score, accepted.
 
     index: (Q,) int64, the reported place, -1 where no place has a finite score.
     score: (Q,) float, the lowest S; lower is better, +inf where nothing covers.
     accepted: (Q,) bool, score below the threshold, or probability at least the precision asked for.
-    probability: (Q,) float64 of being right, where the map is calibrated; else None.
+    probability: (Q,) float64, of being right, where the map is calibrated; else None. It goes along with the
+        three, but is none of the tuple's.
     """
 
-    index: Tensor  # type: ignore[assignment]  # the field shadows tuple.index
-    score: Tensor
-    accepted: Tensor
     probability: Tensor | None = None
+
+    def with_probability(self, probability: Tensor | None) -> Match:
+        """The same with other probabilities."""
+        match = Match(*self)
+        match.probability = probability
+        return match
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
         """The same of every column."""
-        return Match(*(None if column is None else change(column) for column in self))  # type: ignore[arg-type]
+        sure = None if self.probability is None else change(self.probability)
+        return Match(*map(change, self)).with_probability(sure)
 
     @staticmethod
     def joined(parts: Iterable[Match]) -> Match:
         """Matches of queries one behind the other as one."""
-        columns = zip(*parts, strict=True)
-        return Match(*(None if column[0] is None else torch.cat(column) for column in columns))  # type: ignore[arg-type]
+        parts = list(parts)
+        sure = [part.probability for part in parts if part.probability is not None]
+        match = Match(*map(torch.cat, zip(*parts, strict=True)))
+        return match.with_probability(torch.cat(sure) if len(sure) == len(parts) else None)
+
+    def _replace(self, **changes: Tensor) -> Match:
+        return Match(*super()._replace(**changes)).with_probability(self.probability)
 
 
 class Training(NamedTuple):

@@ -197,12 +197,13 @@ def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> flo
     Source: Naeini, Cooper and Hauskrecht, AAAI 2015.
 
     Example:
-        >>> calibration_error(torch.tensor([0.9, 0.9, 0.9, 0.9]), torch.tensor([True, True, True, False]))
-        0.15
+        >>> calibration_error(torch.full((4,), 0.875), torch.tensor([True, True, True, False]))
+        0.125
     """
     if not len(right):
         return math.nan
+    probability = probability.double()
     bin_of = (probability * bins).long().clamp(0, bins - 1)
-    both = torch.stack([probability.double(), right.double()], 1)
+    both = torch.stack([probability, right.double()], 1)
     sums = torch.zeros(bins, 2, dtype=torch.float64).index_add_(0, bin_of, both)
-    return round(float((sums[:, 0] - sums[:, 1]).abs().sum()) / len(right), 12)
+    return float((sums[:, 0] - sums[:, 1]).abs().sum()) / len(right)

@@ -38,7 +38,7 @@ class Found(NamedTuple):
         if self.probability is None:
             return match
         accepted = match.accepted if precision is None else self.probability >= precision
-        return match._replace(accepted=accepted, probability=self.probability)
+        return match._replace(accepted=accepted).with_probability(self.probability)
 
     def moved(self, place: Callable[[Tensor], Tensor]) -> Found:
         """The same with other numbers of the places; -1, where none is found, must stay."""
