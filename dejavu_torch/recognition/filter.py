@@ -279,7 +279,7 @@ class PlaceFilter(SequenceModel):
         side = within + 1  # two means over so many make a triangle
         padded = F.pad(posterior[:, None], (within, within))
         mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
-        score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1).log()
+        score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1.0).log()  # an exporter promotes no types
         return score.masked_fill(~scores.isfinite(), math.inf)
 
     def check(self, queries: int | None, places: int) -> None:
