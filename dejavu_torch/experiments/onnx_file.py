@@ -236,8 +236,7 @@ def _program(
     graph: nn.Module, inputs: tuple[Tensor, ...], names: tuple[list[str], list[str]], any_batch: bool
 ) -> Any:
     """What `torch.onnx.export` makes of a module; `any_batch` leaves the first input's first size free."""
-    free = [{0: torch.export.Dim("batch")}] if any_batch else [None]
-    free += [None] * (len(inputs) - 1)
+    free = {0: torch.export.Dim("batch")} if any_batch else None
     return torch.onnx.export(
         graph,
         inputs,
