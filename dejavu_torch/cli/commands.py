@@ -371,7 +371,7 @@ def run_bench(
         print(text_table(bench.bench_table(rows)))
         note = "x ours: seconds / those of the fastest dejavu"
     if any("No module" in (row.skipped or "") for row in rows):
-        print("what is skipped needs pip install '.[bench]'")
+        print("what is skipped needs pip install '.[bench,export]'")
     _say(f"{note}; next: open {out / 'bench.png'}")
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import logging
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 import dejavu_torch
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.features.extract import in_mode
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.steps import Step, step_of
@@ -146,20 +148,20 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
             f"file holds {MOST_BYTES / 1e9:.1f} GB"
         )
     device = model.map.positions.device
-    graph = Graph(model, step).eval()
+    graph = Graph(model, step)
     noise = torch.rand(TRIED, *model.frame_shape, generator=torch.Generator().manual_seed(0)).to(device)
+    noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # what is flat, too
     facts = _facts(model, sequence)
-    with torch.no_grad(), _quiet():
+    with torch.no_grad(), in_mode(graph, False), _quiet():
         inputs: tuple[Tensor, ...] = (noise[:2],)
         if step is not None:
             inputs = noise[:1], step.start(model.map.places).to(device)
         try:
             names = [*facts["inputs"]], [*facts["outputs"]]
-            program = _program(graph, inputs, names, step is None)
-        except Exception as error:
-            raise _refusal(graph, noise[:2], error) from error
-        written = _serialised(program, facts)
-        difference = _difference(written, graph, noise, facts)
+            written = _serialised(_program(graph, inputs, names, step is None), facts)
+            difference = _difference(written, graph, noise, facts)
+        except Exception as error:  # of torch, onnx or onnxruntime, each of which has many
+            raise _refusal(graph, noise, error) from error
     if not difference <= TOLERANCE:
         raise InputError(
             f"the exported scores differ from torch's by {difference:.2g} on noise; expected at most "
@@ -237,13 +239,14 @@ def _program(
 ) -> Any:
     """What `torch.onnx.export` makes of a module; `any_batch` leaves the first input's first size free."""
     free = {0: torch.export.Dim("batch")} if any_batch else None
+    # not within torch.onnx.export, which would try other ways, some for one batch size only
+    program = torch.export.export(graph, inputs, dynamic_shapes=(free, *[None] * (len(inputs) - 1)))
     return torch.onnx.export(
-        graph,
-        inputs,
+        program,
         dynamo=True,
         verbose=False,
+        optimize=False,  # it leaves out the addition of less than 1e-8, as ahead of a root that divides
         opset_version=OPSET,
-        dynamic_shapes=(free, *[None] * (len(inputs) - 1)),
         input_names=names[0],
         output_names=names[1],
         custom_translation_table=_translations(),
@@ -283,17 +286,18 @@ def _translations() -> dict[Callable[..., Any], Callable[..., Any]]:
 def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
     """The file's contents: without the places in our source that torch notes at every node."""
     import onnx_ir as ir
+    from onnxscript import optimizer
 
     model = program.model
+    optimizer.inline(model)
+    optimizer.fold_constants(model)
+    optimizer.remove_unused_nodes(model)
     for node in model.graph.all_nodes():
         node.metadata_props.clear()
     model.metadata_props.clear()
     model.metadata_props[METADATA] = json.dumps(facts)
     model.producer_name, model.producer_version = METADATA, dejavu_torch.__version__
-    try:
-        written: bytes = ir.to_proto(model).SerializeToString()
-    except Exception as error:  # protobuf has errors of its own
-        raise InputError(f"the graph does not fit into a file: {one_line(error)[:LONGEST]}") from error
+    written: bytes = ir.to_proto(model).SerializeToString()
     return written
 
 
@@ -318,7 +322,7 @@ def _refusal(graph: Graph, frames: Tensor, error: Exception) -> InputError:
     for name, part in graph.parts.items():
         try:
             after = part(frames)
-            _program(part, (frames,), (["input"], ["output"]), True)
+            session_of(_serialised(_program(part, (frames,), (["input"], ["output"]), True), {}))
         except Exception as own:
             return InputError(f"the {name}, {type(part).__name__}, cannot be exported: {_reason(own)}")
         frames = after
@@ -335,15 +339,12 @@ def _reason(error: BaseException) -> str:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what torch and onnxscript log of their own work."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
+    """Without what torch and onnxscript print and log of their own work."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
