@@ -1,4 +1,4 @@
-"""HOG, L1 distances, sequences, filters, exported maps: timed beside programs or ways that compute the same."""
+"""HOG, L1 distances, sequences, filters, exported maps: timed beside what computes the same."""
 
 from __future__ import annotations
 

@@ -240,10 +240,12 @@ def _program(
     """What `torch.onnx.export` makes of a module; `any_batch` leaves the first input's first size free."""
     free = {0: torch.export.Dim("batch")} if any_batch else None
     # not within torch.onnx.export, which would try other ways, some for one batch size only
-    program = torch.export.export(graph, inputs, dynamic_shapes=(free, *[None] * (len(inputs) - 1)))
+    shapes = (free, *[None] * (len(inputs) - 1))
+    program = torch.export.export(graph, inputs, dynamic_shapes=shapes)
     return torch.onnx.export(
         program,
         dynamo=True,
+        dynamic_shapes=shapes,  # for their names
         verbose=False,
         optimize=False,  # it leaves out the addition of less than 1e-8, as ahead of a root that divides
         opset_version=OPSET,
