@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import pytest
 import torch
 from command_line import fails, run
 from helpers import Fixed, refused
+from PIL import Image
 from torch import Tensor, nn
 
 from dejavu_torch import (
@@ -250,3 +253,20 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         capsys, "export", tmp_path / "none.safetensors", "--onnx", tmp_path / "map.onnx"
     )
     assert (tmp_path / "map.onnx").read_bytes() == before
+
+
+def test_the_documentation_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    frame = next(open_source("sim:aerial?frames=128&traverse=1").between(60, 61))[0]
+    Image.fromarray((frame * 255).byte().permute(1, 2, 0).numpy()).save("frame.png")
+    space: dict[str, Any] = {}
+    for language, block in re.findall(r"```(sh|python)\n(.*?)```", page, re.DOTALL):
+        if language == "python":
+            exec(block, space)
+        for line in block.splitlines() if language == "sh" else ():
+            run(*shlex.split(line)[1:])
+    found = re.findall(r"^(\d+) (?:True|False)$", capsys.readouterr().out, re.MULTILINE)
+    assert [abs(int(place) - 60) <= 5 for place in found] == [True] * 4
