@@ -22,6 +22,7 @@ from dejavu_torch import (
     TemplateMapper,
     Whitening,
 )
+from dejavu_torch.features import hog as hog_module
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.types import FrequencyLayer, Plan
@@ -186,6 +187,24 @@ def test_preprocessing_is_part_of_the_exported_model(preprocess: Preprocess) -> 
 def test_a_map_without_layers_is_exported() -> None:
     model = DejaVu(mapper=TemplateMapper(Fixed())).learn_features(torch.rand(20, 4)).eval()
     assert exported(model, torch.rand(2, 4)).module()(torch.rand(5, 4)).isposinf().all()
+
+
+def test_frames_that_run_in_parts_are_exported_whole() -> None:
+    """Eagerly HOG takes 42 frames of this size at a time."""
+    model = DejaVu(HOG(), Whitening(views=1), SpectralMapper(16.0)).learn(torch.rand(60, 3, 64, 64)).eval()
+    run = exported(model, torch.rand(2, 3, 64, 64)).module()
+    for batch in (1, 42, 43, 100):
+        queries = torch.rand(batch, 3, 64, 64)
+        assert (len(hog_module.parts(queries)) > 1) == (batch > 42)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+def test_whitened_features_are_exported() -> None:
+    model = DejaVu().learn(torch.rand(60, 8)).eval()
+    run = exported(model, torch.rand(2, 8)).module()
+    for batch in BATCHES:
+        queries = torch.rand(batch, 8)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
 
 
 def test_gradients_reach_the_backbone() -> None:

@@ -417,8 +417,48 @@ def run_bench(
         print(text_table(bench.bench_table(rows)))
         note = "x ours: seconds / those of the fastest dejavu"
     if any("No module" in (row.skipped or "") for row in rows):
-        print("what is skipped needs pip install '.[bench]'")
+        print("what is skipped needs pip install '.[bench,export]'")
     _say(f"{note}; next: open {out / 'bench.png'}")
+
+
+def run_export(
+    map: Path,
+    *,
+    onnx: Path,
+    sequence: int = 1,
+    speeds: list[float] | None = None,
+    filter: bool = False,
+    moves: list[float] | None = None,
+    threshold: float | None = None,
+    features: nn.Module | None = None,
+) -> None:
+    """Write a map, and what is ahead of it, as an ONNX file, opset 18: frames in, scores of all places out.
+
+    Args:
+        map: map file
+        onnx: file to write (.onnx)
+        sequence: as of `dejavu localize`; the file then takes a frame and a state, and gives the next state
+        speeds: as of `dejavu localize`
+        filter: as of `dejavu localize`, with a state likewise
+        moves: as of `dejavu localize`
+        threshold: noted in the file; the map's own if not given
+        features: class of the map's features, if not ours
+    """
+    from dejavu_torch.experiments.onnx_file import OPSET, export_onnx
+
+    if onnx.suffix != ".onnx":
+        raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")
+    check_output_file(onnx)
+    check_not_read(onnx, map)
+    model = DejaVu.load(map, features)
+    model.threshold = model.threshold if threshold is None else threshold
+    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
+    written = export_onnx(model, onnx, matcher)
+    for kind in ("inputs", "outputs"):
+        shapes = (f"{name} {tuple(shape)}" for name, shape in written.facts[kind].items())
+        print(f"{kind}: {', '.join(shapes)}".replace("'", ""))
+    size = f"{written.bytes / 1e6:.1f} MB, opset {OPSET}"
+    _say(f"{size}; {written.difference:.1g} from torch at most, on noise; written to {onnx}")
 
 
 def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> None:

@@ -1,10 +1,11 @@
-"""HOG, L1 distances, sequences and filters, timed beside other programs or ways that compute the same."""
+"""HOG, L1 distances, sequences, filters, exported maps: timed beside what computes the same."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
 import dejavu_torch
@@ -28,7 +29,9 @@ from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.plots import Plot
 from dejavu_torch.evaluation.score_plots import plot_ratios
-from dejavu_torch.features.hog import hog
+from dejavu_torch.features.hog import HOG, hog
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
@@ -36,9 +39,10 @@ from dejavu_torch.types import FrequencyLayer, InputError
 
 BATCH = 64
 AT_MOST = 60  # seconds for all runs of one contender together
-COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu")
+COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu", "onnxruntime")
 PERIODS = (191, 193, 197, 199, 211)  # of the layers that sequences are matched in: 991 phases
 WIDE = 64  # numbers of the descriptors that are filtered
+NUMBERS = 128  # of those of single frames
 MEMORY = Path("/proc/self/statm")
 
 Sizes = Sequence[tuple[int, int]]
@@ -65,7 +69,7 @@ class Row(NamedTuple):
     memory held during a run beyond what was held before. bytes: of the result. difference: largest to
     our result. measured_rows: where only a part of the case was run: seconds and bytes are scaled up
     from it, seconds_first and peak_bytes are its own. skipped: why there are no figures. recall_at_1: share
-    of queries that were found, where the case is to find places.
+    of queries that were found, where the case is to find places. file_bytes: of the file that it runs.
     """
 
     case: str
@@ -80,6 +84,7 @@ class Row(NamedTuple):
     measured_rows: int | None = None
     skipped: str | None = None
     recall_at_1: float | None = None
+    file_bytes: int | None = None
 
 
 def bench_matcher(
@@ -89,10 +94,12 @@ def bench_matcher(
     distances: Sequence[tuple[int, int, int]] = ((512, 2640, 1000),),
     sequences: Sequence[tuple[int, int, int]] = ((64, 21, 100_000),),
     filters: Sequence[tuple[int, int]] = ((200, 100_000),),
+    exports: Sequence[tuple[int, int, int, int]] = ((50, 64, 64, 3072), (20, 480, 640, 100_000)),
     torch_compile: bool = True,
     seed: int = 0,
 ) -> list[Row]:
-    """Time HOG beside scikit-image, L1 distances beside torch, scipy and faiss; sequences, filters two ways.
+    """Time HOG beside scikit-image, L1 distances beside torch, scipy and faiss; sequences, filters two ways;
+    frames one by one beside the same in onnxruntime.
 
     Args:
         frames: grey frames to describe, of each size in `images` (height, width in pixels).
@@ -102,6 +109,8 @@ def bench_matcher(
             are matched in its layers, beside its score rows.
         filters: queries and places of each case of a filter that searches all places for every 50th query,
             beside one that does for every query; the difference is one of probabilities.
+        exports: frames, their height and width, and places of each case of single frames, found one behind
+            the other on a spectral map, beside its ONNX file.
         torch_compile: also a sum that `torch.compile` makes a loop of; compiling takes its time.
         seed: of the random frames and features.
 
@@ -111,10 +120,17 @@ def bench_matcher(
     Raises:
         InputError: a number below 1.
     """
-    if min(frames, repeats, *(n for size in (*images, *distances, *sequences, *filters) for n in size)) < 1:
+    if (
+        min(
+            frames,
+            repeats,
+            *(n for size in (*images, *distances, *sequences, *filters, *exports) for n in size),
+        )
+        < 1
+    ):
         raise InputError(
             f"the bench got frames={frames}, repeats={repeats}, images {images}, distances {distances}, "
-            f"sequences {sequences} and filters {filters}; expected at least 1 of each"
+            f"sequences {sequences}, filters {filters} and exports {exports}; expected at least 1 of each"
         )
     generator = torch.Generator().manual_seed(seed)
     rows = []
@@ -134,6 +150,11 @@ def bench_matcher(
             route = _smooth(torch.randn(places, WIDE, generator=generator))
             noise = torch.randn(q, WIDE, generator=generator)
             rows += _filter_case(f"filter {q} x {places}", route, noise, repeats)
+        for count, height, width, places in exports:
+            some = torch.rand(count, 1, height, width, generator=generator)
+            route = _smooth(torch.randn(places, NUMBERS, generator=generator))
+            case = f"single frames {count} x {height} x {width} on {places}"
+            rows += _export_case(case, some, route, repeats, generator)
     return rows
 
 
@@ -272,6 +293,36 @@ def _filter_case(case: str, route: Tensor, noise: Tensor, repeats: int) -> list[
 
     beside = Program("dejavu (all places)", torch.get_num_threads(), lambda: partial(drive, 1))
     return benchmark(case, [*_ours(partial(drive, 50)), beside], repeats)
+
+
+def _export_case(
+    case: str, frames: Tensor, route: Tensor, repeats: int, generator: torch.Generator
+) -> list[Row]:
+    """HOG, a whitening and a map made of random numbers: what they find takes as long as what is right."""
+    whitening = Whitening(numbers=NUMBERS)
+    model = DejaVu(HOG(), whitening, SpectralMapper(None, step=0.05))
+    features = model.describe(frames[:1]).shape[1]
+    projection = torch.randn(features, NUMBERS, generator=generator)
+    whitening.take(torch.rand(features, generator=generator), projection, None)
+    model.learn_features(nn.functional.normalize(route, dim=1))
+    model.eval().frame_shape = tuple(frames.shape[1:])
+    threads, size = torch.get_num_threads(), 0
+
+    def ours() -> Tensor:
+        return torch.cat([model(frame) for frame in frames.split(1)])
+
+    def exported() -> Run:
+        nonlocal size
+        from dejavu_torch.experiments.onnx_file import export_onnx, run_session, session_of
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "map.onnx"
+            size = export_onnx(model, path).bytes
+            session = session_of(str(path), threads)
+        return lambda: torch.cat([run_session(session, frame) for frame in frames.split(1)])
+
+    rows = benchmark(case, [*_ours(ours), Program("onnxruntime", threads, exported)], repeats)
+    return [*rows[:-1], rows[-1]._replace(file_bytes=size or None)]
 
 
 def benchmark(case: str, contenders: Sequence[Program], repeats: int) -> list[Row]:
@@ -415,7 +466,18 @@ def bench_table(rows: Sequence[Row]) -> list[list[str]]:
         >>> bench_table([Row("l1", "dejavu", 0.5, ratio_to_ours=1.0)])[1][:3]
         ['l1: dejavu', '0.500', '1.0']
     """
-    head = ["", "seconds", "x ours", "first run", "threads", "peak MB", "result MB", "difference", ""]
+    head = [
+        "",
+        "seconds",
+        "x ours",
+        "first run",
+        "threads",
+        "peak MB",
+        "result MB",
+        "file MB",
+        "difference",
+        "",
+    ]
     return [head, *([f"{row.case}: {row.contender}", *_figures(row)] for row in rows)]
 
 
@@ -431,6 +493,7 @@ def _figures(row: Row) -> list[str]:
         text(row.threads, ".0f"),
         text(row.peak_bytes, ".1f", 1e6),
         text(row.bytes, ".1f", 1e6),
+        text(row.file_bytes, ".1f", 1e6),
         text(row.difference, ".1e"),
         f"{row.measured_rows} measured" if row.measured_rows else note,
     ]

@@ -89,10 +89,22 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
 
 def box_mean(frames: Tensor, side: int) -> Tensor:
     """Mean of the side x side pixels around each pixel; at the border only those inside count."""
+    if torch.compiler.is_exporting():  # no onnxruntime pools in double precision
+        return _row_mean(_row_mean(frames, side).mT, side).mT
     reach = side // 2
     pool = nn.functional.avg_pool2d  # one axis at a time: 2 * side values a pixel instead of side**2
     frames = pool(frames, (1, side), 1, (0, reach), count_include_pad=False)
     return pool(frames, (side, 1), 1, (reach, 0), count_include_pad=False)
+
+
+def _row_mean(frames: Tensor, side: int) -> Tensor:
+    """Mean of the side pixels of its row around each pixel, as a sum of rows that are moved."""
+    width, reach = frames.shape[-1], side // 2
+    padded, there = (nn.functional.pad(one, (reach, reach)) for one in (frames, frames.new_ones(width)))
+    total, count = torch.zeros_like(frames), frames.new_zeros(width)
+    for k in range(side):
+        total, count = total + padded[..., k : k + width], count + there[k : k + width]
+    return total / count
 
 
 def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
@@ -165,6 +177,8 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     """
     check_frames(frames)
     check_clahe(clip_limit, grid)
+    if torch.compiler.is_exporting():
+        raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")
     from kornia.enhance import equalize_clahe
 
     rows, columns = int(grid[0]), int(grid[1])

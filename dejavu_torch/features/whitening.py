@@ -229,7 +229,7 @@ class Whitening(nn.Module):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
             whitened = (exact @ self.whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
-                return torch.cat([whitened, self.length.to(whitened).expand(len(whitened), 1)], 1)
+                return torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
             if self.power < 1:
                 # the least size keeps gradients finite
                 whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
@@ -263,7 +263,7 @@ class Whitening(nn.Module):
             kept = rank
         basis = basis[:, :rank]
         if views is None:
-            self._store(mean, basis[:, :kept], variances[:kept].sum().sqrt())
+            self.take(mean, basis[:, :kept], variances[:kept].sum().sqrt())
             return
         pairs = []
         for view, place in views:
@@ -279,14 +279,14 @@ class Whitening(nn.Module):
         centre, projection = learned_whitening(
             torch.cat([view for view, _ in pairs]), own, kept, self.shrinkage
         )
-        self._store(mean + basis @ centre, basis @ projection, None)
+        self.take(mean + basis @ centre, basis @ projection, None)
 
     def _kept(self, places: int, features: int, views: bool) -> int:
         if self.numbers is not None:
             return self.numbers
         return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS
 
-    def _store(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
+    def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
         """Take over a projection in whole numbers, and its mean."""
         largest = 2 ** (self.bits - 1) - 1
         self.scale = projection.abs().amax(0) / largest

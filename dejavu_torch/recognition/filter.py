@@ -120,7 +120,7 @@ class PlaceFilter(SequenceModel):
         self.within, self.threshold, self.search_every = within, threshold, search_every
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
-        return self._scores(self.posterior(scores, before)[:, :-1], scores)
+        return self.unlikely(self.posterior(scores, before)[:, :-1], scores)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         """Probability of each place, and of being off the map, behind each query.
@@ -141,6 +141,19 @@ class PlaceFilter(SequenceModel):
             belief = self._updated(self._expected(belief, 0, places).to(scores), likelihood)
             rows.append(_without_rest(belief))
         return torch.stack(rows) if rows else scores.new_zeros(0, places + 1)
+
+    def step(self, scores: Tensor, before: Tensor) -> Tensor:
+        """As `posterior`, of one query, by tensor operations alone: (1,N), (N+1,) -> (N+1,).
+
+        Args:
+            before: the posterior of the query before; all 0 where there is none. It is not checked.
+        """
+        places = scores.shape[1]
+        first = self._expected(None, 0, places).to(scores)
+        later = self._expected(_with_rest(before), 0, places)
+        likelihood = self.evidence(scores, moments_of(scores))[0]
+        expected = torch.where((before == 0).all(), first, later)
+        return _without_rest(self._updated(expected, likelihood))
 
     def predicted(self, posterior: Tensor) -> Tensor:
         """What the motion makes of a posterior, ahead of the next query: (N+1,) -> (N+1,)."""
@@ -198,7 +211,7 @@ class PlaceFilter(SequenceModel):
         for scores in batches:
             posterior = self.posterior(scores, before)
             before = posterior[-1].detach() if len(posterior) else before
-            yield self._scores(posterior[:, :-1], scores)
+            yield self.unlikely(posterior[:, :-1], scores)
 
     def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
         """See `SequenceModel`; between two searches only the places of a likely stretch are scored.
@@ -241,13 +254,13 @@ class PlaceFilter(SequenceModel):
                 yield torch.cat(found)
 
     def _row(self, belief: Tensor, start: int, scores: Tensor, places: int) -> Tensor:
-        """As `_scores`, of all places: (W+2,) and (1,W) -> (1,N)."""
+        """As `unlikely`, of all places: (W+2,) and (1,W) -> (1,N)."""
         stop, smallest = start + scores.shape[1], torch.finfo(belief.dtype).tiny
         elsewhere = (self.within + 1) * belief[-2] / max(1, places - stop + start)
         row = -elsewhere.clamp(smallest, 1).log().repeat(1, places)
         left, right = min(self.within, start), min(self.within, places - stop)  # neighbours beside the W
         on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
-        near = torch.minimum(row[:, :1], self._scores(on, seen))
+        near = torch.minimum(row[:, :1], self.unlikely(on, seen))
         row[:, start - left : stop + right] = near.masked_fill(~seen.isfinite(), math.inf)
         return row
 
@@ -260,13 +273,13 @@ class PlaceFilter(SequenceModel):
         near = range(int(likely[0]), int(likely[-1]) + 1)
         return near if float(on[near.start : near.stop].sum()) > LIKELY else None
 
-    def _scores(self, posterior: Tensor, scores: Tensor) -> Tensor:
+    def unlikely(self, posterior: Tensor, scores: Tensor) -> Tensor:
         """-log of the probability of each place and its neighbours: (Q,W) and what they are of -> (Q,W)."""
         within = min(self.within, posterior.shape[1])  # further neighbours there are not
         side = within + 1  # two means over so many make a triangle
         padded = F.pad(posterior[:, None], (within, within))
         mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
-        score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1).log()
+        score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1.0).log()  # an exporter promotes no types
         return score.masked_fill(~scores.isfinite(), math.inf)
 
     def check(self, queries: int | None, places: int) -> None:

@@ -36,6 +36,7 @@ def small(**options: object) -> list[Row]:
         "distances": [(9, 40, 410)],
         "sequences": [(9, 5, 5000)],
         "filters": [(40, 3000)],
+        "exports": [(3, 24, 16, 200)],
     }
     return bench_matcher(**{"torch_compile": False, **sizes, **options})  # type: ignore[arg-type]
 
@@ -49,6 +50,7 @@ L1 = "l1 9 x 40 x 410"
 HOG = "hog 24 x 16"
 SEQUENCE = "sequence 9 x 5 x 5000"
 FILTER = "filter 40 x 3000"
+EXPORT = "single frames 3 x 24 x 16 on 200"
 
 
 def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
@@ -65,7 +67,24 @@ def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
         (SEQUENCE, "dejavu (score rows)"),
         (FILTER, "dejavu"),
         (FILTER, "dejavu (all places)"),
+        (EXPORT, "dejavu"),
+        (EXPORT, "onnxruntime"),
     ]
+
+
+def test_an_exported_map_has_the_size_of_its_file(rows: dict[tuple[str, str], Row]) -> None:
+    pytest.importorskip("onnxruntime")
+    assert rows[EXPORT, "dejavu"].file_bytes is None
+    assert (rows[EXPORT, "onnxruntime"].file_bytes or 0) > 200 * bench.NUMBERS * 4
+
+
+def test_without_onnxruntime_the_row_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    ours, theirs = small(images=[], distances=[], sequences=[], filters=[])
+    assert ours.seconds is not None
+    assert theirs.skipped is not None
+    assert "onnxruntime" in theirs.skipped
+    assert theirs.file_bytes is None
 
 
 def test_contenders_give_what_we_give(rows: dict[tuple[str, str], Row]) -> None:
@@ -88,7 +107,7 @@ def test_threads_are_reported(rows: dict[tuple[str, str], Row]) -> None:
 
 
 def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
-    for case in (HOG, L1, SEQUENCE, FILTER):
+    for case in (HOG, L1, SEQUENCE, FILTER, EXPORT):
         mine = [row for row in rows.values() if row.case == case and row.seconds]
         ours = min(row.seconds for row in mine if row.contender.startswith("dejavu") and row.seconds)
         assert [row.ratio_to_ours for row in mine] == [row.seconds and row.seconds / ours for row in mine]
@@ -96,7 +115,7 @@ def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
 
 def test_a_program_that_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
-    found = {row.contender: row for row in small(images=[], sequences=[], filters=[])}
+    found = {row.contender: row for row in small(images=[], sequences=[], filters=[], exports=[])}
     assert found["faiss"].skipped is not None
     assert "faiss" in found["faiss"].skipped
     assert found["faiss"]._replace(skipped=None) == Row(L1, "faiss")
@@ -106,7 +125,7 @@ def test_a_program_that_is_not_installed_is_a_row_that_says_so(monkeypatch: pyte
 
 def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "AT_MOST", 0)
-    ours, theirs = small(distances=[], sequences=[], filters=[])
+    ours, theirs = small(distances=[], sequences=[], filters=[], exports=[])
     assert (ours.measured_rows, theirs.measured_rows) == (None, 1)
     assert theirs.bytes == ours.bytes
     assert theirs.difference is not None
@@ -195,14 +214,14 @@ def test_a_bar_for_each_contender() -> None:
 def test_the_table() -> None:
     rows = [
         Row("l1", "dejavu", 0.5, 1.25, 1.0, 2_000_000, 1_000_000, 2, 0.0),
-        Row("l1", "slow", 5.0, 6.0, 10.0, None, 1_000_000, 1, 1e-5, measured_rows=7),
+        Row("l1", "slow", 5.0, 6.0, 10.0, None, 1_000_000, 1, 1e-5, measured_rows=7, file_bytes=4_000_000),
         Row("l1", "absent", skipped="ImportError: no module"),
     ]
     head, *body = bench_table(rows)
     assert body == [
-        ["l1: dejavu", "0.500", "1.0", "1.25", "2", "2.0", "1.0", "0.0e+00", ""],
-        ["l1: slow", "5.000", "10.0", "6.00", "1", "", "1.0", "1.0e-05", "7 measured"],
-        ["l1: absent", "", "", "", "", "", "", "", "skipped: ImportError: no module"],
+        ["l1: dejavu", "0.500", "1.0", "1.25", "2", "2.0", "1.0", "", "0.0e+00", ""],
+        ["l1: slow", "5.000", "10.0", "6.00", "1", "", "1.0", "4.0", "1.0e-05", "7 measured"],
+        ["l1: absent", "", "", "", "", "", "", "", "", "skipped: ImportError: no module"],
     ]
     assert len(text_table([head, *body]).splitlines()) == 4
 

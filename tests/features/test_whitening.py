@@ -183,7 +183,7 @@ def test_numbers_of_four_bits_come_back_from_their_bytes(numbers: int) -> None:
     projection[0] = 7 * torch.linspace(0.5, 2, numbers)
     whole[0] = 7
     whitening = Whitening(bits=4)
-    whitening._store(torch.zeros(30), projection, None)
+    whitening.take(torch.zeros(30), projection, None)
     assert torch.equal(whitening.whole, whole.to(torch.int8))
     torch.testing.assert_close(whitening.scale, torch.linspace(0.5, 2, numbers))
     assert whitening.projection.nbytes == 30 * math.ceil(numbers / 2)

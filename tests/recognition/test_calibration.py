@@ -270,6 +270,20 @@ def test_a_threshold_or_a_precision() -> None:
         DejaVu(threshold=1.0, precision=0.9)
 
 
+def test_an_export_tells_how_to_get_probabilities(model: DejaVu, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    from dejavu_torch.experiments.onnx_file import export_onnx, run_session, session_of
+
+    facts = export_onnx(model, tmp_path / "map.onnx").facts["calibration"]
+    queries = torch.cat(list(open_source(AGAIN).batches(64)))[:20]
+    scores = run_session(session_of(tmp_path / "map.onnx"), queries)
+    best, index = scores.min(1)
+    beyond = (torch.arange(160) - index[:, None]).abs() > facts["tolerance"]
+    margin = scores.masked_fill(~beyond, INF).amin(1) - best
+    told = torch.sigmoid(facts["slope"] * (facts["margin"] * margin - best) + facts["offset"]).double()
+    torch.testing.assert_close(told, model.localize(queries).probability, atol=1e-3, rtol=0)
+
+
 def test_matches_join_and_change_with_and_without_probability() -> None:
     one = Match(torch.tensor([1]), torch.tensor([0.5]), torch.tensor([True]))
     assert Match.joined([one, one]).probability is None

@@ -1,0 +1,272 @@
+"""A map as an ONNX file gives torch's scores in onnxruntime, or there is no file."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_line import fails, run
+from helpers import Fixed, refused
+from PIL import Image
+from torch import Tensor, nn
+
+from dejavu_torch import (
+    DejaVu,
+    ImposedPeriods,
+    PlaceFilter,
+    Preprocess,
+    SequenceMatcher,
+    SpectralMapper,
+    TemplateMapper,
+    Whitening,
+    open_source,
+)
+from dejavu_torch.experiments import onnx_file
+from dejavu_torch.experiments.onnx_file import METADATA, OPSET, export_onnx, run_session, session_of
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.types import FrequencyLayer, SequenceModel
+
+pytest.importorskip("onnxscript")
+pytest.importorskip("onnxruntime")
+
+LAYERS = (FrequencyLayer(4, 4, 0, 20, (0, 2)), FrequencyLayer("5/2", 3, 5, 25, (0, 1)))
+
+
+def of_features(**settings: Any) -> DejaVu:
+    """A template map of ready features; nothing covers places 25 to 29."""
+    mapper = TemplateMapper(Fixed(*LAYERS), **settings)
+    return DejaVu(mapper=mapper).learn(torch.rand(30, 4)).eval()
+
+
+def of_frames(frames: Tensor, features: nn.Module | None = None, **settings: Any) -> DejaVu:
+    return DejaVu(features, Whitening(views=1), SpectralMapper(16.0, **settings)).learn(frames).eval()
+
+
+def facts_of(session: Any) -> dict[str, Any]:
+    facts: dict[str, Any] = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
+    return facts
+
+
+@pytest.fixture(scope="module")
+def flights() -> tuple[Tensor, Tensor]:
+    """80 small frames of a road and of another flight over it."""
+    sources = (open_source(f"sim:aerial?frames=80&traverse={i}") for i in range(2))
+    road, query = (torch.cat(list(source.batches(80)))[..., ::2, ::2].contiguous() for source in sources)
+    return road, query
+
+
+def test_real_frames_score_as_in_torch(data_dir: Path, tmp_path: Path) -> None:
+    strips = (f"strip:{data_dir}/aerial_road/pass{i}.png?halve=1&rows=32:128&width=96" for i in (1, 2))
+    road, query = (torch.cat(list(open_source(strip).between(0, 50))) for strip in strips)
+    model = of_frames(road)
+    export_onnx(model, tmp_path / "map.onnx")
+    session = session_of(str(tmp_path / "map.onnx"))
+    for frames in (query[:1], query):
+        with torch.no_grad():
+            torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
+
+
+def test_a_file_says_what_it_is(flights: tuple[Tensor, Tensor], tmp_path: Path) -> None:
+    import onnx
+
+    model = of_frames(flights[0], chunk=30, metric="l2")
+    model.threshold = 0.25
+    written = export_onnx(model, tmp_path / "map.onnx")
+    assert written.bytes == (tmp_path / "map.onnx").stat().st_size
+    assert written.difference < 1e-4
+    session = session_of(str(tmp_path / "map.onnx"))
+    facts = facts_of(session)
+    assert facts == written.facts
+    assert (facts["opset"], facts["places"], facts["threshold"]) == (OPSET, 80, 0.25)
+    assert facts["frame_shape"] == [3, 32, 32]
+    for kind, values in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+        assert facts[kind] == {value.name: value.shape for value in values}
+    assert [entry.version for entry in onnx.load(tmp_path / "map.onnx").opset_import if not entry.domain] == [
+        OPSET
+    ]
+    assert b"/" + Path(onnx_file.__file__).name.encode() not in (tmp_path / "map.onnx").read_bytes()
+    with torch.no_grad():  # more frames than HOG takes at a time in torch, some of them flat
+        frames = torch.cat([*[flights[1]] * 3, torch.zeros(2, 3, 32, 32)])
+        torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        {"features": SmallCNN(8, resize=(16, 16), widths=(4, 8), squeeze=4)},
+        {"preprocess": Preprocess("R-B", "patch")},
+    ],
+    ids=["CNN", "patches"],
+)
+def test_other_parts_score_as_in_torch(
+    part: dict[str, Any], flights: tuple[Tensor, Tensor], tmp_path: Path
+) -> None:
+    mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), "l1", "sum")
+    model = DejaVu(mapper=mapper, **part).learn(flights[0]).eval()
+    export_onnx(model, tmp_path / "map.onnx")
+    found = run_session(session_of(str(tmp_path / "map.onnx")), flights[1])
+    with torch.no_grad():
+        torch.testing.assert_close(found, model(flights[1]), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+def test_a_map_of_features_takes_features(metric: str, tmp_path: Path) -> None:
+    model, queries = of_features(metric=metric, temperature=0.1 if metric == "l1" else None), torch.rand(9, 4)
+    facts = export_onnx(model, tmp_path / "map.onnx").facts
+    assert facts["inputs"] == {"features": ["batch", 4]}
+    assert "threshold" not in facts
+    found = run_session(session_of(str(tmp_path / "map.onnx")), queries)
+    assert found[:, 25:].isposinf().all()
+    torch.testing.assert_close(found, model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "model", [SequenceMatcher(5, (1, 0.5)), PlaceFilter(within=2)], ids=["sum", "filter"]
+)
+def test_a_sequence_goes_from_state_to_state(model: SequenceModel, tmp_path: Path) -> None:
+    route, queries = of_features(), torch.rand(20, 4)
+    facts = export_onnx(route, tmp_path / "map.onnx", model).facts
+    state = [31] if isinstance(model, PlaceFilter) else [4, 30]
+    assert facts["inputs"] == {"features": [1, 4], "state": state}
+    assert facts["outputs"] == {"scores": [1, 30], "next_state": state}
+    assert facts.get("threshold") == model.threshold_of(None)
+    with torch.no_grad():
+        (expected,) = model.stream([route(queries)])
+    found = run_session(session_of(str(tmp_path / "map.onnx")), queries)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
+
+
+class Solves(nn.Module):
+    """What ONNX has no operation for."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return torch.linalg.svdvals(frames).flatten(1)
+
+
+class Looks(nn.Module):
+    """What hangs on the values of the frames."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return frames.flatten(1) if frames.mean() > 0 else frames.flatten(1) + 1
+
+
+class Counts(nn.Module):
+    """What is made for one number of frames."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return frames.flatten(1) + torch.zeros(len(frames), 1)
+
+
+@pytest.mark.parametrize("features", [Solves(), Looks(), Counts()], ids=["no operation", "values", "batch"])
+def test_a_part_that_cannot_be_exported_is_named(
+    features: nn.Module, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    mapper = TemplateMapper(Fixed(FrequencyLayer(4, 4, 0, 20, (0, 1))))
+    model = DejaVu(features, mapper=mapper).learn(torch.rand(20, 1, 8, 8))
+    with refused(f"the features, {type(features).__name__}, cannot be exported: "):
+        export_onnx(model, tmp_path / "map.onnx")
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_clahe_is_refused(tmp_path: Path) -> None:
+    mapper = TemplateMapper(Fixed(FrequencyLayer(4, 4, 0, 20, (0, 1))))
+    model = DejaVu(mapper=mapper, preprocess=Preprocess("grey", "clahe", grid=(2, 2)))
+    model.learn(torch.rand(20, 3, 24, 24))
+    with refused("the preprocess, Preprocess, cannot be exported: clahe", "expected another contrast"):
+        export_onnx(model, tmp_path / "map.onnx")
+
+
+def test_scores_that_differ_are_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onnx_file, "run_session", lambda session, frames: torch.zeros(len(frames), 30))
+    with refused("differ from torch's by", "expected at most"):
+        export_onnx(of_features(), tmp_path / "map.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_number_differs() -> None:
+    graph = onnx_file.Graph(of_features())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(onnx_file, "session_of", lambda written: None)
+        patch.setattr(onnx_file, "run_session", lambda session, frames: graph(frames) * math.nan)
+        assert onnx_file._difference(b"", graph, torch.rand(2, 4), {"places": 30}) > 1e9
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxscript", "onnxruntime"])
+def test_a_missing_package_is_named(package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with refused(f"an export needs {package}", "pip install 'dejavu_torch[export]'"):
+        export_onnx(of_features(), tmp_path / "map.onnx")
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with refused("there is no map yet"):
+        export_onnx(DejaVu(), tmp_path / "map.onnx")
+    with refused("folder", "does not exist"):
+        export_onnx(of_features(), tmp_path / "none" / "map.onnx")
+    with refused("no step"):
+        export_onnx(of_features(), tmp_path / "map.onnx", Fastest())
+    with refused("what frames"):
+        export_onnx(DejaVu().learn_features(torch.rand(60, 4)), tmp_path / "map.onnx")
+    monkeypatch.setattr(onnx_file, "MOST_BYTES", 60 * 5 * 4 - 1)
+    with refused("60 places of 5 numbers", "GB"):
+        export_onnx(DejaVu().learn(torch.rand(60, 4)), tmp_path / "map.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+class Fastest(SequenceModel):
+    """Of its own kind."""
+
+    def stream(self, batches: Any) -> Any:
+        return batches
+
+    def check(self, queries: int | None, places: int) -> None:
+        """Anything goes."""
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = of_features()
+    model.save(tmp_path / "map.safetensors")
+    words = ("export", tmp_path / "map.safetensors", "--onnx")
+    run(*words, tmp_path / "map.onnx", "--sequence", "3", "--threshold", "0.5")
+    out = capsys.readouterr().out
+    for told in ("features (1, 4)", "state (2, 30)", f"opset {OPSET}", f"written to {tmp_path / 'map.onnx'}"):
+        assert told in out
+    facts = facts_of(session_of(str(tmp_path / "map.onnx")))
+    assert (facts["threshold"], facts["first_state"]) == (0.5, "nan")
+    before = (tmp_path / "map.onnx").read_bytes()
+    assert "such as route.onnx" in fails(capsys, *words, tmp_path / "map.pt")
+    assert "expected one or the other" in fails(
+        capsys, *words, tmp_path / "map.onnx", "--filter", "--sequence", "3"
+    )
+    assert "fewer" in fails(
+        capsys, *words, tmp_path / "map.onnx", "--filter", "--moves", str([1 / 40] * 40).replace(" ", "")
+    )
+    assert "none.safetensors" in fails(
+        capsys, "export", tmp_path / "none.safetensors", "--onnx", tmp_path / "map.onnx"
+    )
+    assert (tmp_path / "map.onnx").read_bytes() == before
+
+
+def test_the_documentation_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    frame = next(open_source("sim:aerial?frames=64&traverse=1").between(40, 41))[0]
+    Image.fromarray((frame * 255).byte().permute(1, 2, 0).numpy()).save("frame.png")
+    space: dict[str, Any] = {}
+    for language, block in re.findall(r"```(sh|python)\n(.*?)```", page, re.DOTALL):
+        if language == "python":
+            exec(block, space)
+        for line in block.splitlines() if language == "sh" else ():
+            run(*shlex.split(line)[1:])
+    found = re.findall(r"^(\d+) (?:True|False)$", capsys.readouterr().out, re.MULTILINE)
+    assert [abs(int(place) - 40) <= 5 for place in found] == [True] * 4
