@@ -670,9 +670,11 @@ def _write_matches(
 
 
 def _print_scores(report: Report, out: Path) -> None:
+    from dejavu_torch.evaluation.rejection import rejection_table
     from dejavu_torch.evaluation.report import score_table, sequence_table, summary, text_table
 
-    for rows in (score_table(report), sequence_table(report)):
+    rejection = rejection_table(report.facts.get("rejection", {}))
+    for rows in (score_table(report), sequence_table(report), rejection):
         if rows:
             print(text_table(rows))
     _say(summary(report))

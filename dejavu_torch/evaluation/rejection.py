@@ -114,22 +114,24 @@ def accepted_at(asked: float, probability: Tensor, right: Tensor) -> Accepted:
     )
 
 
-def rejection_line(facts: Mapping[str, Any]) -> str:
-    """The facts of `rejection_facts` in a sentence or two."""
-    text = []
-    if "expected_calibration_error" in facts:
-        last = facts["precision"][-1]
-        text.append(
-            f"Probabilities are {facts['expected_calibration_error']:.3f} away from the share of right "
-            "answers (expected calibration error)"
-        )
-        kept = f"--precision {last['asked']:g} accepts {100 * last['kept']:.1f}\xa0% of the right answers"
-        told = last["precision"]
-        text.append(kept if told is None else f"{kept}, at a precision of {100 * told:.2f}\xa0%")
-    for name, one in facts["off_map"].items():
-        share = 100 * one["accepted"][f"{ASKED[-1]:g}"]
-        text.append(f"It accepts {share:.2f}\xa0% of the {one['frames']} frames of {name}, off the map")
-    return ". ".join(text)
+def rejection_table(facts: Mapping[str, Any]) -> list[list[str]]:
+    """What is accepted at each precision that is asked for, as rows of text, the header first.
+
+    Args:
+        facts: of `rejection_facts`. No rows where they tell of nothing.
+    """
+    own, off_map = facts.get("precision"), facts.get("off_map", {})
+    if own is None and not off_map:
+        return []
+    rows = [["--precision", *(f"{asked:g}" for asked in ASKED)]]
+    if own is not None:
+        reached = ("" if one["precision"] is None else f"{one['precision']:.4f}" for one in own)
+        rows.append(["precision reached", *reached])
+        rows.append(["right answers accepted", *(f"{one['kept']:.3f}" for one in own)])
+    for name, one in off_map.items():
+        shares = (f"{one['accepted'][f'{asked:g}']:.4f}" for asked in ASKED)
+        rows.append([f"accepted of {one['frames']} frames of {name}", *shares])
+    return rows
 
 
 def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) -> dict[str, Picture]:

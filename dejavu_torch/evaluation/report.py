@@ -16,7 +16,7 @@ import jinja2
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.rejection import rejection_line
+from dejavu_torch.evaluation.rejection import rejection_table
 from dejavu_torch.text import printable
 
 PICTURES = (
@@ -209,8 +209,9 @@ def summary(report: Report) -> str:
     if facts.get("threshold_of_full_precision") is not None:
         threshold = facts["threshold_of_full_precision"]
         lines.append(f"Here --threshold {threshold:.9g} would accept right places only")
-    if "rejection" in facts:
-        lines += [line for line in [rejection_line(facts["rejection"])] if line]
+    error = facts.get("rejection", {}).get("expected_calibration_error")
+    if error is not None:
+        lines.append(f"Probabilities differ from the share of right answers by {error:.3f} on average")
     if any(is_late(one) for one in report.shown().values()):
         lines.append(_LATE)
     if "seconds_learn" in facts:
@@ -260,6 +261,7 @@ def write_report(
             *(colour_of(key) for key, one in report.shown().items() if one.sequences),
             *(colour_of("map") for _ in facts.get("storage", {}).get("map", ())),
         ],
+        rejection_rows=rejection_table(facts.get("rejection", {})),
         every_row=score_table(report, every=True),
         contenders=report.contenders,
         facts=facts,

@@ -13,7 +13,7 @@ from dejavu_torch.evaluation.rejection import (
     accepted_at,
     draw_reliability,
     rejection_facts,
-    rejection_line,
+    rejection_table,
 )
 from dejavu_torch.types import Match
 
@@ -37,17 +37,20 @@ def test_the_figures_of_a_rejection() -> None:
     assert facts["off_map"] == {
         "sea": {"frames": 4, "accepted": {"0.5": 0.5, "0.8": 0.25, "0.9": 0.25, "0.95": 0.25, "0.99": 0.25}}
     }
-    line = rejection_line(facts)
-    assert "66.7\xa0% of the right answers, at a precision of 100.00\xa0%" in line
-    assert "25.00\xa0% of the 4 frames of sea" in line
+    head, reached, kept, sea = rejection_table(facts)
+    assert head == ["--precision", "0.5", "0.8", "0.9", "0.95", "0.99"]
+    assert (reached[-1], kept[-1], sea) == (
+        "1.0000",
+        "0.667",
+        ["accepted of 4 frames of sea", "0.5000", "0.2500", "0.2500", "0.2500", "0.2500"],
+    )
 
 
 def test_nothing_is_accepted_where_nothing_is_sure() -> None:
     none = accepted_at(0.99, torch.tensor([0.5]), torch.tensor([True]))
     assert (none.precision, none.kept) == (None, 0.0)
-    assert "at a precision" not in rejection_line(
-        rejection_facts(MATCH.with_probability(MATCH.score / 2), TRUTH, 0, {})["rejection"]
-    )
+    facts = rejection_facts(MATCH.with_probability(MATCH.score / 2), TRUTH, 0, {})["rejection"]
+    assert rejection_table(facts)[1] == ["precision reached", *[""] * 5]
 
 
 def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
@@ -55,7 +58,7 @@ def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
     assert rejection_facts(plain, TRUTH, 0, {}) == draw_reliability(plain, TRUTH, 0) == {}
     assert rejection_facts(MATCH, None, 0, {}) == {"rejection": {"off_map": {}}}
     assert draw_reliability(MATCH, None, 0) == {}
-    assert rejection_line({"off_map": {}}) == ""
+    assert rejection_table({"off_map": {}}) == rejection_table({}) == []
 
 
 def test_the_picture_shows_the_share_that_is_right() -> None:
