@@ -52,8 +52,11 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
     model = DejaVu.load(small_map)
     match = model.localize(open_source(QUERY))
-    assert list(rows[0]) == ["query", "place", "score", "accepted", "query_name", "place_name"]
+    columns = ["query", "place", "score", "accepted", "probability", "query_name", "place_name"]
+    assert list(rows[0]) == columns
     assert [int(row["query"]) for row in rows] == list(range(256))
+    assert match.probability is not None
+    assert [float(row["probability"]) for row in rows] == pytest.approx(match.probability.tolist(), abs=1e-4)
     assert [int(row["place"]) for row in rows] == match.index.tolist()
     assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-5)
 
@@ -255,7 +258,7 @@ def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> No
     assert stop.value.code == 0
     assert "known subclasses" not in out
     assert "<class" not in out
-    assert len(out.splitlines()) < 115
+    assert len(out.splitlines()) < 135
     assert out.splitlines()[0].startswith(f"usage: dejavu {command}")
 
 

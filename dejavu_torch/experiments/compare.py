@@ -105,8 +105,8 @@ def compare(
             resamples.
         sequence: scores consecutive queries together, on the map and on all that it is set beside.
         top: how many candidates of each query are wanted.
-        calibration: see `DejaVu.calibrate`; another traverse than the query. None takes changed frames of the
-            reference, where the model's map is not calibrated yet.
+        calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a map that is
+            learned by changed frames of the reference.
         distractors: routes that are not on the map: how many of their frames are accepted.
         progress: show progress bars on a terminal.
 
@@ -146,7 +146,8 @@ def compare(
         else:
             places = model.describe_reference(reference, second, text)
             model.learn_features(places, reference)
-        model.calibrate_if_possible(reference, calibration)
+        if calibration is not None or not has_map:
+            model.calibrate_if_possible(reference, calibration)
         model.check_precision(sequence)
     with timed(seconds, "localize"):
         model.check_queries(query.frame_shape, features, query.name)

@@ -11,7 +11,7 @@ from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
 from dejavu_torch.model import DejaVu
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -48,7 +48,7 @@ class MapExport(Callback):
             log.warning("%s is gone: the map is of the last step", best)
         elif best is not None:
             load_weights(pl_module, best)
-        self.write(pl_module, Path(trainer.default_root_dir))
+        self.write(pl_module, Path(trainer.default_root_dir), pl_module.data.reference)
 
     def on_exception(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
@@ -58,14 +58,16 @@ class MapExport(Callback):
             assert isinstance(pl_module, PlaceRecognitionTask)
             self.write(pl_module, Path(trainer.default_root_dir))
 
-    def write(self, task: PlaceRecognitionTask, folder: Path) -> None:
-        """Write the task's map; a warning where it has none yet."""
+    def write(self, task: PlaceRecognitionTask, folder: Path, reference: Traverse | None = None) -> None:
+        """Write the task's map, calibrated by its reference where one is given; a warning where it has none
+        yet."""
         try:
             model = task.deployed()
         except InputError as error:
             log.warning("no map is written: %s", error)
             return
-        model.calibrate_if_possible(task.data.reference)
+        if reference is not None:
+            model.calibrate_if_possible(reference)
         folder.mkdir(parents=True, exist_ok=True)
         model.save(folder / self.name)
         self.written = (folder / self.name, model)
