@@ -353,6 +353,7 @@ class DejaVu(nn.Module):
             True
         """
         self._require_map()
+        another = views is not None
         if views is None:
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
@@ -363,7 +364,7 @@ class DejaVu(nn.Module):
             length = LONGEST_TRIAL
         descriptors = self.extract_all(views.traverse)
         parts = zip(descriptors.split(length), views.places.split(length), strict=True)
-        self.calibration = calibrated(self.map, (Trial(*part) for part in parts))
+        self.calibration = calibrated(self.map, (Trial(*part) for part in parts), another)
         return self
 
     def calibrate_if_possible(self, reference: Traverse, views: Views | None = None) -> None:

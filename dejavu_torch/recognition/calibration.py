@@ -62,8 +62,11 @@ class Trial(NamedTuple):
     places: Tensor
 
 
-def fit(evidence: Tensor, right: Tensor) -> Platt:
+def fit(evidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:
     """The slope and offset under which the answers that were seen are most likely.
+
+    Args:
+        weight: (n,) how often each answer counts; None is once.
 
     Shape: evidence (n,) float and right (n,) bool -> Platt.
 
@@ -87,21 +90,22 @@ def fit(evidence: Tensor, right: Tensor) -> Platt:
     if not bool((right & known).any()):
         raise InputError(f"none of {len(right)} answers is right; expected some, to calibrate by")
     x, y = evidence[known].double(), right[known]
+    weight = torch.ones_like(x) if weight is None else weight[known].double()
     mean, spread = x.mean(), x.std(correction=0)
     columns = torch.stack([(x - mean) / (spread if spread > 0 else 1), torch.ones_like(x)], 1)
-    hits, misses = int(y.sum()), int((~y).sum())
+    hits, misses = float(weight[y].sum()), float(weight[~y].sum())
     aim = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
     found = torch.tensor([0.0, math.log((hits + 1) / (misses + 1))], dtype=torch.float64)
     ridge = 1e-9 * torch.eye(2, dtype=torch.float64)
 
     def loss(at: Tensor) -> float:
         logits = columns @ at
-        return float((torch.nn.functional.softplus(logits) - aim * logits).sum())
+        return float((weight * (torch.nn.functional.softplus(logits) - aim * logits)).sum())
 
     for _ in range(STEPS):
         p = torch.sigmoid(columns @ found)
-        gradient = columns.T @ (p - aim)
-        curvature = (columns * (p * (1 - p))[:, None]).T @ columns + ridge
+        gradient = columns.T @ (weight * (p - aim))
+        curvature = (columns * (weight * p * (1 - p))[:, None]).T @ columns + ridge
         step = torch.linalg.solve(curvature, gradient)
         before, size = loss(found), 1.0
         while loss(found - size * step) > before and size > 1e-8:
@@ -156,14 +160,18 @@ class Track:
 
 
 @torch.no_grad()
-def calibrated(route: Scorer, trials: Iterable[Trial]) -> Calibration:
+def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = False) -> Calibration:
     """Fit on queries whose places are known, and on the same with the place and its surroundings, twice the
     tolerance to each side, left out: answers off the map, of which none is right.
+
+    Args:
+        another_visit: the queries are of another visit, whose own wrong answers tell how often to expect one.
+            Those off the map then count as one together, and not where there are others.
 
     Raises:
         InputError: no right answer of single queries, or none whose place is known.
     """
-    kinds: dict[str, list[tuple[Tensor, Tensor]]] = {"single": [], "filter": []}
+    kinds: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {"single": [], "filter": []}
     for descriptors, places in trials:
         known = places >= 0
         scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
@@ -179,11 +187,18 @@ def calibrated(route: Scorer, trials: Iterable[Trial]) -> Calibration:
             ):
                 index = best_match(found).index
                 right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & is_there
-                kinds[kind].append((evidence[known].cpu(), right[known].cpu()))
+                there = torch.full_like(right, is_there)
+                kinds[kind].append((evidence[known].cpu(), right[known].cpu(), there[known].cpu()))
     if not kinds["single"]:
         raise InputError("there are no queries to calibrate by; expected some")
-    single, filtered_ = (tuple(map(torch.cat, zip(*pairs, strict=True))) for pairs in kinds.values())
-    return Calibration(fit(*single), fit(*filtered_) if bool(filtered_[1].any()) else None)
+    platts = []
+    for pairs in kinds.values():
+        evidence, right, there = map(torch.cat, zip(*pairs, strict=True))
+        wrong = int((there & ~right).sum())
+        off_map = max(0.0, 1.0 - wrong) / max(1, int((~there).sum())) if another_visit else 1.0
+        weight = torch.where(there, 1.0, off_map)
+        platts.append(fit(evidence, right, weight) if not platts or bool(right.any()) else None)
+    return Calibration(*platts)
 
 
 def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> float:

@@ -151,6 +151,8 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
     known = places.where(places % 2 == 0, -1)  # what is not known does not count
     half = calibrated(Table(), [Trial(scores, known)])
     assert half.single == calibrated(Table(), [Trial(scores[::2], places[::2])]).single
+    visit = calibrated(Table(), [Trial(scores, places)], another_visit=True)
+    assert float(visit.single.probability(evidence_of(scores)).mean()) > float(there.mean())  # none was wrong
     with refused("none of 80 answers"):
         calibrated(Table(), [Trial(scores, (places + 20) % 40)])
     with refused("no queries"):
