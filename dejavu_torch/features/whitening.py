@@ -206,6 +206,13 @@ class Whitening(nn.Module):
         halves = torch.cat([self.projection & 15, self.projection >> 4], 1)
         return halves[:, : self.scale.shape[0]].to(torch.int8) - 8
 
+    def unpacked(self) -> Tensor:
+        """(D,K) float32, `whole` for a `forward` of single descriptors, which unpacking takes longer than.
+
+        It lies in memory by columns, as a product with one row is fastest.
+        """
+        return self.whole.T.float().contiguous().T
+
     @property
     def learned(self) -> bool:
         """Whether there is a projection."""
@@ -216,7 +223,8 @@ class Whitening(nn.Module):
         """Numbers of a whitened descriptor, once there is a projection."""
         return len(self.scale) + len(self.length)
 
-    def forward(self, descriptors: Tensor) -> Tensor:
+    def forward(self, descriptors: Tensor, unpacked: Tensor | None = None) -> Tensor:
+        """Descriptors (B,D) -> (B,K); `unpacked` is what the method of that name gave, if it is kept."""
         if not self.learned:
             return descriptors
         if descriptors.ndim != 2 or descriptors.shape[1] != len(self.projection):
@@ -227,7 +235,8 @@ class Whitening(nn.Module):
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
-            whitened = (exact @ self.whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
+            whole = self.whole if unpacked is None else unpacked
+            whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
                 return torch.cat([whitened, self.length.to(whitened).expand(len(whitened), 1)], 1)
             if self.power < 1:
