@@ -22,6 +22,7 @@ ORDER = [
     {"recognition"},
     {"motion"},
     {"model"},
+    {"live"},
     {"evaluation"},
     {"training"},
     {"experiments"},
@@ -41,9 +42,10 @@ ARROWS = {
     "recognition": "types",
     "motion": "types data",
     "model": "types text data features periods database recognition motion",
+    "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
-    "experiments": "types text data features periods database recognition motion model evaluation",
+    "experiments": "types text data features periods database recognition motion model live evaluation",
     "cli": "types text data features periods database recognition motion model evaluation training "
     "experiments",
 }

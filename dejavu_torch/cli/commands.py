@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
+from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.recipe import recipe_of
@@ -73,6 +74,7 @@ def run_learn(
     seed: int = 0,
     second: str | None = None,
     second_truth: str | None = None,
+    device: str = "cpu",
     model: DejaVu,
 ) -> None:
     """Learn a map; print its plan, its summary and the bytes per place.
@@ -84,7 +86,9 @@ def run_learn(
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
+        device: what computes: cpu, cuda, cuda:1 or mps
     """
+    model.to(device_of(device))
     if map.suffix != ".safetensors":
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
@@ -115,6 +119,7 @@ def run_localize(
     speeds: list[float] | None = None,
     filter: bool = False,
     moves: list[float] | None = None,
+    device: str = "cpu",
     features: nn.Module | None = None,
 ) -> None:
     """Find the frames of a source on a map.
@@ -133,10 +138,12 @@ def run_localize(
             --threshold are -log probability, and what is more likely than not is accepted
         moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
             if not given
+        device: as of `dejavu learn`
         features: class of the map's features, if not ours
     """
+    where = device_of(device)
     check_output_file(out)
-    model = DejaVu.load(map, features)
+    model = DejaVu.load(map, features).to(where)
     if corners is not None:
         if as_is or model.velocity is None or model.step is None:
             why = "--as_is measures no ground" if as_is else f"{map} was learned without --velocity"
@@ -170,6 +177,63 @@ def run_localize(
     _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
 
+def run_live(
+    map: Path,
+    source: str,
+    *,
+    filter: bool = False,
+    sequence: int | None = None,
+    speeds: list[float] | None = None,
+    moves: list[float] | None = None,
+    threshold: float | None = None,
+    page: int | None = None,
+    reference: str | None = None,
+    realtime: bool = False,
+    timeout: float = 10.0,
+    as_is: bool = False,
+    device: str = "cpu",
+    features: nn.Module | None = None,
+) -> None:
+    """Find frames as they come: a line of JSON for each on stdout, a summary on stderr at the end.
+
+    Frames of cameras, addresses, pipes, videos and folders are brought to the size of the map's frames.
+
+    Args:
+        map: map file
+        source: a camera (/dev/video0), an address (rtsp://host/path), a named pipe, - for standard input, or a
+            source as of `dejavu learn`. Of cameras, addresses and pipes the newest frame is taken, and those
+            that came while the one before was being found are dropped; of a file none is
+        filter: the most probable place given all frames so far, as of `dejavu localize`; the default
+        sequence: frames that are matched together in place of the filter; 1 takes each by itself
+        speeds: as of `dejavu localize`
+        moves: as of `dejavu localize`
+        threshold: accept a match whose score is below
+        page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
+            for any that is free
+        reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
+        realtime: take the frames of a video at their times, and drop those that come too fast
+        timeout: seconds without a frame after which a camera, address or pipe has stalled
+        as_is: take the frames as they are, though the map's are resampled
+        device: as of `dejavu learn`
+        features: class of the map's features, if not ours
+    """
+    from dejavu_torch.cli.live import follow
+
+    where = device_of(device)
+    if reference is not None and page is None:
+        raise InputError(f"--reference {reference} without --page; expected both")
+    if not timeout > 0:
+        raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
+    model = DejaVu.load(map, features).to(where)
+    if as_is:
+        model.velocity = None
+    model.threshold = model.threshold if threshold is None else threshold
+    if sequence is None:
+        filter = True
+    matcher = _sequence_of(1 if sequence is None else sequence, speeds, filter, moves, APART, threshold)
+    follow(model, matcher, source, f"{source} on {map}", page, reference, realtime, timeout)
+
+
 def run_compare(
     reference: str,
     query: str,
@@ -188,6 +252,7 @@ def run_compare(
     filter: bool = False,
     moves: list[float] | None = None,
     top: int | None = None,
+    device: str = "cpu",
     model: DejaVu,
     command: str,
 ) -> None:
@@ -211,10 +276,12 @@ def run_compare(
         filter: as of `dejavu localize`
         moves: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
+        device: as of `dejavu learn`
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
 
+    where = device_of(device)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
     if filter:
         model.threshold = None  # of distances: that of the filter is none for the map to keep
@@ -222,6 +289,7 @@ def run_compare(
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
         model.threshold = model.threshold if given.threshold is None else given.threshold
+    model.to(where)
     first, queries = open_source(reference), open_source(query)
     _check_report_folder(out, reference, query)
     _set_seed(model, seed)

@@ -16,9 +16,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import InputError, Match, SequenceModel
 
-EXPECTED = (
-    "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1]; of a map of ready features, float (D,)"
-)
+EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1]; of a map of ready features, float (D,)"
 ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
 
 
@@ -70,9 +68,7 @@ class LiveLocalizer:
         (20, 21)
     """
 
-    def __init__(
-        self, model: DejaVu, sequence: SequenceModel | Literal["filter"] | None = "filter"
-    ) -> None:
+    def __init__(self, model: DejaVu, sequence: SequenceModel | Literal["filter"] | None = "filter") -> None:
         if not model.map.places:
             raise InputError("there is no map yet; expected a model that learned or loaded one")
         if model.step is not None and model.velocity is not None:
