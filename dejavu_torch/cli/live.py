@@ -60,8 +60,10 @@ def follow(
         feed = stack.enter_context(Feed(shots, newest, timeout if is_stream(source) else None, name))
         try:
             with interrupts_raise(), suppress(KeyboardInterrupt):
+                latest = -1
                 for shot in feed:
-                    match = localizer(shot.pixels)
+                    match = localizer(shot.pixels, shot.number - latest - 1)
+                    latest = shot.number
                     taken.add(match.milliseconds)
                     print(line_of(shot, match))
                     if reader_left():

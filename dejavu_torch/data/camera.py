@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import stat
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -117,10 +116,12 @@ class Camera:
                 raise InputError(f"{self.name} is not there; expected {self._expected}")
             settings["format"] = "v4l2"
             options = {}
-        elif self.source == PIPE:
-            address = sys.stdin.buffer
+        elif (
+            self.source == PIPE
+        ):  # without a buffer, whose lock a thread would hold to the end of the process
+            address = open(0, "rb", buffering=0, closefd=False)  # noqa: SIM115
         elif self.ends:
-            address = open(self.source, "rb")  # noqa: SIM115  # the container reads on
+            address = open(self.source, "rb", buffering=0)  # noqa: SIM115
         else:
             options["protocol_whitelist"] = PROTOCOLS  # and no file of this machine that an answer may name
             options["format_whitelist"] += ",rtsp,sdp,rtp,hls,dash,mpjpeg"

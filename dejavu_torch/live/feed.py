@@ -1,4 +1,4 @@
-"""Frames read by a thread while others are localised; of a live source those that come too fast are dropped."""
+"""Frames read by a thread while others are localised; those that come too fast may be dropped."""
 
 from __future__ import annotations
 

@@ -16,7 +16,11 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import InputError, Match, SequenceModel
 
-EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1]; of a map of ready features, float (D,)"
+EXPECTED = (
+    "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1], or, of a map of ready features, "
+    "float (D,)"
+)
+FURTHEST = 100  # frames left out that count; behind more, a jump finds the place again
 ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
 
 
@@ -53,8 +57,8 @@ class LiveLocalizer:
         scores: (N,) of the latest frame, on the model's device; None ahead of the first.
 
     Convention: the answers are those of `DejaVu.localize` on the same frames with the same sequence, but for
-        rounding. A frame that is refused changes nothing. Where frames are left out, the next one shows a
-        place that is further on, of which the `moves` of the filter have to know.
+        rounding. A frame that is refused changes nothing. `localizer(frame, left_out)` says how many frames
+        came since the one before and were left out: a `PlaceFilter` moves once more for each of them.
 
     Raises:
         InputError: a model without a map, or whose places are at even steps along the ground; calling it: an
@@ -78,7 +82,7 @@ class LiveLocalizer:
             )
         if not (sequence is None or sequence == "filter" or isinstance(sequence, SequenceModel)):
             raise InputError(
-                f"the sequence is {sequence!r}; expected a SequenceModel such as PlaceFilter, 'filter' or None"
+                f"the sequence is {sequence!r}; expected a SequenceModel such as PlaceFilter, 'filter', None"
             )
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self.device = model.map.positions.device
@@ -96,14 +100,20 @@ class LiveLocalizer:
         self._matches: Iterator[Match] = self.model.matches_of(self._descriptors(), self.sequence, self._look)
 
     @torch.no_grad()
-    def __call__(self, frame: Tensor | np.ndarray) -> LiveMatch:
+    def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
         began = time.perf_counter()
         self._descriptor = self._describe(as_batch(frame, self.device))
+        filter = self.sequence if isinstance(self.sequence, PlaceFilter) else None
         try:
+            if filter is not None:
+                filter.moved = 1 + min(left_out, FURTHEST)
             match = next(self._matches)
         except BaseException:  # as Ctrl-C: what was half done is not gone on with
             self.reset()
             raise
+        finally:
+            if filter is not None:
+                filter.moved = 1
         place, score = int(match.index), float(match.score)
         shown = int(self.model.map.frame_of(match.index))
         return LiveMatch(
@@ -111,7 +121,7 @@ class LiveLocalizer:
             shown,
             self.model.frame_name(shown) if shown >= 0 else "",
             score,
-            math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
+            math.nan if filter is None else math.exp(-score),
             bool(match.accepted),
             1e3 * (time.perf_counter() - began),
         )

@@ -85,7 +85,7 @@ class Page:
             self._server = ThreadingHTTPServer((HOST, port), Handler)
         except OSError as error:
             raise InputError(
-                f"port {port} of {HOST} cannot be had: {error.strerror}; expected a free one, as --page 0 finds"
+                f"port {port} of {HOST} cannot be had: {error.strerror}; expected a free one, such as 0 finds"
             ) from error
         self._server.daemon_threads = True
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"
