@@ -46,7 +46,7 @@ ARROWS = {
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model live evaluation",
-    "cli": "types text data features periods database recognition motion model evaluation training "
+    "cli": "types text data features periods database recognition motion model live evaluation training "
     "experiments",
 }
 

@@ -200,9 +200,9 @@ def run_live(
 
     Args:
         map: map file
-        source: a camera (/dev/video0), an address (rtsp://host/path), a named pipe, - for standard input, or a
-            source as of `dejavu learn`. Of cameras, addresses and pipes the newest frame is taken, and those
-            that came while the one before was being found are dropped; of a file none is
+        source: a camera (/dev/video0), an address (rtsp://host/path), a named pipe, - for standard input, or
+            a source as of `dejavu learn`. Of cameras, addresses and pipes the newest frame is taken, and
+            those that came while the one before was being found are dropped; of a file none is
         filter: the most probable place given all frames so far, as of `dejavu localize`; the default
         sequence: frames that are matched together in place of the filter; 1 takes each by itself
         speeds: as of `dejavu localize`
@@ -403,8 +403,8 @@ def run_bench(
     """Set this package beside what a user would pick instead: its speed, memory, or accuracy over bytes.
 
     Args:
-        what: matcher (time of HOG, L1 distances, sequences, filters), memory (of learning and localizing) or
-            storage (accuracy over bytes)
+        what: matcher (time of HOG, L1 distances, sequences, filters), live (time of single frames on 100000
+            places), memory (of learning and localizing) or storage (accuracy over bytes)
         sources: of storage, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
@@ -414,7 +414,7 @@ def run_bench(
             that are learned; 1000, 10000 and 50000 if not given
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench, footprint, frontier
+    from dejavu_torch.experiments import bench, footprint, frontier, live_speed
 
     if what == "storage":
         given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
@@ -425,7 +425,7 @@ def run_bench(
             _say(line)
         _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
-    known = what in bench.BENCHES or what == "memory"
+    known = what in bench.BENCHES or what in ("memory", "live")
     if known and (sources or map or codebooks or whitening or (places and what != "memory")):
         raise InputError(
             f"bench {what} takes no sources, maps, codebooks, whitening or places; bench storage does"
@@ -434,6 +434,9 @@ def run_bench(
         rows = footprint.run_memory(out, places)
         print(text_table(footprint.memory_table(rows)))
         note = "peak: beyond that of the programs loaded"
+    elif what == "live":
+        print(text_table(live_speed.live_table(live_speed.run_live(out))))
+        note = "found: within 5 places; each part alone, in milliseconds"
     else:
         rows = bench.run_bench(what, out)
         print(text_table(bench.bench_table(rows)))

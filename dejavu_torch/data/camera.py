@@ -180,7 +180,5 @@ def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> 
 def shots_of(traverse: Traverse) -> Iterator[Shot]:
     """The frames of a traverse one by one, those of a video with their times."""
     time_of = getattr(traverse, "frame_time", None)
-    number = 0
-    for batch in traverse.batches(1):
-        yield Shot(number, math.nan if time_of is None else time_of(number), batch[0])
-        number += 1
+    for i, batch in enumerate(traverse.batches(1)):
+        yield Shot(i, math.nan if time_of is None else time_of(i), batch[0])
