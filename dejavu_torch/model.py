@@ -383,7 +383,7 @@ class DejaVu(nn.Module):
         """
         self._require_map()
         threshold = self.threshold_of(sequence)
-        for part in self._found(descriptors, Matching(sequence), look=look):
+        for part in self._found(descriptors, Matching(sequence, look=look)):
             yield part.match(threshold)
 
     def candidates(
@@ -448,29 +448,21 @@ class DejaVu(nn.Module):
         return self.threshold if sequence is None else sequence.threshold_of(self.threshold)
 
     def _found(
-        self,
-        batches: Iterable[Tensor],
-        matching: Matching,
-        order: Tensor | None = None,
-        look: Callable[[Tensor], None] | None = None,
+        self, batches: Iterable[Tensor], matching: Matching, order: Tensor | None = None
     ) -> Iterator[Found]:
         """What a matching finds of batches of descriptors, as many queries at a time as memory allows.
 
         Args:
-            order: as of `localize_descriptors`. look: as of `matches_of`.
+            order: as of `localize_descriptors`.
         """
         if matching.sequence is not None:
             matching.sequence.check(None, self.map.places)
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         parts = (part for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence
-        scores: Iterator[Tensor]
         if sequence is not None and not matching.lengths and order is None:  # not all scores may be needed
-            matching, scores = matching._replace(sequence=None), self.map.sequences(parts, sequence)
-        else:
-            scores = map(self.map.scores, parts)
-        if look is not None:
-            scores = _shown(scores, look)
+            return matching._replace(sequence=None).stream(self.map.sequences(parts, sequence))
+        scores: Iterator[Tensor] = map(self.map.scores, parts)
         if order is not None:
             place = order.argsort()
             scores = (part[:, place.to(part.device)] for part in scores)
@@ -625,12 +617,6 @@ def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tenso
         shown = places[done : done + len(batch)]
         yield batch[shown >= 0], shown[shown >= 0]
         done += len(batch)
-
-
-def _shown(batches: Iterable[Tensor], look: Callable[[Tensor], None]) -> Iterator[Tensor]:
-    for scores in batches:
-        look(scores)
-        yield scores
 
 
 def _bytes_of(names: list[str]) -> int:

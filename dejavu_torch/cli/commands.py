@@ -436,13 +436,13 @@ def run_bench(
         note = "peak: beyond that of the programs loaded"
     elif what == "live":
         print(text_table(live_speed.live_table(live_speed.run_live(out))))
-        note = "found: within 5 places; each part alone, in milliseconds"
+        note = "found: within 5 places; decoding and what follows: each alone, in milliseconds"
     else:
         rows = bench.run_bench(what, out)
         print(text_table(bench.bench_table(rows)))
         note = "x ours: seconds / those of the fastest dejavu"
-    if any("No module" in (row.skipped or "") for row in rows):
-        print("what is skipped needs pip install '.[bench]'")
+        if any("No module" in (row.skipped or "") for row in rows):
+            print("what is skipped needs pip install '.[bench]'")
     _say(f"{note}; next: open {out / 'bench.png'}")
 
 

@@ -164,6 +164,7 @@ def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> 
         torch.Size([1, 3, 480, 640])
     """
     kind = str(getattr(frame, "dtype", type(frame).__name__)).removeprefix("torch.")
+    kind = frame.dtype.name if isinstance(frame, np.ndarray) else kind  # whatever its byte order
     shape = tuple(getattr(frame, "shape", ()))
     pixels = kind == "uint8"
     floats = kind in ("float16", "bfloat16", "float32", "float64")

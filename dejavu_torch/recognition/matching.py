@@ -47,12 +47,14 @@ class Matching(NamedTuple):
     lengths: each T that is matched beside that by a `SequenceMatcher`, at the speeds of `sequence` if that is
         one; only where there is a sequence.
     ranks: candidates of a query. apart: places, any two of them differ by more.
+    look: is given the scores (B,N) that places are found by, as for a picture.
     """
 
     sequence: SequenceModel | None = None
     lengths: tuple[int, ...] = ()
     ranks: int = 1
     apart: int = 0
+    look: Callable[[Tensor], None] | None = None
 
     @property
     def single(self) -> bool:
@@ -76,6 +78,8 @@ class Matching(NamedTuple):
             small = (part for scores in batches for part in scores.split(max(1, AT_ONCE // scores.shape[1])))
             parts = _beside(self.sequence, small, sorted(self.lengths))
         for scores, sums in parts:
+            if self.look is not None:
+                self.look(scores)
             candidates = best_candidates(scores, self.ranks, self.apart)
             yield Found(
                 Candidates(*(column.cpu() for column in candidates)),
