@@ -218,7 +218,7 @@ class DejaVu(nn.Module):
             batches = self._features(second.traverse, progress and "whitening")
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
-        return concatenate(self.whitened(part) for part in features.split(ROWS))
+        return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
 
     def views(self, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
         """Another traverse of the reference's places, for `learn`; resampled where the reference is.
@@ -458,7 +458,8 @@ class DejaVu(nn.Module):
         if matching.sequence is not None:
             matching.sequence.check(None, self.map.places)
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
-        parts = (part for descriptors in batches for part in descriptors.split(at_once))
+        device = self.map.positions.device  # many descriptors lie in a file
+        parts = (part.to(device) for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence
         if sequence is not None and not matching.lengths and order is None:  # not all scores may be needed
             return matching._replace(sequence=None).stream(self.map.sequences(parts, sequence))

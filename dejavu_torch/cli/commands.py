@@ -86,9 +86,9 @@ def run_learn(
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
-        device: what computes: cpu, cuda, cuda:1 or mps
+        device: what learns: cpu, cuda or cuda:1
     """
-    model.to(device_of(device))
+    model.to(device_of(device, learns=True))
     if map.suffix != ".safetensors":
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
@@ -138,7 +138,7 @@ def run_localize(
             --threshold are -log probability, and what is more likely than not is accepted
         moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
             if not given
-        device: as of `dejavu learn`
+        device: what computes: cpu, cuda, cuda:1 or mps
         features: class of the map's features, if not ours
     """
     where = device_of(device)
@@ -214,7 +214,7 @@ def run_live(
         realtime: take the frames of a video at their times, and drop those that come too fast
         timeout: seconds without a frame after which a camera, address or pipe has stalled
         as_is: take the frames as they are, though the map's are resampled
-        device: as of `dejavu learn`
+        device: as of `dejavu localize`
         features: class of the map's features, if not ours
     """
     from dejavu_torch.cli.live import follow
@@ -276,12 +276,12 @@ def run_compare(
         filter: as of `dejavu localize`
         moves: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
-        device: as of `dejavu learn`
+        device: what learns and localizes: cpu, cuda or cuda:1. Baselines and null are computed by the cpu
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
 
-    where = device_of(device)
+    where = device_of(device, learns=map is None)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
     if filter:
         model.threshold = None  # of distances: that of the filter is none for the map to keep

@@ -7,11 +7,12 @@ import torch
 from dejavu_torch.types import InputError
 
 
-def device_of(name: str) -> torch.device:
+def device_of(name: str, learns: bool = False) -> torch.device:
     """The device of that name.
 
     Args:
         name: cpu, cuda, cuda:N or mps.
+        learns: whether it is to learn, which takes double precision.
 
     Raises:
         InputError: another name, or a device that this machine does not have.
@@ -32,4 +33,6 @@ def device_of(name: str) -> torch.device:
         raise InputError(f"--device {name} is not there; expected {there}, which this machine has")
     if device.type == "mps" and not torch.backends.mps.is_available():
         raise InputError("--device mps is not there; expected cpu, which this machine has")
+    if device.type == "mps" and learns:
+        raise InputError("--device mps has no double precision, which learning takes; expected cpu or cuda")
     return device

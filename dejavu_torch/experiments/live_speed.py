@@ -38,10 +38,10 @@ WARM = 10  # frames ahead of those that are timed
 class LiveRow(NamedTuple):
     """What frames took, one by one.
 
-    case: camera, map's frames, places. seconds: of a decoded frame's way to its place, the median; seconds_p99:
-    the longest but for 1 %. rate: frames a second from the file to the place, decoding beside it. dropped: of
-    the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of decoding, features,
-    whitening, scores and filter, each alone, the median.
+    case: camera, map's frames, places. seconds: of a decoded frame's way to its place, the median;
+    seconds_p99: the longest but for 1 %. rate: frames a second from the file to the place, decoding beside
+    it. dropped: of the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of
+    decoding, features, whitening, scores and filter, each alone, the median.
     """
 
     case: str

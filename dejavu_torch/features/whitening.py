@@ -270,7 +270,8 @@ class Whitening(nn.Module):
             if views is not None:
                 log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
             kept = rank
-        basis = basis[:, :rank]
+        # many descriptors lie in a file, wherever the model is
+        mean, basis, variances = (one.to(self.scale.device) for one in (mean, basis[:, :rank], variances))
         if views is None:
             self._store(mean, basis[:, :kept], variances[:kept].sum().sqrt())
             return
@@ -284,7 +285,9 @@ class Whitening(nn.Module):
         if not pairs:
             raise InputError("there are no views to whiten with; expected some, or None for none")
         shown = torch.cat([place for _, place in pairs])
-        own = torch.cat([(places[part].to(mean) - mean) @ basis for part in shown.split(ROWS)])
+        own = torch.cat(
+            [(places[part.to(places.device)].to(mean) - mean) @ basis for part in shown.split(ROWS)]
+        )
         centre, projection = learned_whitening(
             torch.cat([view for view, _ in pairs]), own, kept, self.shrinkage
         )
