@@ -1,7 +1,11 @@
-"""Video files that tests write, and which of their frames is which."""
+"""Video files and streams that tests write, and which of their frames is which."""
 
 from __future__ import annotations
 
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 
@@ -51,3 +55,24 @@ def clip(
 def numbers(frames: Tensor) -> list[int]:
     """Which of `pictures` each frame is."""
     return (frames[:, :, 4:-4, 4:16].mean((1, 2, 3)) * 255 / 8).round().int().tolist()
+
+
+@contextmanager
+def piped(folder: Path, data: bytes, open_for: float = 0) -> Iterator[str]:
+    """A named pipe that gives these bytes, once, and stays open for so many seconds."""
+    path, done = folder / "pipe", threading.Event()
+    os.mkfifo(path)
+
+    def write() -> None:
+        with suppress(BrokenPipeError), path.open("wb") as pipe:
+            pipe.write(data)
+            pipe.flush()
+            done.wait(open_for)
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    try:
+        yield str(path)
+    finally:
+        done.set()
+        writer.join(5)

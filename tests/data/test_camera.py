@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import refused
-from videos import H264, clip, numbers, pictures
+from videos import H264, clip, numbers, pictures, piped
 
 from dejavu_torch import open_source
 from dejavu_torch.data.camera import Camera, is_stream, shots_of
@@ -27,22 +27,6 @@ FRAMES = pictures(12)
 def stream(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A stream of MPEG, which can begin and end anywhere."""
     return clip(tmp_path_factory.mktemp("stream") / "clip.ts", FRAMES, **H264).read_bytes()  # type: ignore[arg-type]
-
-
-@contextmanager
-def piped(folder: Path, data: bytes) -> Iterator[str]:
-    """A named pipe that gives these bytes, once."""
-    path = folder / "pipe"
-    os.mkfifo(path)
-
-    def write() -> None:
-        with path.open("wb") as pipe:
-            pipe.write(data)
-
-    writer = threading.Thread(target=write, daemon=True)
-    writer.start()
-    yield str(path)
-    writer.join(5)
 
 
 @contextmanager
