@@ -276,7 +276,7 @@ def run_compare(
         filter: as of `dejavu localize`
         moves: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
-        device: what learns and localizes: cpu, cuda or cuda:1. Baselines and null are computed by the cpu
+        device: as of `dejavu learn`
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
