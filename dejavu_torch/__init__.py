@@ -23,6 +23,7 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     V      (ours) beside baselines and nulls     compare             experiments.compare
     VI     (ours) several queries one by one     SequenceMatcher     recognition.sequence
     VI     (ours) probabilities on the way        PlaceFilter         recognition.filter
+    VI     (ours) frames as they come            LiveLocalizer       live.localizer
     VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
            frames to train on                    RouteData           training.datamodule
            any backbone                          Embedding           features.embedding
@@ -36,7 +37,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dejavu_torch.data.source import open_source
-    from dejavu_torch.data.strip import SlidingWindow
     from dejavu_torch.database.distance import phase_distances
     from dejavu_torch.database.place_map import PlaceMap
     from dejavu_torch.database.spectral import SpectralMapper
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from dejavu_torch.features.hog import HOG, hog
     from dejavu_torch.features.preprocess import Preprocess
     from dejavu_torch.features.whitening import Whitening
+    from dejavu_torch.live.localizer import LiveLocalizer
     from dejavu_torch.model import DejaVu
     from dejavu_torch.motion.odometry import GroundOdometry
     from dejavu_torch.periods.imposed import ImposedPeriods
@@ -69,6 +70,7 @@ __all__ = [
     "GroundOdometry",
     "ImposedPeriods",
     "InputError",
+    "LiveLocalizer",
     "Match",
     "PhaseTemplates",
     "PlaceFilter",
@@ -77,7 +79,6 @@ __all__ = [
     "Preprocess",
     "RouteData",
     "SequenceMatcher",
-    "SlidingWindow",
     "SpectralMapper",
     "SpectrogramAnalysis",
     "TemplateMap",
@@ -103,6 +104,7 @@ _HOMES = {
     "HOG": "features.hog",
     "ImposedPeriods": "periods.imposed",
     "InputError": "types",
+    "LiveLocalizer": "live.localizer",
     "Match": "types",
     "PhaseTemplates": "database.templates",
     "PlaceFilter": "recognition.filter",
@@ -111,7 +113,6 @@ _HOMES = {
     "Preprocess": "features.preprocess",
     "RouteData": "training.datamodule",
     "SequenceMatcher": "recognition.sequence",
-    "SlidingWindow": "data.strip",
     "SpectralMapper": "database.spectral",
     "SpectrogramAnalysis": "periods.spectrogram",
     "TemplateMap": "database.template_map",

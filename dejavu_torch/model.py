@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -233,7 +233,7 @@ class DejaVu(nn.Module):
             batches = self._features(second.traverse, progress and "whitening")
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
-        return concatenate(self.whitened(part) for part in features.split(ROWS))
+        return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
 
     def views(self, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
         """Another traverse of the reference's places, for `learn`; resampled where the reference is.
@@ -442,9 +442,23 @@ class DejaVu(nn.Module):
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
+        yield from self.matches_of(self._checked(queries, progress, sequence), sequence)
+
+    def matches_of(
+        self,
+        descriptors: Iterable[Tensor],
+        sequence: SequenceModel | None = None,
+        look: Callable[[Tensor], None] | None = None,
+    ) -> Iterator[Match]:
+        """As `matches`, of batches of descriptors (B,K); each is asked for when its match is.
+
+        Args:
+            look: is given the scores (B,N) of each batch, as for a picture.
+        """
+        self._require_map()
         self.check_precision(sequence)
         threshold, matching = self.threshold_of(sequence), self.matching(sequence)
-        for part in self._found(self._checked(queries, progress, sequence), matching):
+        for part in self._found(descriptors, matching._replace(look=look)):
             yield part.match(threshold, self.precision)
 
     def candidates(
@@ -538,7 +552,8 @@ class DejaVu(nn.Module):
         if matching.sequence is not None:
             matching.sequence.check(None, self.map.places)
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
-        parts = (part for descriptors in batches for part in descriptors.split(at_once))
+        device = self.map.positions.device  # many descriptors lie in a file
+        parts = (part.to(device) for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence
         alone = not matching.lengths and matching.platt is None and order is None
         if sequence is not None and alone:  # not all scores may be needed

@@ -22,6 +22,7 @@ ORDER = [
     {"recognition"},
     {"motion"},
     {"model"},
+    {"live"},
     {"evaluation"},
     {"training"},
     {"experiments"},
@@ -41,10 +42,11 @@ ARROWS = {
     "recognition": "types",
     "motion": "data memory types",
     "model": "types text data features periods database recognition motion",
+    "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
-    "experiments": "types text data features periods database recognition motion model evaluation",
-    "cli": "types text data features periods database recognition motion model evaluation training "
+    "experiments": "types text data features periods database recognition motion model live evaluation",
+    "cli": "types text data features periods database recognition motion model live evaluation training "
     "experiments",
 }
 

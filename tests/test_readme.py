@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from dejavu_torch import DejaVu, ImposedPeriods, PlaceFilter, TemplateMapper
-from dejavu_torch.cli import commands, train
+from dejavu_torch.cli import _spelt_out, commands, train
 from dejavu_torch.cli.parser import UsageError, command_parser, without_whitening_map
 from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features.cnn import SmallCNN
@@ -23,6 +24,7 @@ ROUTES = (ROOT / "docs" / "real_routes.md").read_text()
 SPECTRAL = (ROOT / "docs" / "spectral_maps.md").read_text()
 SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
 STORAGE = (ROOT / "docs" / "storage.md").read_text()
+LIVE = (ROOT / "docs" / "live.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 OPTIONS = [
     option
@@ -75,7 +77,7 @@ def understand(line: str) -> None:
     _, name, *words = shlex.split(line, comments=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)  # where the configs lie
-        words = with_configs(words)
+        words = _spelt_out(with_configs(words))
         if name != "train":
             words, _ = without_whitening_map(words)
             command_parser(name, getattr(commands, f"run_{name}")).parse_args(words)
@@ -87,8 +89,8 @@ def understand(line: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE],
-    ids=["README", "training", "real_routes", "spectral_maps", "sequences", "storage"],
+    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE, LIVE],
+    ids=["README", "training", "real_routes", "spectral_maps", "sequences", "storage", "live"],
 )
 def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
@@ -184,3 +186,22 @@ def test_a_filter_is_learned_as_the_documentation_shows() -> None:
     right = [float((one.posterior(scores)[:, :-1] * near).sum(1).log().mean()) for one in (fresh, learned)]
     assert right[1] > right[0]
     assert (space["match"].index - torch.arange(60)).abs().median() <= 5
+
+
+def test_live_in_python_as_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    (shown,) = re.findall(r"```python\n(.*?)```", LIVE, re.DOTALL)
+    assert shown.count("frames=256") == 2
+    space: dict[str, Any] = {}
+    exec(shown.replace("frames=256", "frames=64"), space)
+    assert capsys.readouterr().out == f"{space['match'].place} True\n"
+    assert abs(space["match"].place - 63) <= 5
+
+
+def test_the_line_of_json_shown_has_the_keys_of_those_printed() -> None:
+    from dejavu_torch.cli.live import line_of
+    from dejavu_torch.data.camera import Shot
+    from dejavu_torch.live.localizer import LiveMatch
+
+    (shown,) = re.findall(r"```json\n(.*?)```", LIVE, re.DOTALL)
+    printed = line_of(Shot(0, 0.0, torch.zeros(1, 1, 1)), LiveMatch(0, 0, "", 0.0, 1.0, True, 1.0))
+    assert list(json.loads(shown)) == list(json.loads(printed))

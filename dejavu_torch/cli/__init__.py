@@ -16,6 +16,7 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "demo": "learn the built-in route, localize a second traverse of it, report",
     "learn": "learn a map",
     "localize": "find the frames of a source on a map",
+    "live": "find the frames of a camera on a map, one by one",
     "compare": "learn, localize and evaluate, beside baselines and null control",
     "evaluate": "evaluate the matches in a csv, whatever found them",
     "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
@@ -24,6 +25,7 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "export": "write a map, and what is ahead of it, as an ONNX file",
     "info": "what is in a map",
 }
+BARE = {"--velocity": "GroundOdometry", "--page": "8765"}  # what an option without a value means
 LONGEST = 300  # characters of a message of torch's
 
 
@@ -149,10 +151,10 @@ def overview(word: str) -> NoReturn:
 
 
 def _spelt_out(words: Sequence[str]) -> list[str]:
-    """The command line with a bare --velocity given the one value it can have, and the options of a template
-    mapper's periods the class that they are of, where nothing else says it."""
+    """The command line with a bare --velocity given the one value it can have, a bare --page its port, and
+    the options of a template mapper's periods the class that they are of, where nothing else says it."""
     spelt = [
-        "--velocity=GroundOdometry" if word == "--velocity" and after.startswith("--") else word
+        f"{word}={BARE[word]}" if word in BARE and after.startswith("--") else word
         for word, after in pairwise([*words, "--"])
     ]
     named = any(word.partition("=")[0] in ("--config", "--mapper.periods") for word in words)

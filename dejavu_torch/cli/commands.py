@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
+from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of
@@ -85,6 +86,7 @@ def run_learn(
     second_truth: str | None = None,
     calibration: str | None = None,
     calibration_truth: str | None = None,
+    device: str = "cpu",
     model: DejaVu,
     command: str,
 ) -> None:
@@ -100,7 +102,9 @@ def run_learn(
         calibration: another traverse of the same places, which tells how probably answers are right; changed
             frames of the route itself if not given, none if "none"
         calibration_truth: which places it shows, as --truth
+        device: what learns: cpu, cuda or cuda:1
     """
+    model.to(device_of(device, learns=True))
     if map.suffix != ".safetensors":
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
@@ -139,6 +143,7 @@ def run_localize(
     speeds: list[float] | None = None,
     filter: bool = False,
     moves: list[float] | None = None,
+    device: str = "cpu",
     features: nn.Module | None = None,
 ) -> None:
     """Find the frames of a source on a map.
@@ -158,11 +163,13 @@ def run_localize(
             --threshold are -log probability, and what is more likely than not is accepted
         moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
             if not given
+        device: what computes: cpu, cuda, cuda:1 or mps
         features: class of the map's features, if not ours
     """
+    where = device_of(device)
     check_output_file(out)
     check_not_read(out, map, source)
-    model = DejaVu.load(map, features)
+    model = DejaVu.load(map, features).to(where)
     if corners is not None:
         if as_is or model.velocity is None or model.step is None:
             why = "--as_is measures no ground" if as_is else f"{map} was learned without --velocity"
@@ -200,6 +207,63 @@ def run_localize(
     _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
 
+def run_live(
+    map: Path,
+    source: str,
+    *,
+    filter: bool = False,
+    sequence: int | None = None,
+    speeds: list[float] | None = None,
+    moves: list[float] | None = None,
+    threshold: float | None = None,
+    page: int | None = None,
+    reference: str | None = None,
+    realtime: bool = False,
+    timeout: float = 10.0,
+    as_is: bool = False,
+    device: str = "cpu",
+    features: nn.Module | None = None,
+) -> None:
+    """Find frames as they come: a line of JSON for each on stdout, a summary on stderr at the end.
+
+    Frames of cameras, addresses, pipes, videos and folders are brought to the size of the map's frames.
+
+    Args:
+        map: map file
+        source: a camera (/dev/video0), an address (rtsp://host/path), a named pipe, - for standard input, or
+            a source as of `dejavu learn`. Of cameras, addresses and pipes the newest frame is taken, and
+            those that came while the one before was being found are dropped; of a file none is
+        filter: the most probable place given all frames so far, as of `dejavu localize`; the default
+        sequence: frames that are matched together in place of the filter; 1 takes each by itself
+        speeds: as of `dejavu localize`
+        moves: as of `dejavu localize`
+        threshold: accept a match whose score is below
+        page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
+            for any that is free
+        reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
+        realtime: take the frames of a video at their times, and drop those that come too fast
+        timeout: seconds without a frame after which a camera, address or pipe has stalled
+        as_is: take the frames as they are, though the map's are resampled
+        device: as of `dejavu localize`
+        features: class of the map's features, if not ours
+    """
+    from dejavu_torch.cli.live import follow
+
+    where = device_of(device)
+    if reference is not None and page is None:
+        raise InputError(f"--reference {reference} without --page; expected both")
+    if not timeout > 0:
+        raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
+    model = DejaVu.load(map, features).to(where)
+    if as_is:
+        model.velocity = None
+    model.threshold = model.threshold if threshold is None else threshold
+    if sequence is None:
+        filter = True
+    matcher = _sequence_of(1 if sequence is None else sequence, speeds, filter, moves, APART, threshold)
+    follow(model, matcher, source, f"{source} on {map}", page, reference, realtime, timeout)
+
+
 def run_compare(
     reference: str,
     query: str,
@@ -221,6 +285,7 @@ def run_compare(
     calibration: str | None = None,
     calibration_truth: str | None = None,
     distractors: list[str] | str | None = None,
+    device: str = "cpu",
     model: DejaVu,
     command: str,
 ) -> None:
@@ -247,10 +312,12 @@ def run_compare(
         calibration: as of `dejavu learn`; a third traverse
         calibration_truth: which places it shows, as --truth
         distractors: another route, or a list of several, '[A,B]': how many of its frames are accepted
+        device: as of `dejavu learn`
     """
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.hog import HOG
 
+    where = device_of(device, learns=map is None)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
     if filter:
         model.threshold = None  # of distances: that of the filter is none for the map to keep
@@ -258,6 +325,7 @@ def run_compare(
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
         _accept_by(model, given.threshold, given.precision)
+    model.to(where)
     first, queries = open_source(reference), open_source(query)
     _check_report_folder(out, COMPARED, [reference, query, second], [truth, second_truth])
     others = [distractors] if isinstance(distractors, str) else distractors or []
@@ -379,8 +447,8 @@ def run_bench(
     """Set this package beside what a user would pick instead: its speed, memory, or accuracy over bytes.
 
     Args:
-        what: matcher (time of HOG, L1 distances, sequences, filters), memory (of learning and localizing) or
-            storage (accuracy over bytes)
+        what: matcher (time of HOG, L1 distances, sequences, filters), live (time of single frames on 100000
+            places), memory (of learning and localizing) or storage (accuracy over bytes)
         sources: of storage, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
@@ -390,7 +458,7 @@ def run_bench(
             that are learned; 1000, 10000 and 50000 if not given
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench, footprint, frontier
+    from dejavu_torch.experiments import bench, footprint, frontier, live_speed
 
     for file in (out, out / "bench.json", out / "bench.png"):
         check_not_read(file, *sources, codebooks)
@@ -403,7 +471,7 @@ def run_bench(
             _say(line)
         _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
-    known = what in bench.BENCHES or what == "memory"
+    known = what in bench.BENCHES or what in ("memory", "live")
     if known and (sources or map or codebooks or whitening or (places and what != "memory")):
         raise InputError(
             f"bench {what} takes no sources, maps, codebooks, whitening or places; bench storage does"
@@ -412,12 +480,15 @@ def run_bench(
         rows = footprint.run_memory(out, places)
         print(text_table(footprint.memory_table(rows)))
         note = "peak: beyond that of the programs loaded"
+    elif what == "live":
+        print(text_table(live_speed.live_table(live_speed.run_live(out))))
+        note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
     else:
         rows = bench.run_bench(what, out)
         print(text_table(bench.bench_table(rows)))
         note = "x ours: seconds / those of the fastest dejavu"
-    if any("No module" in (row.skipped or "") for row in rows):
-        print("what is skipped needs pip install '.[bench,export]'")
+        if any("No module" in (row.skipped or "") for row in rows):
+            print("what is skipped needs pip install '.[bench,export]'")
     _say(f"{note}; next: open {out / 'bench.png'}")
 
 

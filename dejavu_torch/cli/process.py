@@ -57,6 +57,13 @@ def take_over() -> None:
             setattr(sys, name, io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=lines))
 
 
+def reader_left() -> bool:
+    """Whether nobody reads what is printed any more, as behind `| head`; what is printed is sent first."""
+    sys.stdout.flush()
+    raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
+    return isinstance(getattr(raw, "problem", None), BrokenPipeError)
+
+
 def output_problem() -> str | None:
     """Why what was printed did not arrive, where it is not that nobody reads on."""
     sys.stdout.flush()

@@ -103,10 +103,14 @@ class Video(Traverse):
 
     def frame_name(self, i: int) -> str:
         """The time of frame i, such as 0:01:23.480; "" where the file has none."""
+        seconds = self.frame_time(i)
+        return clock_time(seconds) if math.isfinite(seconds) else ""
+
+    def frame_time(self, i: int) -> float:
+        """The time of frame i in seconds; NaN where the file has none."""
         if not self._complete and i >= len(self._seconds):
             self._read_times()
-        seconds = self._seconds[i]
-        return clock_time(seconds) if math.isfinite(seconds) else ""
+        return self._seconds[i]
 
     @property
     def times(self) -> Tensor:
@@ -186,19 +190,8 @@ class Video(Traverse):
 
     def _pixels(self, frame: VideoFrame) -> np.ndarray:
         """One frame, upright and resized, (H,W,3) uint8."""
-        from av.video.reformatter import Interpolation as How
-
-        # full chroma, or colours are averaged over pairs of columns of the result as well
-        how = int(How.AREA | How.FULL_CHR_H_INT | How.FULL_CHR_H_INP)
-        turns = round(frame.rotation / 90) % 4  # quarters, counterclockwise
-        w, h = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
-        height, width = fitted_size(self.path, h, w, self.width, self.height)
-        if turns % 2:
-            width, height = height, width
-        check_pixels(self.path, height, width, MOST_PIXELS)
-        with reading(self.path, f"cannot be resized to {height} x {width} pixels", "less"):
-            pixels = frame.reformat(width, height, "rgb24", interpolation=how).to_ndarray()
-        return np.rot90(pixels, turns)
+        with reading(self.path, f"cannot be resized to {self.height} x {self.width} pixels", "less"):
+            return pixels_of(frame, self.path, self.width, self.height)
 
     @contextmanager
     def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
@@ -226,6 +219,21 @@ class Video(Traverse):
 
     def _broken(self, frame: int, why: str) -> InputError:
         return InputError(f"{self.name} is broken near frame {frame}: {why}; expected a whole video file")
+
+
+def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) -> np.ndarray:
+    """A decoded frame, upright and resized as by `fitted_size`: (H,W,3) uint8; `path` is for messages."""
+    from av.video.reformatter import Interpolation as How
+
+    # full chroma, or colours are averaged over pairs of columns of the result as well
+    how = int(How.AREA | How.FULL_CHR_H_INT | How.FULL_CHR_H_INP)
+    turns = round(frame.rotation / 90) % 4  # quarters, counterclockwise
+    w, h = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
+    height, width = fitted_size(path, h, w, width, height)
+    if turns % 2:
+        width, height = height, width
+    check_pixels(path, height, width, MOST_PIXELS)
+    return np.rot90(frame.reformat(width, height, "rgb24", interpolation=how).to_ndarray(), turns)
 
 
 def _seconds(stamp: int | None, base: Fraction | float) -> float:

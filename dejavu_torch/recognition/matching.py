@@ -58,6 +58,7 @@ class Matching(NamedTuple):
         one; only where there is a sequence.
     ranks: candidates of a query. apart: places, any two of them differ by more.
     platt: makes probabilities of how single queries stand out, or the track of a filter; None makes none.
+    look: is given the scores (B,N) that places are found by, as for a picture.
     """
 
     sequence: SequenceModel | None = None
@@ -65,6 +66,7 @@ class Matching(NamedTuple):
     ranks: int = 1
     apart: int = 0
     platt: Platt | None = None
+    look: Callable[[Tensor], None] | None = None
 
     @property
     def single(self) -> bool:
@@ -84,6 +86,8 @@ class Matching(NamedTuple):
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Found]:
         """As `found`, a part of the queries at a time, on the CPU and without gradients."""
         for scores, sums, evidence in self._parts(batches):
+            if self.look is not None:
+                self.look(scores)
             candidates = best_candidates(scores, self.ranks, self.apart)
             yield Found(
                 Candidates(*(column.cpu() for column in candidates)),

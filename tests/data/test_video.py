@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 import torch
 from helpers import all_of, refused
-from torch import Tensor
 from torch.nn.functional import avg_pool2d
+from videos import H264, clip, numbers, pictures
 
 from dejavu_torch.data import video as video_module
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.data.video import Video
 
-H264 = {"codec": "libx264", "pixels": "yuv420p"}
 MJPEG = {"codec": "mjpeg", "pixels": "yuvj420p"}
 MPEG4 = {"codec": "mpeg4", "pixels": "yuv420p", "bframes": 2}
 FFV1 = {"codec": "ffv1", "pixels": "bgr0"}
@@ -37,47 +36,6 @@ KINDS = {
     "ffv1.avi": FFV1,
 }
 FRONT = {"movflags": "faststart"}  # the table of contents first, so that a cut leaves it whole
-
-
-def pictures(n: int, height: int = 32, width: int = 48) -> np.ndarray:
-    """(n,H,W,3): frame i has grey level 8 * i on its left half, noise of its own on the right one."""
-    frames = np.random.default_rng(0).integers(0, 256, (n, height, width, 3), np.uint8)
-    frames[:, :, : width // 2] = 8 * np.arange(n, dtype=np.uint8)[:, None, None, None]
-    return frames
-
-
-def clip(
-    path: Path,
-    frames: np.ndarray,
-    codec: str = "ffv1",
-    pixels: str = "bgr0",
-    ticks: list[int] | None = None,
-    bframes: int | None = None,
-    turn: int | None = None,
-    options: dict[str, str] | None = None,
-    base: Fraction = Fraction(1, 25),
-) -> Path:
-    """Write frames at 25 per second, or at the given multiples of the time base."""
-    with av.open(str(path), "w", options=options or {}) as container:
-        stream = container.add_stream(codec, rate=25)
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt, stream.bit_rate = pixels, 4_000_000
-        stream.codec_context.time_base = base
-        if bframes is not None:
-            stream.codec_context.max_b_frames = bframes
-        if turn is not None:
-            stream.set_display_rotation(turn)
-        for i, pixel in enumerate(frames):
-            frame = av.VideoFrame.from_ndarray(pixel, "rgb24")
-            frame.pts, frame.time_base = i if ticks is None else ticks[i], base
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
-
-
-def numbers(frames: Tensor) -> list[int]:
-    """Which of `pictures` each frame is."""
-    return (frames[:, :, 4:-4, 4:16].mean((1, 2, 3)) * 255 / 8).round().int().tolist()
 
 
 @pytest.mark.parametrize("name", ["a.mkv", "a.avi", "with space: 100%d?.MKV", "12:30.mkv"])

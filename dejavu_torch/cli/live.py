@@ -1,0 +1,154 @@
+"""What `dejavu live` does: frames in, lines of JSON out, and a page beside them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import sys
+from collections import deque
+from collections.abc import Iterable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import numpy as np
+
+from dejavu_torch.cli.process import interrupts_raise, reader_left
+from dejavu_torch.data.camera import Camera, Shot, is_stream, shots_of, stretched
+from dejavu_torch.data.source import open_source
+from dejavu_torch.data.video import SUFFIXES, Video
+from dejavu_torch.live.feed import Feed, in_real_time
+from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
+from dejavu_torch.live.page import Moment, Page, ReferencePictures
+from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.text import printable
+from dejavu_torch.types import InputError, SequenceModel
+
+RECENT = 10_000  # answers whose milliseconds are kept
+
+log = logging.getLogger("dejavu_torch")
+
+
+def follow(
+    model: DejaVu,
+    sequence: SequenceModel | None,
+    source: str,
+    title: str,
+    port: int | None = None,
+    reference: str | None = None,
+    realtime: bool = False,
+    timeout: float = 10.0,
+) -> None:
+    """Localize the frames of a source until it ends or Ctrl-C; see `run_live`.
+
+    Raises:
+        InputError: what is wrong with the source, behind the lines and the summary of what came before.
+    """
+    localizer = LiveLocalizer(model, sequence)
+    shots, newest, name = shots_from(source, model, realtime)
+    taken = Timings()
+    with ExitStack() as stack:
+        page = None
+        if port is not None:
+            pictures = None
+            if reference is not None:
+                frames = len(model.map.positions) or model.map.places
+                pictures = ReferencePictures(open_source(reference), frames)
+            page = stack.enter_context(Page(port, title, pictures))
+            _tell(f"the page is at {page.url}")
+        feed = stack.enter_context(Feed(shots, newest, timeout if is_stream(source) else None, name))
+        try:
+            with interrupts_raise(), suppress(KeyboardInterrupt):
+                latest = -1
+                for shot in feed:
+                    match = localizer(shot.pixels, shot.number - latest - 1)
+                    latest = shot.number
+                    taken.add(match.milliseconds)
+                    print(line_of(shot, match))
+                    if reader_left():
+                        break
+                    if page is not None and localizer.scores is not None:
+                        posterior = isinstance(sequence, PlaceFilter)
+                        counts = (taken.frames, feed.dropped, *taken.percentiles())
+                        page.show(Moment(shot, match, localizer.scores, posterior, *counts))
+        finally:
+            if taken.frames:
+                p50, p99 = taken.percentiles()
+                times = f"milliseconds a frame: p50 {p50:.1f}, p99 {p99:.1f}"
+                _tell(f"{taken.frames} frames, {feed.dropped} dropped; {times}")
+
+
+def shots_from(source: str, model: DejaVu, realtime: bool) -> tuple[Iterable[Shot], bool, str]:
+    """What a source gives, whether only its newest frame counts, and its name."""
+    shape = model.frame_shape
+    size = (shape[1], shape[2]) if shape is not None and len(shape) == 3 else None
+    if is_stream(source):
+        if realtime:
+            raise InputError(f"--realtime: {source} has its own time; expected a video file with it")
+        camera = Camera(source, size)
+        return _noted(camera), True, camera.name
+    traverse = open_source(source)
+    path = Path(source)
+    if size is not None and (path.is_dir() or path.suffix.lower() in SUFFIXES):  # and no options of its own
+        own = traverse.frame_shape
+        if own[1:] != size:
+            note = stretched(traverse.name, (own[1], own[2]), size)
+            if note:
+                log.warning("%s", note)
+            traverse = open_source(f"{source}?width={size[1]}&height={size[0]}")
+    if realtime and not isinstance(traverse, Video):
+        raise InputError(f"--realtime: {traverse.name} has no times; expected a video file with it")
+    shots = shots_of(traverse)
+    return (in_real_time(shots, traverse.name) if realtime else shots), realtime, traverse.name
+
+
+def _noted(camera: Camera) -> Iterable[Shot]:
+    for shot in camera:
+        if camera.note and not shot.number:
+            log.warning("%s", camera.note)
+        yield shot
+
+
+def line_of(shot: Shot, match: LiveMatch) -> str:
+    """An answer as a line of JSON."""
+    facts = {
+        "frame": shot.number,
+        "time": shot.seconds,
+        "place": match.place,
+        "reference_frame": match.frame,
+        "name": match.name,
+        "score": match.score,
+        "posterior": match.posterior,
+        "accepted": match.accepted,
+        "milliseconds": round(match.milliseconds, 3),
+    }
+    known = {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in facts.items()
+    }
+    return json.dumps(known)
+
+
+class Timings:
+    """Milliseconds of the latest answers, and how many there were."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self._recent: deque[float] = deque(maxlen=RECENT)
+
+    def add(self, milliseconds: float) -> None:
+        """Those of one more answer."""
+        self._recent.append(milliseconds)
+        self.frames += 1
+
+    def percentiles(self) -> tuple[float, float]:
+        """p50 and p99; NaN ahead of the first answer."""
+        if not self._recent:
+            return math.nan, math.nan
+        p50, p99 = np.percentile(np.fromiter(self._recent, float), (50, 99))
+        return float(p50), float(p99)
+
+
+def _tell(text: str) -> None:
+    print(f"dejavu: {printable(text)}", file=sys.stderr, flush=True)

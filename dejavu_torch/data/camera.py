@@ -1,0 +1,184 @@
+"""Frames of a camera, an address or a pipe, which come once and in their own time."""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from dejavu_torch.data.folder import check_pixels
+from dejavu_torch.data.video import FORMATS, pixels_of
+from dejavu_torch.resize import MOST_PIXELS
+from dejavu_torch.text import one_line, printable
+from dejavu_torch.types import InputError, Traverse
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
+
+PIPE = "-"  # standard input
+PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,rtmp,rtmps,rtmpt,srt,crypto,data"
+OPENING = 10.0  # seconds that an address may take to answer
+STRETCHED = 1.05  # a side may be so much longer beside the other than it was
+
+
+class Shot(NamedTuple):
+    """A frame of a stream.
+
+    number: from 0, of all frames that came. seconds: of its timestamp, NaN where it has none. pixels: (H,W,3)
+    uint8, or (C,H,W) float in [0, 1].
+    """
+
+    number: int
+    seconds: float
+    pixels: np.ndarray | Tensor
+
+
+def is_stream(source: str) -> bool:
+    """Whether a source is a camera, an address or a pipe, and no file or folder."""
+    if source == PIPE or "://" in source or source.startswith("/dev/"):
+        return True
+    try:
+        mode = os.stat(source).st_mode
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
+
+
+class Camera:
+    """The frames of a camera, an address or a pipe. Iterating reads them, once.
+
+    Args:
+        source: a camera, `/dev/video0`; an address such as `rtsp://host/path`; a named pipe; or "-", standard
+            input.
+        size: (height, width) in pixels that frames are brought to; None keeps the camera's.
+
+    Attributes:
+        ends: whether an end is expected, as of a pipe.
+        note: what there is to say of the first frame: that `size` stretches it; "" for nothing.
+
+    Raises:
+        InputError: while iterating: no such camera, no video, a damaged stream, frames of another size than
+            the first, or the end of what should go on.
+    """
+
+    def __init__(self, source: str, size: tuple[int, int] | None = None) -> None:
+        self.source, self.size, self.name = source, size, printable(source)
+        self.device = source.startswith("/dev/") or _mode_is(source, stat.S_ISCHR)
+        self.ends = source == PIPE or _mode_is(source, stat.S_ISFIFO)
+        if source == PIPE:
+            self.name = "standard input"
+        self.note = ""
+
+    def __iter__(self) -> Iterator[Shot]:
+        number = 0
+        try:
+            container, stream = self._open()
+            with container:
+                for shot in self._shots(container, stream):
+                    number = shot.number + 1
+                    yield shot
+        except InputError:
+            raise
+        except Exception as error:  # FFmpeg's, of any type
+            why = one_line(getattr(error, "strerror", None) or str(error) or type(error).__name__)
+            if number:
+                raise InputError(
+                    f"{self.name} broke off after {number} frames: {why}; expected it to go on"
+                ) from error
+            raise InputError(f"{self.name} cannot be read: {why}; expected {self._expected}") from error
+        if not number:
+            raise InputError(f"{self.name} gave no frames; expected {self._expected}")
+        if not self.ends:
+            raise InputError(f"{self.name} ended after {number} frames; expected it to go on")
+
+    @property
+    def _expected(self) -> str:
+        return "a camera such as /dev/video0" if self.device else "a video stream"
+
+    def _open(self) -> tuple[InputContainer, VideoStream]:
+        import av
+
+        options: dict[str, str] = {
+            "protocol_whitelist": "pipe",
+            "format_whitelist": f"{FORMATS},nut,yuv4mpegpipe",
+        }
+        settings: dict[str, Any] = {"metadata_errors": "replace"}
+        address: Any = self.source
+        if self.device:
+            if not os.path.exists(self.source):
+                raise InputError(f"{self.name} is not there; expected {self._expected}")
+            settings["format"] = "v4l2"
+            options = {}
+        elif (
+            self.source == PIPE
+        ):  # without a buffer, whose lock a thread would hold to the end of the process
+            address = open(0, "rb", buffering=0, closefd=False)  # noqa: SIM115
+        elif self.ends:
+            address = open(self.source, "rb", buffering=0)  # noqa: SIM115
+        else:
+            options["protocol_whitelist"] = PROTOCOLS  # and no file of this machine that an answer may name
+            options["format_whitelist"] += ",rtsp,sdp,rtp,hls,dash,mpjpeg"
+            options["rtsp_transport"] = "tcp"
+            settings["timeout"] = (OPENING, None)
+        container = av.open(address, "r", container_options=options, **settings)
+        stream: Any = container.streams.best("video")
+        if stream is None or stream.codec_context is None:
+            container.close()
+            raise InputError(f"{self.name} has no video that can be decoded; expected {self._expected}")
+        check_pixels(Path(self.name), stream.codec_context.height, stream.codec_context.width, MOST_PIXELS)
+        stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
+        stream.thread_type = "SLICE"  # threads by frames hold some of them back
+        return container, stream
+
+    def _shots(self, container: InputContainer, stream: VideoStream) -> Iterator[Shot]:
+        first: tuple[int, int] | None = None
+        high, wide = self.size or (0, 0)
+        base = stream.time_base
+        for number, frame in enumerate(container.decode(stream)):
+            shape = (frame.height, frame.width)
+            if first is None:
+                first, self.note = shape, stretched(self.name, shape, self.size)
+            if shape != first:
+                raise InputError(
+                    f"frame {number} of {self.name} is {shape[0]} x {shape[1]} pixels; expected "
+                    f"{first[0]} x {first[1]} as frame 0"
+                )
+            seconds = math.nan if frame.pts is None or base is None else float(frame.pts * base)
+            yield Shot(number, seconds, pixels_of(frame, Path(self.name), wide, high))
+
+
+def _mode_is(path: str, test: Any) -> bool:
+    try:
+        return bool(test(os.stat(path).st_mode))
+    except (OSError, ValueError):
+        return False
+
+
+def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> str:
+    """A line on frames of one size (height, width) that are brought to one of another shape; else "".
+
+    Example:
+        >>> stretched("clip", (480, 640), (120, 160)), bool(stretched("clip", (480, 640), (90, 160)))
+        ('', True)
+    """
+    if size is None:
+        return ""
+    ratio = own[0] * size[1] / (own[1] * size[0])
+    if 1 / STRETCHED < ratio < STRETCHED:
+        return ""
+    seen = f"frames of {own[0]} x {own[1]} pixels are brought to the map's {size[0]} x {size[1]}"
+    return f"{name}: {seen}, which stretches them"
+
+
+def shots_of(traverse: Traverse) -> Iterator[Shot]:
+    """The frames of a traverse one by one, those of a video with their times."""
+    time_of = getattr(traverse, "frame_time", None)
+    for i, batch in enumerate(traverse.batches(1)):
+        yield Shot(i, math.nan if time_of is None else time_of(i), batch[0])

@@ -1,0 +1,257 @@
+"""How fast frames of a video are found one by one on a long map: `dejavu bench live`."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch.nn.functional import interpolate
+from tqdm import tqdm
+
+import dejavu_torch
+from dejavu_torch.data.camera import shots_of
+from dejavu_torch.data.output import check_output_folder, whole_folder
+from dejavu_torch.data.video import Video
+from dejavu_torch.evaluation.score_plots import plot_ratios
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.live.feed import Feed, in_real_time
+from dejavu_torch.live.localizer import LiveLocalizer
+from dejavu_torch.model import DejaVu
+from dejavu_torch.types import InputError
+
+RATE = 30  # frames a second
+CAMERA = (480, 640)
+SIZES = ((480, 640), (120, 160))  # that maps are learned from
+NUMBERS = 128  # of a descriptor
+NEAR = 5  # places
+NOISE = 0.1  # of a feature's spread, between two looks at one place
+WARM = 10  # frames ahead of those that are timed
+
+
+class LiveRow(NamedTuple):
+    """What frames took, one by one.
+
+    case: camera, and the map's frames. seconds: of a decoded frame's way to its place, the median;
+    seconds_p99: the longest but for 1 %. rate: frames a second from the file to the place, decoding beside
+    it; cpu_seconds: that a frame takes of all cores together, which other programs change little. dropped: of
+    the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of decoding, features,
+    whitening, scores and filter, each by itself, the best of some.
+    """
+
+    case: str
+    contender: str
+    seconds: float
+    seconds_p99: float
+    rate: float
+    cpu_seconds: float
+    frames: int
+    dropped: int
+    recall_at_1: float
+    places: int
+    route_bytes_per_place: float
+    threads: int
+    parts: dict[str, float]
+
+
+def bench_live(
+    places: int = 100_000,
+    frames: int = 300,
+    sizes: Sequence[tuple[int, int]] = SIZES,
+    camera: tuple[int, int] = CAMERA,
+    numbers: int = NUMBERS,
+    progress: bool = False,
+) -> list[LiveRow]:
+    """Localize the frames of a video one by one on a map of many places, with HOG and the filter.
+
+    Args:
+        places: of the map. frames: of the video.
+        sizes: (height, width) of the frames that a map is learned from, a case each.
+        camera: size of the video's frames.
+        numbers: of a descriptor.
+        progress: show a progress bar on a terminal.
+
+    Convention: the route is the video once, and for the rest its descriptors turned at random, block by
+        block: other places that change as a real route does. Only the time is of interest: the frames are
+        those that were learned.
+
+    Raises:
+        InputError: fewer places than frames, or fewer frames than are timed.
+    """
+    if not WARM < frames <= places or frames <= numbers:
+        raise InputError(
+            f"bench live got {frames} frames on {places} places with {numbers} numbers each; expected more "
+            f"frames than numbers and than {WARM}, and as many places"
+        )
+    rows = []
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        path = Path(folder) / "drive.mkv"
+        write_drive(path, frames, camera)
+        for size in tqdm(sizes, desc="live", disable=None if progress else True, leave=False):
+            rows.append(_case(path, size, camera, places, frames, numbers))
+    return rows
+
+
+def _case(
+    path: Path, size: tuple[int, int], camera: tuple[int, int], places: int, frames: int, numbers: int
+) -> LiveRow:
+    video = Video(path, width=size[1], height=size[0])
+    model, first = long_model(video, places, numbers)
+    localizer = LiveLocalizer(model)
+    found, milliseconds = 0, []
+    with Feed(shots_of(video)) as feed:
+        for shot in feed:
+            if shot.number == WARM:
+                began, busy = time.perf_counter(), time.process_time()
+            match = localizer(shot.pixels)
+            milliseconds.append(match.milliseconds)
+            found += abs(match.place - first - shot.number) <= NEAR
+    rate = (frames - WARM) / (time.perf_counter() - began)
+    cpu = (time.process_time() - busy) / (frames - WARM)
+    p50, p99 = (float(p) / 1e3 for p in np.percentile(milliseconds[WARM:], (50, 99)))
+    localizer.reset()
+    with Feed(in_real_time(shots_of(video), "drive"), newest=True) as feed:
+        for shot in feed:
+            localizer(shot.pixels)
+    by = " x ".join(map(str, size))
+    return LiveRow(
+        f"{camera[0]} x {camera[1]} on a map of {by}",
+        "dejavu",
+        p50,
+        p99,
+        rate,
+        cpu,
+        frames,
+        feed.dropped,
+        found / frames,
+        places,
+        model.map.summary().route_bytes / places,
+        torch.get_num_threads(),
+        parts_of(model, video),
+    )
+
+
+def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:
+    """A video of a camera that moves along a texture, `RATE` frames a second of (height, width) pixels."""
+    import av
+
+    height, width = size
+    step = max(2, width // 40)
+    generator = torch.Generator().manual_seed(0)
+    length = width + step * frames
+    ground = torch.zeros(1, 3, height, length)
+    for cell in (64, 24, 8):  # pixels of what is seen
+        coarse = torch.rand(1, 3, height // cell + 2, length // cell + 2, generator=generator)
+        ground += interpolate(coarse, (height, length), mode="bicubic") / 3
+    pixels = ground[0].clamp(0, 1).mul(255).byte().permute(1, 2, 0).numpy()
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=RATE)
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+        for i in range(frames):
+            part = np.ascontiguousarray(pixels[:, step * i : step * i + width])
+            frame = av.VideoFrame.from_ndarray(part, "rgb24")
+            frame.pts, frame.time_base = i, Fraction(1, RATE)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
+    """A model whose map has the frames of a video among many places, and the place of the first of them."""
+    model = DejaVu(whitening=Whitening(numbers=numbers)).eval()
+    assert model.whitening is not None
+    features = torch.cat([model.describe(batch) for batch in video.batches(16)])
+    generator = torch.Generator().manual_seed(0)
+    noise = NOISE * features.std(0) * torch.randn(features.shape, generator=generator)
+    model.whitening.learn(features, [(features + noise, torch.arange(len(features)))])
+    own = model.whitening(features)
+    blocks = -(-places // len(own))
+    middle = (blocks - 1) // 2
+    route = []
+    for block in range(blocks):
+        turn = torch.linalg.qr(torch.randn(own.shape[1], own.shape[1], generator=generator)).Q
+        route.append(own if block == middle else own @ turn)
+    model.learn_features(torch.cat(route)[:places])
+    model.frame_shape = video.frame_shape
+    return model, middle * len(own)
+
+
+def parts_of(model: DejaVu, video: Video, repeats: int = 30) -> dict[str, float]:
+    """Seconds of each part of a frame's way by itself, the best of some."""
+    localizer = LiveLocalizer(model)
+    began = time.perf_counter()
+    decoded = sum(1 for _ in video.batches(1))
+    seconds = {"decoding": (time.perf_counter() - began) / decoded}
+    (frame,) = video.between(0, 1)
+    whitening = model.whitening
+    assert whitening is not None
+    features = model.describe(frame)
+    unpacked = whitening.unpacked()
+    descriptor = whitening(features, unpacked)
+    scores = model.map.scores(descriptor)
+    assert localizer.sequence is not None
+    filtered = localizer.sequence.stream(scores for _ in iter(int, 1))
+    works: dict[str, Callable[[], object]] = {
+        "features": lambda: model.describe(frame),
+        "whitening": lambda: whitening(features, unpacked),
+        "scores": lambda: model.map.scores(descriptor),
+        "filter": lambda: next(filtered),
+    }
+    for name, work in works.items():
+        times = []
+        for _ in range(repeats):
+            began = time.perf_counter()
+            work()
+            times.append(time.perf_counter() - began)
+        seconds[name] = min(times)
+    return seconds
+
+
+def run_live(out: Path, places: int = 100_000, frames: int = 300) -> list[LiveRow]:
+    """Run the bench, and write bench.json and bench.png into the folder `out`.
+
+    Raises:
+        InputError: as `bench_live`, or a folder that cannot be made or written in.
+    """
+    check_output_folder(out)
+    rows = bench_live(places, frames, progress=True)
+    facts = {
+        "rows": [row._asdict() for row in rows],
+        "rate": RATE,
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "versions": {"dejavu_torch": dejavu_torch.__version__, "torch": torch.__version__},
+    }
+    with whole_folder(out) as folder:
+        (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        figure, _ = plot_ratios(bars(rows), "milliseconds a frame (p50), and of each part by itself")
+        figure.savefig(folder / "bench.png")
+    return rows
+
+
+def live_table(rows: Sequence[LiveRow]) -> list[list[str]]:
+    """The figures as rows of text, the header first."""
+    names = list(rows[0].parts) if rows else []
+    table = [["", "p50 ms", "p99 ms", "frames/s", "cpu ms", f"dropped at {RATE}/s", "found", *names]]
+    for row in rows:
+        figures = [
+            f"{1e3 * row.seconds:.1f}",
+            f"{1e3 * row.seconds_p99:.1f}",
+            f"{row.rate:.0f}",
+            f"{1e3 * row.cpu_seconds:.1f}",
+        ]
+        figures += [f"{row.dropped} of {row.frames}", f"{row.recall_at_1:.3f}"]
+        table.append([row.case, *figures, *(f"{1e3 * row.parts[name]:.1f}" for name in names)])
+    return table
+
+
+def bars(rows: Sequence[LiveRow]) -> dict[str, dict[str, float]]:
+    """Milliseconds of each part and of a whole way, as `plot_ratios` draws them."""
+    return {
+        row.case: {"dejavu": 1e3 * row.seconds} | {name: 1e3 * value for name, value in row.parts.items()}
+        for row in rows
+    }

@@ -1,0 +1,1 @@
+"""Frames as they come -> places, one by one."""

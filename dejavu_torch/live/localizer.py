@@ -1,0 +1,195 @@
+"""One frame at a time on a map, with what the frames before it told."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dejavu_torch.features.extract import features_of, in_mode
+from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.types import InputError, Match, SequenceModel
+
+EXPECTED = (
+    "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1], or, of a map of ready features, "
+    "float (D,)"
+)
+FURTHEST = 100  # frames left out that count; behind more, a jump finds the place again
+ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
+
+
+class LiveMatch(NamedTuple):
+    """Where a frame was found.
+
+    place: the reported place, -1 where none has a finite score. frame: the reference frame that it shows, -1
+    likewise. name: of that frame, "" where it has none. score: as of `Match`, lower is better. posterior: the
+    probability that the place is right, given all frames so far; NaN without a filter. accepted: as of
+    `Match`. milliseconds: from the frame to this answer.
+    """
+
+    place: int
+    frame: int
+    name: str
+    score: float
+    posterior: float
+    accepted: bool
+    milliseconds: float
+
+
+class LiveLocalizer:
+    """`DejaVu.localize` for frames that come one at a time.
+
+    Args:
+        model: has a map. It is used as it is and where it is: on a GPU, frames are moved there.
+        sequence: keeps what the frames before told. "filter", the default, is a `PlaceFilter`: frames of a
+            camera show places one behind the other, and it alone says how probable its answer is. None takes
+            each frame by itself.
+
+    Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
+
+    Attributes:
+        scores: (N,) of the latest frame, on the model's device; None ahead of the first.
+
+    Convention: the answers are those of `DejaVu.localize` on the same frames with the same sequence, but for
+        rounding. A frame that is refused changes nothing. `localizer(frame, left_out)` says how many frames
+        came since the one before and were left out: a `PlaceFilter` moves once more for each of them.
+
+    Raises:
+        InputError: a model without a map, or whose places are at even steps along the ground; calling it: an
+            array of another type or shape, frames of a size that do not fit the map, or numbers outside
+            [0, 1].
+
+    Example:
+        >>> route = torch.rand(60, 1, 32, 32)
+        >>> localizer = LiveLocalizer(DejaVu().learn(route), sequence=None)
+        >>> localizer(route[20]).place, localizer(route[21, 0].mul(255).byte().numpy()).place
+        (20, 21)
+    """
+
+    def __init__(self, model: DejaVu, sequence: SequenceModel | Literal["filter"] | None = "filter") -> None:
+        if not model.map.places:
+            raise InputError("there is no map yet; expected a model that learned or loaded one")
+        if model.step is not None and model.velocity is not None:
+            raise InputError(
+                "the map's places are even steps along the ground, which are measured on a whole traverse; "
+                "expected a map without --velocity, or the frames taken as they are (--as_is)"
+            )
+        if not (sequence is None or sequence == "filter" or isinstance(sequence, SequenceModel)):
+            raise InputError(
+                f"the sequence is {sequence!r}; expected a SequenceModel such as PlaceFilter, 'filter', None"
+            )
+        self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
+        self.device = model.map.positions.device
+        if self.sequence is not None:
+            self.sequence.check(None, model.map.places)
+        self._pipeline = model.pipeline
+        self._shape: tuple[int, ...] | None = None  # of the latest frame that fitted
+        whitening = model.whitening
+        self._projection = whitening.unpacked() if whitening is not None and whitening.learned else None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames so far."""
+        self.scores: Tensor | None = None
+        self._matches: Iterator[Match] = self.model.matches_of(self._descriptors(), self.sequence, self._look)
+
+    @torch.no_grad()
+    def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
+        began = time.perf_counter()
+        self._descriptor = self._describe(as_batch(frame, self.device))
+        filter = self.sequence if isinstance(self.sequence, PlaceFilter) else None
+        try:
+            if filter is not None:
+                filter.moved = 1 + min(left_out, FURTHEST)
+            match = next(self._matches)
+        except BaseException:  # as Ctrl-C: what was half done is not gone on with
+            self.reset()
+            raise
+        finally:
+            if filter is not None:
+                filter.moved = 1
+        place, score = int(match.index), float(match.score)
+        shown = int(self.model.map.frame_of(match.index))
+        return LiveMatch(
+            place,
+            shown,
+            self.model.frame_name(shown) if shown >= 0 else "",
+            score,
+            math.nan if filter is None else math.exp(-score),
+            bool(match.accepted),
+            1e3 * (time.perf_counter() - began),
+        )
+
+    def _describe(self, batch: Tensor) -> Tensor:
+        """The descriptor of a frame that fits the map, (1,K)."""
+        with in_mode(self._pipeline, False):
+            features = features_of(batch, self._pipeline, "the frame")
+        if batch.shape[1:] != self._shape:
+            self.model.check_queries(tuple(batch.shape[1:]), features.shape[1], "the frame")
+            self._shape = batch.shape[1:]
+        features = features.to(torch.promote_types(features.dtype, torch.float32))
+        whitening, places = self.model.whitening, self.model.map
+        descriptor = features if whitening is None else whitening(features, self._projection)
+        if descriptor.shape[1] != places.dimension:
+            raise InputError(
+                f"the frame gives {descriptor.shape[1]} features; the map expects {places.dimension}"
+            )
+        if not descriptor.isfinite().all():
+            raise InputError("the frame gives NaN or infinite features; expected finite numbers")
+        return descriptor
+
+    def _descriptors(self) -> Iterator[Tensor]:
+        """That of the frame at hand, whenever the next one is asked for."""
+        while True:
+            yield self._descriptor
+
+    def _look(self, scores: Tensor) -> None:
+        self.scores = scores[0]
+
+
+def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+    """One frame as a batch (1,C,H,W) of floats in [0, 1], or one frame's ready features (D,) as (1,D).
+
+    Raises:
+        InputError: another type or shape, no pixels, or numbers outside [0, 1].
+
+    Example:
+        >>> as_batch(np.zeros((480, 640, 3), np.uint8)).shape
+        torch.Size([1, 3, 480, 640])
+    """
+    kind = str(getattr(frame, "dtype", type(frame).__name__)).removeprefix("torch.")
+    kind = frame.dtype.name if isinstance(frame, np.ndarray) else kind  # whatever its byte order
+    shape = tuple(getattr(frame, "shape", ()))
+    pixels = kind == "uint8"
+    floats = kind in ("float16", "bfloat16", "float32", "float64")
+    last, first = shape[-1:] in ((1,), (3,)), shape[:1] in ((1,), (3,))
+    image = len(shape) == 2 or (len(shape) == 3 and (last or first))
+    if not isinstance(frame, Tensor | np.ndarray) or not (
+        (image and (pixels or floats)) or (len(shape) == 1 and floats)
+    ):
+        raise InputError(f"the frame is {f'{shape} {kind}' if shape else f'a {kind}'}; expected {EXPECTED}")
+    if 0 in shape:
+        raise InputError(f"the frame is {shape}, which holds nothing; expected {EXPECTED}")
+    if isinstance(frame, np.ndarray):
+        whole = frame if frame.flags.writeable and min(frame.strides) >= 0 else frame.copy()
+        frame = torch.from_numpy(whole.astype(frame.dtype.newbyteorder("="), copy=False))
+    values = frame.detach().to(device)
+    if len(shape) == 1:
+        return values.float()[None]
+    if len(shape) == 2:
+        values = values[None]
+    elif last and not (first and floats):  # a tensor of floats has its channels first
+        values = values.permute(2, 0, 1)
+    if pixels:
+        return values[None].float().div_(255)
+    values = values if values.dtype == torch.float64 else values.float()
+    low, high = (float(end) for end in values.aminmax())
+    if not (low >= -ROUNDING and high <= 1 + ROUNDING):
+        raise InputError(f"the frame holds numbers from {low:.4g} to {high:.4g}; expected 0 to 1")
+    return values[None].clamp(0, 1)

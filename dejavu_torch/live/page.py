@@ -1,0 +1,240 @@
+"""A page of what happens live, served on this machine alone by the standard library."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from dejavu_torch.data.camera import Shot
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.live.localizer import LiveMatch
+from dejavu_torch.types import InputError, Traverse
+
+HOST = "127.0.0.1"
+PORT = 8765  # where none is given
+COLUMNS = 512  # of the curve
+WIDTH = 640  # pixels of the pictures at most
+KEPT = 20_000  # small pictures of a reference that can only be read in order
+SMALL = 160  # pixels of their width
+PAGE = Path(__file__).with_name("page.html")
+
+
+class Moment(NamedTuple):
+    """What the page shows of one frame.
+
+    scores: (N,) of all places. posterior: whether they are -log of probabilities. p50, p99: milliseconds.
+    """
+
+    shot: Shot
+    match: LiveMatch
+    scores: Tensor
+    posterior: bool
+    frames: int
+    dropped: int
+    p50: float
+    p99: float
+
+
+class Page:
+    """Serves the page at http://127.0.0.1:PORT/ from threads of its own; `show` is all it costs the frames.
+
+    Args:
+        port: 0 is any that is free; `url` says which.
+        title: a line below the heading.
+        reference: pictures of the reference's frames, where the page is to show them.
+
+    Convention: a context manager. It answers requests for 127.0.0.1 and localhost only, so that no other site
+        can ask for it by a name of its own.
+
+    Raises:
+        InputError: a port that is in use, or none.
+    """
+
+    def __init__(
+        self, port: int = PORT, title: str = "", reference: Callable[[int], str | None] | None = None
+    ) -> None:
+        if not 0 <= port < 2**16:
+            raise InputError(f"port {port}; expected one from 0 to 65535, 0 being any that is free")
+        self.title, self.reference, self.over = title, reference, ""
+        self.moment: Moment | None = None
+        page = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                page.answer(self)
+
+            def log_message(self, *_: Any) -> None:
+                pass
+
+        try:
+            self._server = ThreadingHTTPServer((HOST, port), Handler)
+        except OSError as error:
+            raise InputError(
+                f"port {port} of {HOST} cannot be had: {error.strerror}; expected a free one, such as 0 finds"
+            ) from error
+        self._server.daemon_threads = True
+        self.url = f"http://{HOST}:{self._server.server_address[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+
+    def __enter__(self) -> Page:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def show(self, moment: Moment) -> None:
+        """Show this frame from the next request on."""
+        self.moment = moment
+
+    def answer(self, request: BaseHTTPRequestHandler) -> None:
+        """Answer one request."""
+        host = request.headers.get("Host", "").rpartition(":")[0] or request.headers.get("Host", "")
+        address = urlsplit(request.path)
+        if host not in (HOST, "localhost"):
+            body, kind, status = b"", "text/plain", HTTPStatus.FORBIDDEN
+        elif address.path == "/":
+            body, kind, status = PAGE.read_bytes(), "text/html; charset=utf-8", HTTPStatus.OK
+        elif address.path == "/state":
+            seen = parse_qs(address.query).get("seen", [""])[0]
+            body = json.dumps(self.state(seen)).encode()
+            kind, status = "application/json", HTTPStatus.OK
+        else:
+            body, kind, status = b"", "text/plain", HTTPStatus.NOT_FOUND
+        try:
+            request.send_response(status)
+            request.send_header("Content-Type", kind)
+            request.send_header("Content-Length", str(len(body)))
+            request.send_header("Cache-Control", "no-store")
+            request.end_headers()
+            request.wfile.write(body)
+        except OSError:  # who asked has left
+            pass
+
+    def state(self, seen: str = "") -> dict[str, Any]:
+        """What the page asks for again and again; without pictures where it has `seen` that frame."""
+        moment = self.moment
+        state: dict[str, Any] = {"title": self.title, "over": self.over, "number": -1}
+        if moment is None:
+            return state
+        shot, match = moment.shot, moment.match
+        state["number"] = shot.number
+        if seen == str(shot.number):
+            return state
+        known = match._asdict() | {"time": shot.seconds, "p50": moment.p50, "p99": moment.p99}
+        state |= {name: _number(value) for name, value in known.items()}
+        return state | {
+            "frames": moment.frames,
+            "dropped": moment.dropped,
+            "places": len(moment.scores),
+            "kind": "Posterior over the route"
+            if moment.posterior
+            else "Match over the route, the best place 1",
+            "curve": curve(moment.scores, moment.posterior),
+            "query": as_picture(shot.pixels),
+            "reference": self.reference(match.frame) if self.reference and match.frame >= 0 else None,
+        }
+
+
+def _number(value: Any) -> Any:
+    """JSON has no NaN and no infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def curve(scores: Tensor, posterior: bool) -> list[float]:
+    """Scores (N,) as at most `COLUMNS` heights in [0, 1], each the highest of its places.
+
+    Args:
+        posterior: the scores are -log of probabilities, which are the heights; else the best score has height
+            1, and the worst 0.
+
+    Example:
+        >>> curve(torch.tensor([3.0, 1.0, 2.0, torch.inf]), posterior=False)
+        [0.0, 1.0, 0.5, 0.0]
+    """
+    scores = scores.detach().float().cpu()
+    known = scores.isfinite()
+    if posterior:
+        height = (-scores).exp()
+    elif known.any():
+        worst, best = scores[known].max(), scores[known].min()
+        height = (worst - scores) / (worst - best).clamp(min=1e-12)
+    else:
+        height = torch.zeros_like(scores)
+    height = torch.where(known, height, 0).clamp(0, 1)
+    columns = min(COLUMNS, len(height))
+    best = torch.nn.functional.adaptive_max_pool1d(height[None], columns)[0]
+    return [round(value, 4) for value in best.tolist()]
+
+
+def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
+    """A frame, (H,W,3) uint8 or (C,H,W) float, as the address of a JPEG in itself; None of ready features."""
+    if isinstance(pixels, Tensor):
+        if pixels.ndim != 3:
+            return None
+        pixels = (pixels.permute(1, 2, 0).clamp(0, 1) * 255).round().byte().cpu().numpy()
+    image = Image.fromarray(np.ascontiguousarray(pixels if pixels.shape[2] == 3 else pixels[..., 0]))
+    if image.width > width:
+        image = image.resize((width, max(1, round(image.height * width / image.width))))
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+class ReferencePictures:
+    """Pictures of the frames of a reference, for `Page`.
+
+    Args:
+        reference: the traverse that the map was learned from. One that can be read in any order is; of
+            another, as a video, small pictures are made in a thread of its own, of at most `KEPT` frames, of
+            which the nearest is shown.
+        frames: how many the map's reference has.
+
+    Raises:
+        InputError: a traverse of another number of frames.
+    """
+
+    def __init__(self, reference: Traverse, frames: int) -> None:
+        if reference.length not in (None, frames):
+            raise InputError(
+                f"{reference.name} has {reference.length} frames; the map's reference has {frames}"
+            )
+        self.reference, self.step = reference, max(1, math.ceil(frames / KEPT))
+        self._small: list[str | None] = []
+        if not isinstance(reference, IndexedTraverse):
+            threading.Thread(target=self._read, daemon=True).start()
+
+    def __call__(self, frame: int) -> str | None:
+        if isinstance(self.reference, IndexedTraverse):
+            try:
+                return as_picture(next(self.reference.between(frame, frame + 1))[0])
+            except InputError:  # an image that is not there any more
+                return None
+        near = round(frame / self.step)
+        return self._small[near] if near < len(self._small) else None
+
+    def _read(self) -> None:
+        try:
+            for i, batch in enumerate(self.reference.batches(1)):
+                if i % self.step == 0:
+                    self._small.append(as_picture(batch[0], SMALL))
+        except InputError:  # those there are stay
+            pass

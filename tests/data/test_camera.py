@@ -1,0 +1,132 @@
+"""Streams: pipes and addresses as a camera gives them, and how each of them fails."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from videos import H264, clip, numbers, pictures, piped
+
+from dejavu_torch import open_source
+from dejavu_torch.data.camera import Camera, is_stream, shots_of
+from dejavu_torch.data.video import Video
+
+FRAMES = pictures(12)
+
+
+@pytest.fixture(scope="module")
+def stream(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A stream of MPEG, which can begin and end anywhere."""
+    return clip(tmp_path_factory.mktemp("stream") / "clip.ts", FRAMES, **H264).read_bytes()  # type: ignore[arg-type]
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a folder."""
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+
+
+def test_a_pipe_gives_the_frames_of_the_file(tmp_path: Path, stream: bytes) -> None:
+    with piped(tmp_path, stream) as pipe:
+        assert is_stream(pipe)
+        shots = list(Camera(pipe))
+    assert [shot.number for shot in shots] == [*range(12)]
+    assert np.diff([shot.seconds for shot in shots]) == pytest.approx(1 / 25, abs=1e-3)
+    pixels = torch.from_numpy(np.stack([shot.pixels for shot in shots])).permute(0, 3, 1, 2) / 255
+    assert numbers(pixels) == [*range(12)]
+
+
+def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path: Path, stream: bytes) -> None:
+    (tmp_path / "clip.ts").write_bytes(stream)
+    (expected,) = Video(tmp_path / "clip.ts", width=24, height=16).between(0, 1)
+    with piped(tmp_path, stream) as pipe:
+        camera = Camera(pipe, (16, 24))
+        first = next(iter(camera))
+    assert camera.note == ""
+    assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected[0])
+
+
+def test_frames_that_are_stretched_are_told_of(tmp_path: Path, stream: bytes) -> None:
+    with piped(tmp_path, stream) as pipe:
+        camera = Camera(pipe, (16, 16))
+        assert next(iter(camera)).pixels.shape == (16, 16, 3)
+    assert "32 x 48" in camera.note
+    assert "16 x 16" in camera.note
+
+
+def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path: Path, stream: bytes) -> None:
+    other = clip(tmp_path / "other.ts", pictures(4, 48, 64), **H264).read_bytes()  # type: ignore[arg-type]
+    count = 0
+    with piped(tmp_path, stream + other) as pipe, refused("48 x 64", "32 x 48", "frame 12"):
+        for _ in Camera(pipe):
+            count += 1
+    assert count == 12
+
+
+def test_the_end_of_an_address_is_told(tmp_path: Path, stream: bytes) -> None:
+    (tmp_path / "clip.ts").write_bytes(stream)
+    count = 0
+    with served(tmp_path) as address, refused("clip.ts", "12 frames", "go on"):
+        for _ in Camera(f"{address}/clip.ts"):
+            count += 1
+    assert count == 12
+
+
+def test_an_answer_names_no_file_of_this_machine(tmp_path: Path, stream: bytes) -> None:
+    (tmp_path / "clip.ts").write_bytes(stream)
+    for where in (f"file:{tmp_path}/clip.ts", "file:clip.ts"):
+        (tmp_path / "list.m3u8").write_text(
+            f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\n{where}\n#EXT-X-ENDLIST\n"
+        )
+        with served(tmp_path) as address, refused("list.m3u8"):
+            list(Camera(f"{address}/list.m3u8"))
+        os.rename(tmp_path / "list.m3u8", tmp_path / "list")
+        with piped(tmp_path, (tmp_path / "list").read_bytes()) as pipe, refused("pipe"):
+            list(Camera(pipe))
+        (tmp_path / "pipe").unlink()
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("/dev/video99", ("/dev/video99 is not there", "a camera")),
+        ("/dev/null", ("/dev/null", "a camera")),
+        ("rtsp://127.0.0.1:1/cam", ("rtsp://127.0.0.1:1/cam", "refused", "a video stream")),
+        ("nothing://here", ("nothing://here", "a video stream")),
+    ],
+)
+def test_what_is_no_stream_is_one_line(source: str, words: tuple[str, ...]) -> None:
+    assert is_stream(source)
+    with refused(*words):
+        list(Camera(source))
+
+
+@pytest.mark.parametrize("data", [b"", b"no video at all" * 100])
+def test_a_pipe_without_video_is_one_line(data: bytes, tmp_path: Path) -> None:
+    with piped(tmp_path, data) as pipe, refused("pipe", "a video stream"):
+        list(Camera(pipe))
+
+
+def test_files_are_no_streams(tmp_path: Path) -> None:
+    path = clip(tmp_path / "clip.mkv", FRAMES[:3])
+    assert not any(map(is_stream, (str(path), str(tmp_path), "sim:aerial", "missing.mp4", "nul\0")))
+    shots = list(shots_of(open_source(path)))
+    assert [shot.seconds for shot in shots] == pytest.approx([0, 0.04, 0.08])
+    assert [shot.pixels.shape for shot in shots] == [(3, 32, 48)] * 3

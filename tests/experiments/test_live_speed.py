@@ -1,0 +1,47 @@
+"""`dejavu bench live`, on a short route."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import run
+from helpers import refused
+
+from dejavu_torch.experiments import live_speed
+from dejavu_torch.experiments.live_speed import LiveRow, bench_live, live_table
+
+SMALL = {"places": 400, "frames": 40, "sizes": ((48, 64), (32, 48)), "camera": (96, 128), "numbers": 12}
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[LiveRow]:
+    return bench_live(**SMALL)  # type: ignore[arg-type]
+
+
+def test_every_frame_is_found_and_timed(rows: list[LiveRow]) -> None:
+    assert len(rows) == 2
+    for row in rows:
+        assert 0 < row.seconds <= row.seconds_p99
+        assert row.recall_at_1 > 0.8
+        assert 0 <= row.dropped < row.frames == 40
+        assert set(row.parts) == {"decoding", "features", "whitening", "scores", "filter"}
+        assert sum(row.parts.values()) > row.seconds / 10
+    assert [len(line) for line in live_table(rows)] == [12, 12, 12]
+
+
+def test_the_command_writes_them(
+    rows: list[LiveRow], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(live_speed, "bench_live", lambda *_, **__: rows)
+    run("bench", "live", "--out", tmp_path / "bench")
+    assert "p99 ms" in capsys.readouterr().out
+    written = json.loads((tmp_path / "bench" / "bench.json").read_text())["rows"]
+    assert [row["contender"] for row in written] == ["dejavu", "dejavu"]
+    assert (tmp_path / "bench" / "bench.png").is_file()
+
+
+def test_too_few_places_are_refused() -> None:
+    with refused("20 places"):
+        bench_live(places=20, frames=40, numbers=12)

@@ -1,0 +1,230 @@
+"""Frames one at a time are found where `localize` finds them together."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from footage import QUERY, REFERENCE, camera, footage
+from helpers import refused
+from torch import Tensor
+
+from dejavu_torch import (
+    DejaVu,
+    ImposedPeriods,
+    LiveLocalizer,
+    PlaceFilter,
+    SequenceMatcher,
+    SpectralMapper,
+    TemplateMapper,
+    Whitening,
+)
+from dejavu_torch.live.localizer import LiveMatch, as_batch
+from dejavu_torch.types import SequenceModel
+
+PLACES, SHAPE = 48, (3, 24, 32)
+
+
+@pytest.fixture(scope="module")
+def route() -> Tensor:
+    """A camera that moves along a texture."""
+    ground = torch.rand(1, 3, 6, 40, generator=torch.Generator().manual_seed(1))
+    ground = torch.nn.functional.interpolate(ground, (24, 32 + 3 * PLACES), mode="bicubic").clamp(0, 1)[0]
+    return torch.stack([ground[..., 3 * i : 3 * i + 32] for i in range(PLACES)])
+
+
+@pytest.fixture(scope="module")
+def drive(route: Tensor) -> Tensor:
+    noise = torch.randn(route[10:40].shape, generator=torch.Generator().manual_seed(2))
+    return (route[10:40] + 0.03 * noise).clamp(0, 1)
+
+
+@pytest.fixture(scope="module")
+def spectral(route: Tensor) -> DejaVu:
+    return (
+        DejaVu(whitening=Whitening(views=1), mapper=SpectralMapper(20.0), threshold=0.7).learn(route).eval()
+    )
+
+
+def answers(localizer: LiveLocalizer, frames: Tensor) -> list[LiveMatch]:
+    return [localizer(frame) for frame in frames]
+
+
+SEQUENCES: dict[str, SequenceModel | None] = {
+    "single": None,
+    "sequence": SequenceMatcher(5),
+    "speeds": SequenceMatcher(4, (1.0, 0.5)),
+    "filter": PlaceFilter(),
+    "rare searches": PlaceFilter(search_every=7),
+}
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES.values(), ids=SEQUENCES)
+@pytest.mark.parametrize("kind", ["spectral", "templates"])
+def test_one_by_one_is_as_all_together(
+    kind: str, sequence: SequenceModel | None, spectral: DejaVu, route: Tensor, drive: Tensor
+) -> None:
+    model = spectral
+    if kind == "templates":
+        model = DejaVu(mapper=TemplateMapper(ImposedPeriods([5, 7, 9], bin=4)), threshold=1.0).learn(route)
+    match = model.localize(drive, sequence=sequence)
+    found = answers(LiveLocalizer(model, sequence), drive)
+    assert [one.place for one in found] == match.index.tolist()
+    assert [one.accepted for one in found] == match.accepted.tolist()
+    torch.testing.assert_close(
+        torch.tensor([one.score for one in found]), match.score.float(), rtol=1e-3, atol=1e-4
+    )
+    assert (match.index - torch.arange(10, 40)).abs().float().median() <= 2
+
+
+def test_the_default_is_a_filter_and_tells_its_posterior(spectral: DejaVu, drive: Tensor) -> None:
+    found = answers(LiveLocalizer(spectral), drive)
+    assert [one.posterior for one in found] == pytest.approx([math.exp(-one.score) for one in found])
+    assert all(0 < one.posterior <= 1 for one in found)
+    assert all(math.isnan(one.posterior) for one in answers(LiveLocalizer(spectral, None), drive[:2]))
+    assert all(0 < one.milliseconds < 10_000 for one in found)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        lambda x: x,
+        lambda x: x.double(),
+        lambda x: (x.permute(1, 2, 0) * 255).round().byte(),
+        lambda x: (x.permute(1, 2, 0) * 255).round().byte().numpy(),
+        lambda x: (x * 255).round().byte().numpy(),
+        lambda x: x.permute(1, 2, 0).numpy(),
+        lambda x: np.rot90(np.rot90(x.permute(1, 2, 0).numpy().copy(), 2).copy(), 2),
+        lambda x: x.numpy().astype(">f4"),
+    ],
+)
+def test_every_kind_of_array(given: Any, spectral: DejaVu, drive: Tensor) -> None:
+    batch = as_batch(given(drive[5]))
+    torch.testing.assert_close(batch[0].float(), drive[5], atol=0.5 / 255 + 1e-6, rtol=0)
+    assert LiveLocalizer(spectral, None)(given(drive[5])).place == 15
+
+
+def test_grey_frames_have_two_dimensions(route: Tensor) -> None:
+    model = DejaVu(whitening=Whitening(views=1)).learn(route[:, :1])
+    localizer = LiveLocalizer(model, None)
+    assert localizer(route[20, 0]).place == localizer((route[20, 0] * 255).round().byte().numpy()).place == 20
+
+
+def test_ready_features() -> None:
+    wave = torch.randn(40, 6)
+    model = DejaVu().learn(wave)
+    assert LiveLocalizer(model, None)(wave[7]).place == 7
+    with refused("5 features", "6"):
+        LiveLocalizer(DejaVu(whitening="none").learn(wave))(wave[7, :5])
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        (np.zeros((24, 32, 3), np.int64), ("int64", "(24, 32, 3)", "uint8")),
+        (np.zeros((24, 32, 4), np.uint8), ("(24, 32, 4)", "(H,W,3)")),
+        (np.zeros((2, 24, 32, 3), np.uint8), ("(2, 24, 32, 3)",)),
+        (np.zeros((0, 32, 3), np.uint8), ("(0, 32, 3)", "nothing")),
+        (torch.full(SHAPE, 2.0), ("2", "0 to 1")),
+        (torch.full(SHAPE, math.nan), ("nan", "0 to 1")),
+        (np.zeros((48, 64, 3), np.uint8), ("48 x 64", "24 x 32")),
+        ("photo.jpg", ("str", "uint8")),
+        (7, ("int", "uint8")),
+        (np.array("photo"), ("expected",)),
+    ],
+)
+def test_what_is_no_frame_of_the_map_is_refused_and_changes_nothing(
+    frame: Any, words: tuple[str, ...], spectral: DejaVu, drive: Tensor
+) -> None:
+    localizer = LiveLocalizer(spectral)
+    before = answers(localizer, drive[:6])
+    with refused(*words):
+        localizer(frame)
+    after = answers(localizer, drive[6:9])
+    expected = answers(LiveLocalizer(spectral), drive[:9])
+    assert [one[:6] for one in before + after] == [one[:6] for one in expected]
+
+
+def test_another_size_is_told_once(
+    spectral: DejaVu, route: Tensor, drive: Tensor, caplog: pytest.LogCaptureFixture
+) -> None:
+    wider = torch.nn.functional.pad(drive, (0, 3))  # as many cells
+    with caplog.at_level(logging.WARNING, "dejavu_torch"):
+        answers(LiveLocalizer(spectral), wider)
+    assert len(caplog.messages) == 1
+
+
+def test_reset_forgets(spectral: DejaVu, drive: Tensor) -> None:
+    localizer = LiveLocalizer(spectral, SequenceMatcher(5))
+    first = answers(localizer, drive[:8])
+    localizer.reset()
+    assert localizer.scores is None
+    assert [one[:6] for one in answers(localizer, drive[:8])] == [one[:6] for one in first]
+
+
+def test_scores_are_those_of_the_latest_frame(spectral: DejaVu, drive: Tensor) -> None:
+    localizer = LiveLocalizer(spectral)
+    for match in answers(localizer, drive[:5]):
+        latest = match
+    assert localizer.scores is not None
+    assert localizer.scores.shape == (PLACES,)
+    assert (int(localizer.scores.argmin()), float(localizer.scores.min())) == latest[0:4:3]
+
+
+def test_frames_left_out_move_the_filter_on(route: Tensor) -> None:
+    """Of every 6th frame only a filter that knows is not lost."""
+    torch.manual_seed(3)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(None, step=0.05, metric="l2"))
+    wave = torch.randn(300, 24)
+    model.learn(wave)
+    frames, noise = range(10, 290, 6), 1.2
+
+    def posteriors(told: bool) -> Tensor:
+        generator = torch.Generator().manual_seed(0)
+        localizer = LiveLocalizer(model)
+        seen = (wave[i] + noise * torch.randn(24, generator=generator) for i in frames)
+        found = [localizer(one, 5 * told) for one in seen]
+        return torch.tensor(
+            [one.posterior * (abs(one.place - i) <= 5) for one, i in zip(found, frames, strict=True)]
+        )
+
+    assert posteriors(True)[10:].mean() > posteriors(False)[10:].mean() + 0.2
+
+
+def test_names_and_interruption(spectral: DejaVu, drive: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    localizer = LiveLocalizer(spectral)
+    monkeypatch.setattr(spectral, "frame_names", [f"{i}.png" for i in range(PLACES)])
+    assert localizer(drive[0]).name == f"{localizer(drive[0]).frame}.png"
+
+    def interrupted(queries: Tensor) -> Tensor:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(spectral.map, "scores", interrupted)
+        broken = LiveLocalizer(spectral)
+        with pytest.raises(KeyboardInterrupt):
+            broken(drive[0])
+    broken.reset()
+    assert broken(drive[0])[:6] == LiveLocalizer(spectral)(drive[0])[:6]
+
+
+def test_what_cannot_be_localised_live_is_refused(spectral: DejaVu) -> None:
+    with refused("no map"):
+        LiveLocalizer(DejaVu())
+    with refused("best", "PlaceFilter"):
+        LiveLocalizer(spectral, "best")  # type: ignore[arg-type]
+    with refused("expected a shorter one"):
+        LiveLocalizer(spectral, SequenceMatcher(PLACES + 1))
+
+
+def test_a_map_of_even_steps_takes_frames_as_they_are_or_none() -> None:
+    model = DejaVu(velocity=camera(), mapper=SpectralMapper(20.0), whitening="none").learn(footage(REFERENCE))
+    with refused("even steps", "as_is"):
+        LiveLocalizer(model)
+    model.velocity = None
+    match = LiveLocalizer(model, None)(footage(QUERY)[0])
+    assert match.frame == int(model.map.frame_of(torch.tensor(match.place)))

@@ -1,0 +1,156 @@
+"""The page: what it answers, and what a browser makes of it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from videos import clip, pictures
+
+from dejavu_torch import open_source
+from dejavu_torch.data.camera import Shot
+from dejavu_torch.live.localizer import LiveMatch
+from dejavu_torch.live.page import PAGE, Moment, Page, ReferencePictures, as_picture, curve
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+def moment(number: int = 7, name: str = "left<b>.png", accepted: bool = True, time: float = 0.28) -> Moment:
+    pixels = np.zeros((24, 32, 3), np.uint8)
+    pixels[:, :16] = (200, 40, 40)
+    scores = torch.full((3000,), 9.0)
+    scores[1200:1210] = torch.tensor([3, 2, 1, 0.2, 0.1, 0.1, 0.2, 1, 2, 3])
+    match = LiveMatch(1204, 1204, name, 0.1, math.exp(-0.1), accepted, 12.5)
+    return Moment(Shot(number, time, pixels), match, scores, True, 8, 2, 11.0, 19.0)
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    with Page(0, "drive.mp4 on map.safetensors") as page:
+        yield page
+
+
+def state_of(page: Page, seen: str = "") -> dict[str, object]:
+    with urlopen(f"{page.url}state?seen={seen}") as answer:
+        state: dict[str, object] = json.load(answer)
+        return state
+
+
+def test_the_state_is_that_of_the_latest_frame(page: Page) -> None:
+    assert state_of(page)["number"] == -1
+    page.show(moment())
+    state = state_of(page)
+    known = {"number": 7, "place": 1204, "accepted": True, "frames": 8, "dropped": 2, "places": 3000}
+    assert known.items() <= state.items()
+    assert str(state["query"]).startswith("data:image/jpeg;base64,")
+    assert state["reference"] is None
+    assert max(state["curve"]) == pytest.approx(math.exp(-0.1), abs=1e-3)  # type: ignore[type-var]
+    assert "curve" not in state_of(page, seen="7")
+    page.show(moment(8, time=math.nan))
+    assert (state_of(page, seen="7")["number"], state_of(page)["time"]) == (8, None)
+
+
+def test_it_asks_for_nothing_elsewhere(page: Page) -> None:
+    with urlopen(page.url) as answer:
+        text = answer.read().decode()
+    assert text == PAGE.read_text()
+    assert not re.findall(r"(?:https?:)?//[a-z]", text.replace("// ", ""))
+
+
+@pytest.mark.parametrize(
+    ("path", "host", "status"),
+    [
+        ("/", "127.0.0.1", 200),
+        ("/", "localhost", 200),
+        ("/", "evil.example", 403),
+        ("/etc", "127.0.0.1", 404),
+    ],
+)
+def test_only_this_machine_is_answered(path: str, host: str, status: int, page: Page) -> None:
+    port = int(page.url.rpartition(":")[2].strip("/"))
+    connection = http.client.HTTPConnection("127.0.0.1", port)
+    connection.request("GET", path, headers={"Host": f"{host}:{port}"})
+    assert connection.getresponse().status == status
+    connection.close()
+
+
+def test_a_port_that_cannot_be_had_is_one_line(page: Page) -> None:
+    port = page.url.rpartition(":")[2].strip("/")
+    with refused(port, "in use"):
+        Page(int(port))
+    with refused("70000", "65535"):
+        Page(70000)
+
+
+def test_curve_keeps_the_highest_of_many_places() -> None:
+    scores = torch.full((100_000,), 12.0)
+    scores[70_001] = 0.0
+    heights = curve(scores, posterior=True)
+    assert (len(heights), max(heights), heights.index(max(heights))) == (512, 1.0, 512 * 70_001 // 100_000)
+    assert curve(torch.full((4,), math.inf), posterior=False) == [0.0] * 4
+
+
+def test_reference_pictures_of_any_source(tmp_path: Path) -> None:
+    frames = pictures(5)
+    np.save(tmp_path / "frames.npy", frames)
+    by_index = ReferencePictures(open_source(tmp_path / "frames.npy"), 5)
+    assert by_index(3) == as_picture(frames[3])
+    video = ReferencePictures(open_source(clip(tmp_path / "clip.mkv", frames)), 5)
+    for _ in range(500):
+        if video(4) is None:
+            torch.randn(100_000).sort()
+    assert video(4) == as_picture(frames[4])
+    assert video(5) is None
+    with refused("5 frames", "7"):
+        ReferencePictures(open_source(tmp_path / "frames.npy"), 7)
+    assert as_picture(torch.rand(6)) is None  # ready features
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_browser_shows_it(page: Page, tmp_path: Path) -> None:
+    page.reference = lambda frame: as_picture(np.full((24, 32, 3), frame % 256, np.uint8))
+    page.show(moment())
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
+    options += ["--disable-background-networking", "--disable-component-update", "--window-size=1000,800"]
+    assert CHROMIUM is not None
+    ran = subprocess.run(
+        [
+            CHROMIUM,
+            *options,
+            f"--user-data-dir={tmp_path}",
+            "--virtual-time-budget=2000",
+            "--dump-dom",
+            page.url,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    shown = re.sub(r"<script>.*?</script>", "", ran.stdout, flags=re.DOTALL)
+    assert 'class="yes"' in shown
+    for words in (
+        "frame 7",
+        "0.28 s",
+        "accepted:",
+        "place 1204",
+        "left&lt;b&gt;.png",
+        "0.905",
+        "12.5",
+        "19.0",
+    ):
+        assert words in shown, words
+    assert shown.count("data:image/jpeg") == 2
+    assert len(re.findall(r"<path", shown)) >= 4

@@ -1,0 +1,259 @@
+"""`dejavu live`: its lines, its summary, its page, and every way in which a source ends."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, run
+from footage import REFERENCE, camera, footage
+from videos import H264, clip, piped
+
+from dejavu_torch import DejaVu, LiveLocalizer, SpectralMapper, Whitening, open_source
+from dejavu_torch.live.localizer import LiveMatch
+from dejavu_torch.live.page import Page
+
+KEYS = ["frame", "time", "place", "reference_frame", "name", "score", "posterior", "accepted", "milliseconds"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of a drive, another drive as a video and as a stream, and one of other pixels."""
+    folder = tmp_path_factory.mktemp("live")
+    first, second = (
+        torch.cat(list(open_source(f"sim:aerial?frames=64&traverse={i}").batches(64))) for i in (0, 1)
+    )
+    clip(folder / "first.mkv", _pixels(first))
+    DejaVu(whitening=Whitening(views=1), mapper=SpectralMapper(20.0)).learn(
+        open_source(folder / "first.mkv")
+    ).save(folder / "map.safetensors")
+    clip(folder / "second.mkv", _pixels(second))
+    large = torch.nn.functional.interpolate(second[:40], scale_factor=2)
+    clip(folder / "second.ts", _pixels(large), **H264)  # type: ignore[arg-type]
+    clip(folder / "other.ts", _pixels(second[:4]), **H264)  # type: ignore[arg-type]
+    return folder
+
+
+def _pixels(frames: torch.Tensor) -> Any:
+    return (frames * 255).round().byte().permute(0, 2, 3, 1).contiguous().numpy()
+
+
+def lines_of(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_a_line_a_frame_as_localize_finds_them(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("live", folder / "map.safetensors", folder / "second.mkv")
+    out, err = capsys.readouterr()
+    found = lines_of(out)
+    assert list(found[0]) == KEYS
+    assert [line["frame"] for line in found] == [*range(64)]
+    assert [line["time"] for line in found] == pytest.approx([i / 25 for i in range(64)])
+    assert found[30]["name"] == "0:00:01.200"
+    assert re.fullmatch(r"dejavu: 64 frames, 0 dropped; milliseconds a frame: p50 [\d.]+, p99 [\d.]+\n", err)
+    run(
+        "localize", folder / "map.safetensors", folder / "second.mkv", "--filter", "--out", tmp_path / "m.csv"
+    )
+    rows = list(csv.DictReader((tmp_path / "m.csv").open()))
+    assert [line["reference_frame"] for line in found] == [int(row["place"]) for row in rows]
+    assert [line["accepted"] for line in found] == [row["accepted"] in ("1", "True") for row in rows]
+    assert sum(abs(line["place"] - line["frame"]) <= 5 for line in found) > 50
+
+
+def test_without_a_filter_there_is_no_posterior(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for length in ("1", "5"):
+        run("live", folder / "map.safetensors", folder / "second.mkv", "--sequence", length)
+        found = lines_of(capsys.readouterr().out)
+        assert {line["posterior"] for line in found} == {None}
+        assert sum(abs(line["place"] - line["frame"]) <= 5 for line in found) > 50
+
+
+def test_a_pipe_is_brought_to_the_size_of_the_map(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with piped(tmp_path, (folder / "second.ts").read_bytes()) as pipe:
+        run("live", folder / "map.safetensors", pipe)
+    out, err = capsys.readouterr()
+    found = lines_of(out)
+    told = re.match(r"dejavu: (\d+) frames, (\d+) dropped", err)
+    assert told is not None
+    assert [len(found), 40] == [int(told[1]), int(told[1]) + int(told[2])]
+    assert found[-1]["frame"] == 39
+    assert abs(found[-1]["place"] - 39) <= 5
+
+
+@pytest.mark.parametrize(
+    ("after", "words"),
+    [("other.ts", ("64 x 64", "128 x 128")), (None, ("stalled", "0.4"))],
+)
+def test_what_was_found_is_kept_where_a_stream_fails(
+    after: str | None,
+    words: tuple[str, ...],
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    data = b"".join((folder / name).read_bytes() for name in ("second.ts", after) if name)
+    with (
+        piped(tmp_path, data, open_for=0 if after else 20) as pipe,
+        pytest.raises(SystemExit) as stop,
+    ):
+        run("live", folder / "map.safetensors", pipe, "--timeout", "0.4")
+    out, err = capsys.readouterr()
+    assert stop.value.code == 2
+    summary, problem = err.splitlines()
+    assert all(word in problem for word in words)
+    assert len(lines_of(out)) == int(summary.split()[1]) > 0
+
+
+def test_frames_are_dropped_in_real_time_only(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call = LiveLocalizer.__call__
+    left_out = []
+
+    def slow(self: LiveLocalizer, frame: Any, dropped: int = 0) -> LiveMatch:
+        left_out.append(dropped)
+        time.sleep(0.1)
+        return call(self, frame, dropped)
+
+    monkeypatch.setattr(LiveLocalizer, "__call__", slow)
+    run("live", folder / "map.safetensors", folder / "second.mkv", "--realtime")
+    out, err = capsys.readouterr()
+    found = lines_of(out)
+    assert len(found) < 40
+    assert f"{len(found)} frames, {64 - len(found)} dropped" in err
+    assert sum(left_out) + len(found) == 64
+    run("live", folder / "map.safetensors", f"{folder / 'second.mkv'}?stop=8")
+    assert "8 frames, 0 dropped" in capsys.readouterr().err
+
+
+def test_an_interrupt_ends_with_the_summary(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call = LiveLocalizer.__call__
+
+    def interrupted(self: LiveLocalizer, frame: Any, dropped: int = 0) -> LiveMatch:
+        match = call(self, frame, dropped)
+        if match.place >= 20:
+            raise KeyboardInterrupt
+        return match
+
+    monkeypatch.setattr(LiveLocalizer, "__call__", interrupted)
+    run("live", folder / "map.safetensors", folder / "second.mkv")
+    out, err = capsys.readouterr()
+    assert err.startswith(f"dejavu: {len(lines_of(out))} frames, 0 dropped")
+    assert 10 < len(lines_of(out)) < 40
+
+
+@pytest.mark.parametrize("how", ["interrupt", "head"])
+def test_a_process_that_nobody_needs_any_more_ends(how: str, folder: Path, tmp_path: Path) -> None:
+    """Ctrl-C is how a camera is ended; and who reads the lines may leave."""
+    with piped(tmp_path, (folder / "second.ts").read_bytes() * 2, open_for=60) as pipe:
+        command = [sys.executable, "-m", "dejavu_torch.cli", "live", str(folder / "map.safetensors"), pipe]
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        )
+        assert process.stdout is not None
+        assert process.stderr is not None
+        json.loads(process.stdout.readline())
+        if how == "interrupt":
+            process.send_signal(signal.SIGINT)
+        else:
+            process.stdout.close()
+        assert process.wait(20) == 0
+        assert re.fullmatch(r"dejavu: \d+ frames, \d+ dropped; .*\n", process.stderr.read())
+
+
+def test_the_page_shows_frame_reference_and_answer(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states: list[dict[str, Any]] = []
+    show = Page.show
+
+    def shown(self: Page, moment: Any) -> None:
+        show(self, moment)
+        if moment.shot.number in (30, 63):
+            with urlopen(f"{self.url}state") as answer:
+                states.append(json.load(answer))
+
+    monkeypatch.setattr(Page, "show", shown)
+    reference = ("--reference", "sim:aerial?frames=64")
+    run("live", folder / "map.safetensors", folder / "second.mkv", "--page", "0", *reference)
+    out, err = capsys.readouterr()
+    assert re.match(r"dejavu: the page is at http://127\.0\.0\.1:\d+/\n", err)
+    assert [state["number"] for state in states] == [30, 63]
+    assert [state["place"] for state in states] == [lines_of(out)[i]["place"] for i in (30, 63)]
+    assert all(state["reference"].startswith("data:image/jpeg") for state in states)
+    assert max(states[0]["curve"]) == pytest.approx(states[0]["posterior"], abs=1e-3)
+
+
+def test_a_port_in_use_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Page(0) as page:
+        port = page.url.rpartition(":")[2].strip("/")
+        words = ("live", folder / "map.safetensors", folder / "second.mkv", "--page", port)
+        assert port in fails(capsys, *words)
+
+
+MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "camera": (("/dev/video99",), ("/dev/video99 is not there", "camera")),
+    "address": (("rtsp://127.0.0.1:1/x",), ("rtsp://127.0.0.1:1/x", "refused")),
+    "file": (("missing.mp4",), ("missing.mp4 is not there",)),
+    "no times": (("sim:aerial?frames=20", "--realtime"), ("no times", "video")),
+    "camera's time": (("/dev/video99", "--realtime"), ("its own time",)),
+    "reference alone": (("sim:aerial?frames=20", "--reference", "sim:aerial"), ("--page",)),
+    "reference": (
+        ("sim:aerial?frames=20", "--page", "0", "--reference", "sim:aerial?frames=20"),
+        ("20 frames", "64"),
+    ),
+    "port": (("sim:aerial?frames=20", "--page", "99999"), ("99999", "65535")),
+    "timeout": (("/dev/video99", "--timeout", "0"), ("--timeout 0", "above 0")),
+    "both": (("sim:aerial?frames=20", "--filter", "--sequence", "5"), ("--sequence 5", "--filter")),
+    "moves": (("sim:aerial?frames=20", "--moves", "[1]", "--sequence", "5"), ("--filter",)),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_one_line(mistake: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words, told = MISTAKES[mistake]
+    error = fails(capsys, "live", folder / "map.safetensors", *words)
+    assert [word for word in told if word not in error] == []
+
+
+def test_a_map_of_even_steps_is_refused_but_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = DejaVu(velocity=camera(), mapper=SpectralMapper(20.0), whitening="none").learn(footage(REFERENCE))
+    model.save(tmp_path / "map.safetensors")
+    np.save(tmp_path / "frames.npy", _pixels(footage(REFERENCE[:9]))[..., 0])
+    words = ("live", tmp_path / "map.safetensors", tmp_path / "frames.npy")
+    assert "--as_is" in fails(capsys, *words)
+    run(*words, "--as_is")
+    found = lines_of(capsys.readouterr().out)
+    assert len(found) == 9
+    assert any(line["place"] != line["reference_frame"] for line in found)
+
+
+def test_a_bare_page_has_a_port(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ports = []
+    monkeypatch.setattr(
+        "dejavu_torch.cli.live.Page.__init__", lambda self, port, *_: ports.append(port) or 1 / 0
+    )
+    with pytest.raises(ZeroDivisionError):
+        run("live", folder / "map.safetensors", "sim:aerial?frames=20", "--page")
+    assert ports == [8765]

@@ -1,0 +1,78 @@
+"""Video files and streams that tests write, and which of their frames is which."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from torch import Tensor
+
+H264 = {"codec": "libx264", "pixels": "yuv420p"}
+
+
+def pictures(n: int, height: int = 32, width: int = 48) -> np.ndarray:
+    """(n,H,W,3): frame i has grey level 8 * i on its left half, noise of its own on the right one."""
+    frames = np.random.default_rng(0).integers(0, 256, (n, height, width, 3), np.uint8)
+    frames[:, :, : width // 2] = 8 * np.arange(n, dtype=np.uint8)[:, None, None, None]
+    return frames
+
+
+def clip(
+    path: Path,
+    frames: np.ndarray,
+    codec: str = "ffv1",
+    pixels: str = "bgr0",
+    ticks: list[int] | None = None,
+    bframes: int | None = None,
+    turn: int | None = None,
+    options: dict[str, str] | None = None,
+    base: Fraction = Fraction(1, 25),
+) -> Path:
+    """Write frames at 25 per second, or at the given multiples of the time base."""
+    with av.open(str(path), "w", options=options or {}) as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt, stream.bit_rate = pixels, 4_000_000
+        stream.codec_context.time_base = base
+        if bframes is not None:
+            stream.codec_context.max_b_frames = bframes
+        if turn is not None:
+            stream.set_display_rotation(turn)
+        for i, pixel in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(pixel, "rgb24")
+            frame.pts, frame.time_base = i if ticks is None else ticks[i], base
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def numbers(frames: Tensor) -> list[int]:
+    """Which of `pictures` each frame is."""
+    return (frames[:, :, 4:-4, 4:16].mean((1, 2, 3)) * 255 / 8).round().int().tolist()
+
+
+@contextmanager
+def piped(folder: Path, data: bytes, open_for: float = 0) -> Iterator[str]:
+    """A named pipe that gives these bytes, once, and stays open for so many seconds."""
+    path, done = folder / "pipe", threading.Event()
+    os.mkfifo(path)
+
+    def write() -> None:
+        with suppress(BrokenPipeError), path.open("wb") as pipe:
+            pipe.write(data)
+            pipe.flush()
+            done.wait(open_for)
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    try:
+        yield str(path)
+    finally:
+        done.set()
+        writer.join(5)
