@@ -25,7 +25,8 @@ from dejavu_torch import DejaVu, LiveLocalizer, SpectralMapper, Whitening, open_
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.live.page import Page
 
-KEYS = ["frame", "time", "place", "reference_frame", "name", "score", "posterior", "accepted", "milliseconds"]
+KEYS = ["frame", "time", "place", "reference_frame", "name", "score", "posterior", "probability", "accepted"]
+KEYS += ["milliseconds"]
 
 
 @pytest.fixture(scope="module")

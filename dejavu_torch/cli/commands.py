@@ -216,6 +216,7 @@ def run_live(
     speeds: list[float] | None = None,
     moves: list[float] | None = None,
     threshold: float | None = None,
+    precision: float | None = None,
     page: int | None = None,
     reference: str | None = None,
     realtime: bool = False,
@@ -238,6 +239,7 @@ def run_live(
         speeds: as of `dejavu localize`
         moves: as of `dejavu localize`
         threshold: accept a match whose score is below
+        precision: accept instead what is at least as probably right, such as .99
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
             for any that is free
         reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
@@ -257,10 +259,11 @@ def run_live(
     model = DejaVu.load(map, features).to(where)
     if as_is:
         model.velocity = None
-    model.threshold = model.threshold if threshold is None else threshold
+    _accept_by(model, threshold, precision)
     if sequence is None:
         filter = True
     matcher = _sequence_of(1 if sequence is None else sequence, speeds, filter, moves, APART, threshold)
+    model.check_precision(matcher)
     follow(model, matcher, source, f"{source} on {map}", page, reference, realtime, timeout)
 
 

@@ -120,6 +120,7 @@ def line_of(shot: Shot, match: LiveMatch) -> str:
         "name": match.name,
         "score": match.score,
         "posterior": match.posterior,
+        "probability": match.probability,
         "accepted": match.accepted,
         "milliseconds": round(match.milliseconds, 3),
     }

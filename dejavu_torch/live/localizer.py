@@ -29,8 +29,9 @@ class LiveMatch(NamedTuple):
 
     place: the reported place, -1 where none has a finite score. frame: the reference frame that it shows, -1
     likewise. name: of that frame, "" where it has none. score: as of `Match`, lower is better. posterior: the
-    probability that the place is right, given all frames so far; NaN without a filter. accepted: as of
-    `Match`. milliseconds: from the frame to this answer.
+    probability that the filter gives the place, of all frames so far; NaN without a filter. probability: of
+    being right, where the map is calibrated; NaN where it is not. accepted: as of `Match`. milliseconds: from
+    the frame to this answer.
     """
 
     place: int
@@ -38,6 +39,7 @@ class LiveMatch(NamedTuple):
     name: str
     score: float
     posterior: float
+    probability: float
     accepted: bool
     milliseconds: float
 
@@ -122,6 +124,7 @@ class LiveLocalizer:
             self.model.frame_name(shown) if shown >= 0 else "",
             score,
             math.nan if filter is None else math.exp(-score),
+            math.nan if match.probability is None else float(match.probability),
             bool(match.accepted),
             1e3 * (time.perf_counter() - began),
         )

@@ -173,8 +173,9 @@ def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = Fal
     """
     kinds: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {"single": [], "filter": []}
     for descriptors, places in trials:
-        known = places >= 0
         scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
+        places = places.to(scores.device)
+        known = places >= 0
         near = places.clamp(min=0)[:, None] + torch.arange(
             -2 * TOLERANCE, 2 * TOLERANCE + 1, device=scores.device
         )

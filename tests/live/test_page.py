@@ -31,7 +31,7 @@ def moment(number: int = 7, name: str = "left<b>.png", accepted: bool = True, ti
     pixels[:, :16] = (200, 40, 40)
     scores = torch.full((3000,), 9.0)
     scores[1200:1210] = torch.tensor([3, 2, 1, 0.2, 0.1, 0.1, 0.2, 1, 2, 3])
-    match = LiveMatch(1204, 1204, name, 0.1, math.exp(-0.1), accepted, 12.5)
+    match = LiveMatch(1204, 1204, name, 0.1, math.exp(-0.1), 0.99, accepted, 12.5)
     return Moment(Shot(number, time, pixels), match, scores, True, 8, 2, 11.0, 19.0)
 
 
