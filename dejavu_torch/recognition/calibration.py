@@ -30,7 +30,8 @@ class Platt(NamedTuple):
     offset: float
 
     def probability(self, evidence: Tensor) -> Tensor:
-        """Of evidence (Q,): (Q,) float64, 0 where it is -inf."""
+        """Of evidence (Q,): (Q,) float64 on the CPU, 0 where it is -inf."""
+        evidence = evidence.cpu()  # not every device has double precision
         finite = evidence.double().nan_to_num(neginf=0.0)
         p = torch.sigmoid(self.slope * finite + self.offset)
         return torch.where(evidence.isneginf(), 0.0, p)
@@ -143,7 +144,7 @@ class Track:
         self.told = self.weight = 0.0
 
     def __call__(self, found: Tensor, scores: Tensor) -> Tensor:
-        """Of the filter's scores and those of single queries, each (B,N) -> (B,)."""
+        """Of the filter's scores and those of single queries, each (B,N) -> (B,) float64 on the CPU."""
         match = best_match(found)
         near = match.index.clamp(min=0)[:, None] + torch.arange(-NEAR, NEAR + 1, device=found.device)
         mean, spread, _ = moments_of(scores)
@@ -154,9 +155,10 @@ class Track:
             self.told = MEMORY * self.told + (1 - MEMORY) * one
             self.weight = MEMORY * self.weight + 1 - MEMORY
             lately.append(self.told / self.weight)
-        p = (-match.score.double()).exp().clamp(SURE, 1 - SURE)
-        stood = torch.tensor(lately, dtype=torch.float64, device=p.device)
-        return torch.where(match.score.isfinite(), p.logit() + SPREADS * stood, -math.inf)
+        score = match.score.cpu().double()
+        odds = (-score).exp().clamp(SURE, 1 - SURE).logit()
+        stood = torch.tensor(lately, dtype=torch.float64)
+        return torch.where(score.isfinite(), odds + SPREADS * stood, -math.inf)
 
 
 @torch.no_grad()

@@ -92,7 +92,7 @@ class Matching(NamedTuple):
             yield Found(
                 Candidates(*(column.cpu() for column in candidates)),
                 {length: best_match(part).map(Tensor.cpu) for length, part in sums.items()},
-                None if self.platt is None or evidence is None else self.platt.probability(evidence).cpu(),
+                None if self.platt is None or evidence is None else self.platt.probability(evidence),
             )
 
     def _parts(self, batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, dict[int, Tensor], Tensor | None]]:
