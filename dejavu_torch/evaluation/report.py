@@ -211,7 +211,11 @@ def summary(report: Report) -> str:
         lines.append(f"Here --threshold {threshold:.9g} would accept right places only")
     error = facts.get("rejection", {}).get("expected_calibration_error")
     if error is not None:
-        lines.append(f"Probabilities differ from the share of right answers by {error:.3f} on average")
+        full = facts["rejection"]["recall_at_100_precision"]
+        lines.append(
+            f"Probabilities differ from the share of right answers by {error:.3f} on average (expected "
+            f"calibration error); in their order R@100P is {full:.3f}"
+        )
     if any(is_late(one) for one in report.shown().values()):
         lines.append(_LATE)
     if "seconds_learn" in facts:
