@@ -23,6 +23,7 @@ TRAINING = (ROOT / "docs" / "training.md").read_text()
 ROUTES = (ROOT / "docs" / "real_routes.md").read_text()
 SPECTRAL = (ROOT / "docs" / "spectral_maps.md").read_text()
 SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
+REJECTION = (ROOT / "docs" / "rejection.md").read_text()
 STORAGE = (ROOT / "docs" / "storage.md").read_text()
 LIVE = (ROOT / "docs" / "live.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -89,8 +90,8 @@ def understand(line: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE, LIVE],
-    ids=["README", "training", "real_routes", "spectral_maps", "sequences", "storage", "live"],
+    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE, LIVE, REJECTION],
+    ids=["README", "training", "real_routes", "spectral_maps", "sequences", "storage", "live", "rejection"],
 )
 def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
@@ -111,6 +112,12 @@ def test_lines_over_cycles_are_those_of_the_code_shown(capsys: pytest.CaptureFix
     for row, line in zip(rows, printed, strict=True):
         assert row[:3] == line[:3]
         assert [float(cell) for cell in row[3:]] == pytest.approx([float(cell) for cell in line[3:]], rel=0.1)
+
+
+def test_the_python_on_rejection_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    (shown,) = re.findall(r"```python\n(.*?)```", REJECTION, re.DOTALL)
+    exec(shown.replace("frames=400", "frames=100"), {})
+    assert capsys.readouterr().out.count("tensor(") == 2
 
 
 def test_the_text_on_training_names_options() -> None:
