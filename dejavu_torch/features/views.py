@@ -15,6 +15,7 @@ BLOCK = 64  # frames augmented at once
 STRETCH, EVERY = 20, 10  # frames of a stretch, and which of the stretches are taken
 STRONGER = 1.5  # than what a whitening knows, since it has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all stretches together
+TIMES = 2  # of a short route, as many as it has itself at most
 LARGEST = {"scale": 0.9, "rotation": 180.0, "gamma": 10.0, "blur": 20.0}  # strengths that make sense; else 1
 
 
@@ -110,7 +111,8 @@ class Stretches(Traverse):
         length = min(STRETCH, max(1, frames // EVERY))
         starts = range(0, frames - length + 1, EVERY * length)
         self.starts = starts[:: max(1, len(starts) * length // MOST)]
-        self.times = max(1, -(-FEWEST // (len(self.starts) * length)))
+        wanted = min(FEWEST, TIMES * frames)
+        self.times = max(1, -(-wanted // (len(self.starts) * length)))
         self.traverse, self.stretch, self.seed = traverse, length, seed
         self.augmentation = Augmentation(**{name: _stronger(name, one) for name, one in strengths.items()})
         self.name, self.length = f"changed frames of {traverse.name}", len(self.places)
