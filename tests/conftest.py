@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
+from PIL import Image
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -42,6 +45,12 @@ SLOW = (
 )
 
 
+PIXELS = {
+    *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_rejection", "test_several_places"),
+    "test_real_routes",
+}
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What runs whole commands is marked `slow` as well as single tests above 5 s."""
     here = Path(__file__).parent
@@ -55,6 +64,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _one_thread() -> None:
     """Many small operations: on a busy machine two threads mostly wait for each other."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Where whole commands run again and again, their pictures are drawn but written as one pixel each, which
+    takes half of their time; what a picture looks like is tested elsewhere."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.stem in PIXELS:
+            one = io.BytesIO()
+            Image.new("L", (1, 1)).save(one, "png")
+            patch.setattr("dejavu_torch.evaluation.report.as_png", lambda picture: one.getvalue())
+        yield
 
 
 @pytest.fixture(autouse=True)
