@@ -57,6 +57,7 @@ from dejavu_torch.types import (
 log = logging.getLogger("dejavu_torch")
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
+TRIAL_SCORES = 2**22  # of the queries of a trial at all places
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors whitened at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
@@ -358,13 +359,23 @@ class DejaVu(nn.Module):
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
-            views = Stretches(as_traverse(reference), self.map.places, strengths).views
-            length = STRETCH
+            stretches = Stretches(as_traverse(reference), self.map.places, strengths)
+            views, length = stretches.views, stretches.stretch
         else:
-            length = LONGEST_TRIAL
+            length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
+        name = views.traverse.name
+        if len(views.places) and int(views.places.max()) >= self.map.places:
+            shown = f"{name} shows place {int(views.places.max())}"
+            raise InputError(f"{shown}; expected one of the map's {self.map.places}")
         descriptors = self.extract_all(views.traverse)
+        if len(descriptors) != len(views.places):
+            seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
+            raise InputError(f"{seen}; expected as many")
         parts = zip(descriptors.split(length), views.places.split(length), strict=True)
-        self.calibration = calibrated(self.map, (Trial(*part) for part in parts), another)
+        try:
+            self.calibration = calibrated(self.map, (Trial(*part) for part in parts), another)
+        except InputError as error:
+            raise InputError(f"calibrating by {name}: {error}") from error
         return self
 
     def calibrate_if_possible(self, reference: Traverse, views: Views | None = None) -> None:

@@ -67,6 +67,9 @@ def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> 
     assert report["accepted_right"] == pytest.approx(asked[0.9]["kept"] * report["recall_at_1"] * 64)
     assert (out / "reliability.png").exists()
     run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", "--out", tmp_path / "again")
+    strict = ("--filter", "--threshold", "1e-9")  # in place of the map's precision
+    run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", *strict, "--out", tmp_path / "none")
+    assert report_of(tmp_path / "none")["accepted"] == 0
     again = report_of(tmp_path / "again")
     assert (again["accepted"], again["accepted_right"]) == (report["accepted"], report["accepted_right"])
 
@@ -77,13 +80,15 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
     path = tmp_path / "map.safetensors"
     run("learn", ROUTE, "--map", path, "--calibration", "none")
     assert DejaVu.load(path).calibration is None
+    run("compare", ROUTE, AGAIN, "--calibration", "none", "--out", tmp_path / "out")
+    assert "rejection" not in report_of(tmp_path / "out")
     error = fails(capsys, "localize", path, AGAIN, "--precision", ".9", "--out", tmp_path / "m.csv")
     assert "the map is not calibrated" in error
     np.save(tmp_path / "features.npy", np.random.default_rng(0).random((64, 8), np.float32))
     error = fails(
         capsys, "learn", tmp_path / "features.npy", "--map", tmp_path / "n.safetensors", "--precision", ".9"
     )
-    assert "the map is not calibrated" in error
+    assert "no frames to calibrate by" in error
     assert not (tmp_path / "n.safetensors").exists()
 
 
@@ -93,7 +98,7 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
         (("--precision", "0"), ("precision is 0", "above 0")),
         (("--precision", "1"), ("precision is 1", "below 1")),
         (("--precision", ".9", "--threshold", "1"), ("--threshold", "--precision", "one of them")),
-        (("--precision", ".9", "--top", "3"), ("--precision", "--top 3")),
+        (("--precision", ".9", "--top", "3"), ("precision 0.9", "--top 3")),
         (("--precision", ".9", "--sequence", "5"), ("precision is 0.9", "calibrated for single queries")),
     ],
 )
@@ -117,7 +122,10 @@ def test_precisions_that_cannot_be_asked_for(
         (("--calibration", THIRD, "--calibration_truth", "60"), ("none of",)),
         (("--calibration_truth", "0"), ("--calibration SOURCE",)),
         (("--calibration", "nowhere"), ("nowhere is not there",)),
-        (("--distractors", AGAIN), ("another route",)),
+        (("--distractors", AGAIN), ("one of the traverses", "another route")),
+        (("--distractors", SEA, "--sequence", "5"), ("--distractors", "a filter")),
+        (("--precision", ".9", "--calibration", "none"), ("--precision 0.9", "calibrated map")),
+        (("--precision", ".9", "--top", "2"), ("--top 2", "precision 0.9")),
         (("--distractors", "nowhere"), ("nowhere is not there",)),
     ],
 )

@@ -6,6 +6,7 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 from __future__ import annotations
 
 import shlex
+import threading
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import REGISTRY, DejaVu, check_precision
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.recognition.calibration import NEVER
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from dejavu_torch.experiments.compare import Comparison
 
 NO_CALIBRATION = "none"
+UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
 COMPARED = ("map.safetensors", "matches.csv")  # beside a report of them
 APART = 5  # places: any two candidates of a query are further apart
 
@@ -116,7 +119,10 @@ def run_learn(
     traverse = model.resample(open_source(source), progress=True)
     _print_steps(traverse)
     traverse, views = _with_second(model, traverse, second, second_truth)
-    known = _with_calibration(model, traverse, calibration, calibration_truth)
+    if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
+        seen = f"--precision {model.precision}: {source} has no frames to calibrate by"
+        raise InputError(f"{seen}; expected --calibration SOURCE")
+    traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
     model.learn(traverse, progress=True, second=views)
     if calibration != NO_CALIBRATION:
         model.calibrate_if_possible(traverse, known)
@@ -180,9 +186,7 @@ def run_localize(
         model.velocity = None
     _accept_by(model, threshold, precision)
     if top is not None:
-        if precision is not None:
-            raise InputError(f"--precision {precision} is of one place, --top {top} of several; expected one")
-        model.precision = None
+        _check_top(top, model)
         check_candidates(top, APART, model.map.places)
     query = open_source(source)
     if model.step is not None:
@@ -254,7 +258,7 @@ def run_live(
     where = device_of(device)
     if reference is not None and page is None:
         raise InputError(f"--reference {reference} without --page; expected both")
-    if not timeout > 0:
+    if not 0 < timeout <= threading.TIMEOUT_MAX:
         raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
     model = DejaVu.load(map, features).to(where)
     if as_is:
@@ -322,23 +326,36 @@ def run_compare(
 
     where = device_of(device, learns=map is None)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
+    asked = model.threshold
     if filter:
         model.threshold = None  # of distances: that of the filter is none for the map to keep
     if map is not None:
         given = model
         model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
-        _accept_by(model, given.threshold, given.precision)
+        _accept_by(model, asked, given.precision)
+        model.threshold = None if filter and asked is not None else model.threshold
     model.to(where)
     first, queries = open_source(reference), open_source(query)
-    _check_report_folder(out, COMPARED, [reference, query, second], [truth, second_truth])
+    read = [truth, second_truth, calibration, calibration_truth]
+    _check_report_folder(out, COMPARED, [reference, query, second], read)
     others = [distractors] if isinstance(distractors, str) else distractors or []
-    read = [reference, query, second, calibration]
-    for other in others:
-        if other in read:
-            raise InputError(f"--distractors {other} is one of the traverses; expected another route")
+    strange = [open_source(other) for other in others]
+    traverses = [first, queries, *(open_source(one) for one in (second, calibration) if one not in UNREAD)]
+    for other in strange:
+        if Path(other.name).resolve() in [Path(one.name).resolve() for one in traverses]:
+            raise InputError(f"--distractors {other.name} is one of the traverses; expected another route")
+    if top is not None:
+        _check_top(top, model)
+    known_frames = calibration is None and len(first.frame_shape) == 3
+    certain = calibration not in UNREAD or (known_frames if map is None else model.calibration is not None)
+    if not certain or (matcher is not None and not filter):
+        for name, value in (("--precision", model.precision), ("--distractors", others or None)):
+            if value is not None:
+                why = "probabilities are of single queries and of a filter, on a calibrated map"
+                raise InputError(f"{name} {value}: {why}; expected --threshold, or none of both")
     _set_seed(model, seed)
     first, views = _with_second(model, first, second, second_truth, queries)
-    known = _with_calibration(model, first, calibration, calibration_truth, queries)
+    first, known = _with_calibration(model, first, calibration, calibration_truth, queries, second)
     result = compare(
         first,
         queries,
@@ -351,8 +368,8 @@ def run_compare(
         second=views,
         sequence=matcher,
         top=1 if top is None else top,
-        calibration=known,
-        distractors=[open_source(other) for other in others],
+        calibration="none" if calibration == NO_CALIBRATION else known,
+        distractors=strange,
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map, top)
@@ -525,8 +542,11 @@ def run_export(
     check_output_file(onnx)
     check_not_read(onnx, map)
     model = DejaVu.load(map, features)
-    model.threshold = model.threshold if threshold is None else threshold
+    _accept_by(model, threshold, None)
     matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
+    if matcher is not None and model.precision is not None:
+        seen = f"the map's precision, {model.precision}, is of single frames in an ONNX file"
+        raise InputError(f"{seen}; expected --threshold with a sequence or a filter")
     written = export_onnx(model, onnx, matcher)
     for kind in ("inputs", "outputs"):
         shapes = (f"{name} {tuple(shape)}" for name, shape in written.facts[kind].items())
@@ -562,6 +582,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         steps, seed = model.trained
         print(f"trained for {steps} steps, seed {seed}")
     print(f"map format {FORMAT}, its checksums agree")
+    known = [name for name, platt in (model.calibration or NEVER)._asdict().items() if platt is not None]
+    print(f"calibrated for: {', '.join(known) or 'nothing'}; precision: {model.precision}")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
     _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
 
@@ -645,19 +667,34 @@ def _with_second(
 
 
 def _with_calibration(
-    model: DejaVu, reference: Traverse, source: str | None, truth: str | None, query: Traverse | None = None
-) -> Views | None:
-    """The traverse that a map is calibrated by."""
-    if source in (None, NO_CALIBRATION):
+    model: DejaVu,
+    reference: Traverse,
+    source: str | None,
+    truth: str | None,
+    query: Traverse | None,
+    second: str | None,
+) -> tuple[Traverse, Views | None]:
+    """The reference, and the traverse that its map is calibrated by."""
+    if source in UNREAD:
         if truth is not None:
             seen = f"--calibration_truth {truth} is of no traverse"
             raise InputError(f"{seen}; expected --calibration SOURCE with it")
-        return None
+        return reference, None
+    if source == second:
+        raise InputError(f"--calibration {source} is that of --second; expected a further traverse")
     traverse = open_source(str(source))
     for other in (reference, query):
         if other is not None and Path(traverse.name).resolve() == Path(other.name).resolve():
             raise InputError(f"--calibration {source} is {other.name} itself; expected another traverse")
-    return model.places_shown(reference, traverse, truth)
+    reference = model.resample(reference, model.step, progress=True)
+    return reference, model.places_shown(reference, traverse, truth)
+
+
+def _check_top(top: int, model: DejaVu) -> None:
+    """Refuse to accept several places of a query by the probability of one."""
+    if model.precision is not None:
+        seen = f"--top {top} writes several places, and the precision {model.precision} is of one"
+        raise InputError(f"{seen}; expected --threshold in its place, or no --top")
 
 
 def _accept_by(model: DejaVu, threshold: float | None, precision: float | None) -> None:

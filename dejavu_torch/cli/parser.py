@@ -175,7 +175,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     if MODEL in function.__annotations__:
         settings = list(inspect.signature(DejaVu).parameters)
         changed = [one for one in settings if parsed[one] != parser.get_defaults()[one]]
-        lost = set(changed) - {"features", "threshold"}  # a map has all but these itself
+        lost = set(changed) - {"features", "threshold", "precision"}  # a map has all but these itself
         told = [word.lstrip("-").partition("=")[0] for word in words if word.startswith("--")]
         if name == "compare" and arguments["map"]:
             lost |= {one for one in ("second", "second_truth") if arguments[one] is not None}

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -82,7 +82,7 @@ def compare(
     others: Mapping[str, tuple[str, DejaVu]] | None = None,
     sequence: SequenceModel | None = None,
     top: int = 1,
-    calibration: Views | None = None,
+    calibration: Views | Literal["none"] | None = None,
     distractors: Sequence[Traverse] = (),
     progress: bool = False,
 ) -> Comparison:
@@ -107,7 +107,7 @@ def compare(
         sequence: scores consecutive queries together, on the map and on all that it is set beside.
         top: how many candidates of each query are wanted.
         calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a map that is
-            learned by changed frames of the reference.
+            learned by changed frames of the reference, "none" does not.
         distractors: routes that are not on the map: how many of their frames are accepted.
         progress: show progress bars on a terminal.
 
@@ -147,7 +147,7 @@ def compare(
         else:
             places = model.describe_reference(reference, second, text)
             model.learn_features(places, reference)
-        if calibration is not None or not has_map:
+        if isinstance(calibration, Views) or (calibration is None and not has_map):
             model.calibrate_if_possible(reference, calibration)
         model.check_precision(sequence)
     with timed(seconds, "localize"):
@@ -161,6 +161,8 @@ def compare(
         found = model.found(queries, wanted)
     match, candidates = found.match(model.threshold_of(sequence), model.precision), found.candidates
     off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
+    if distractors and not off_map:
+        log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
     model.cpu()  # baselines, null and pictures take their numbers one by one
     places, queries = places.cpu(), queries.cpu()
     if not lengths_known:

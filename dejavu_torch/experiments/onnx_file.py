@@ -234,6 +234,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
     platt = model.matching(None).platt if sequence is None else None
     if platt is not None:  # of `evidence_of`
         facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
+        facts |= {} if model.precision is None else {"precision": model.precision}
     threshold = model.threshold_of(sequence)
     facts |= {} if threshold is None else {"threshold": threshold}
     return facts | ({} if model.step is None else {"step": model.step})

@@ -110,7 +110,7 @@ class Stretches(Traverse):
             raise InputError(f"{traverse.name} holds ready features; expected frames to calibrate by")
         length = min(STRETCH, max(1, frames // EVERY))
         starts = range(0, frames - length + 1, EVERY * length)
-        self.starts = starts[:: max(1, len(starts) * length // MOST)]
+        self.starts = starts[:: max(1, -(-len(starts) * length // MOST))]
         wanted = min(FEWEST, TIMES * frames)
         self.times = max(1, -(-wanted // (len(self.starts) * length)))
         self.traverse, self.stretch, self.seed = traverse, length, seed
@@ -121,18 +121,34 @@ class Stretches(Traverse):
     def places(self) -> Tensor:
         """The frame that each shows, (n,) int64."""
         one = torch.tensor(self.starts)[:, None] + torch.arange(self.stretch)
-        return one.flatten().repeat(self.times)
+        return one[:, None].expand(-1, self.times, -1).flatten()
 
     def batches(self, size: int) -> Iterator[Tensor]:
         state = torch.Generator().manual_seed(self.seed).get_state()
-        for _ in range(self.times):
+        for frames in self._stretches():
+            for _ in range(self.times):
+                with torch.random.fork_rng(devices=[]):
+                    torch.set_rng_state(state)
+                    changed: Tensor = self.augmentation.train()(frames)
+                    state = torch.get_rng_state()
+                yield from changed.split(size)
+
+    def _stretches(self) -> Iterator[Tensor]:
+        """The frames of each."""
+        if hasattr(self.traverse, "read"):  # any frame as quickly as any other
             for start in self.starts:
-                for frames in self.traverse.between(start, start + self.stretch):
-                    with torch.random.fork_rng(devices=[]):
-                        torch.set_rng_state(state)
-                        changed: Tensor = self.augmentation.train()(frames)
-                        state = torch.get_rng_state()
-                    yield from changed.split(size)
+                yield torch.cat(list(self.traverse.between(start, start + self.stretch)))
+            return
+        held: list[Tensor] = []
+        starts = iter(self.starts)
+        place, start = 0, next(starts)
+        for batch in self.traverse.between(0, self.starts[-1] + self.stretch):
+            for frame in batch:
+                held += [frame] if place >= start else []
+                place += 1
+                if len(held) == self.stretch:
+                    yield torch.stack(held)
+                    held, start = [], next(starts, place)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:

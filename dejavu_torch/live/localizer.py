@@ -90,6 +90,7 @@ class LiveLocalizer:
         self.device = model.map.positions.device
         if self.sequence is not None:
             self.sequence.check(None, model.map.places)
+        model.check_precision(self.sequence)
         self._pipeline = model.pipeline
         self._shape: tuple[int, ...] | None = None  # of the latest frame that fitted
         whitening = model.whitening

@@ -53,6 +53,9 @@ class Calibration(NamedTuple):
         return self.filter if isinstance(sequence, PlaceFilter) and sequence.search_every == 1 else None
 
 
+NEVER = Calibration(None, None)
+
+
 class Trial(NamedTuple):
     """Consecutive queries whose places are known.
 

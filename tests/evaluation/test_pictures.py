@@ -17,12 +17,12 @@ from dejavu_torch import (
     PlaceFilter,
     Preprocess,
     SequenceMatcher,
-    SlidingWindow,
     SpectrogramAnalysis,
 )
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
+from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.evaluation.activation import best_phases
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.pictures import (

@@ -16,7 +16,7 @@ from dejavu_torch import DejaVu
 from dejavu_torch.cli import main
 
 README = Path(__file__).parents[2] / "README.md"
-PICTURES = ("pairs", "coverage", "scores", "pr", "auc", "storage", "spectrum", "components")
+PICTURES = ("pairs", "coverage", "scores", "pr", "auc", "storage", "spectrum", "components", "reliability")
 OTHERS = ("uncompressed", "stride", "interpolated", "null", "hog", "hog_stride_coarsest", "paper")
 OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}
 SCORES = {

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, open_source
+from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.features.views import Stretches, Views
 from dejavu_torch.recognition.calibration import (
     Calibration,
@@ -168,11 +169,11 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
 def test_every_tenth_stretch_is_taken(frames: int, stretch: int, starts: list[int]) -> None:
     route = open_source(f"sim:aerial?frames={frames}")
     changed = Stretches(route, frames, {"noise": 0.01})
-    once = changed.places[: len(starts) * stretch]
-    assert once.tolist() == [start + i for start in starts for i in range(stretch)]
+    shown = changed.places.view(len(starts), -1, stretch)
+    assert shown[:, 0].flatten().tolist() == [start + i for start in starts for i in range(stretch)]
     assert changed.length is not None
     assert min(600, 2 * frames) <= changed.length <= 1200
-    assert torch.equal(changed.places, once.repeat(changed.length // len(once)))
+    assert bool((shown == shown[:, :1]).all())
 
 
 def test_changed_frames_show_their_places_whatever_the_batch() -> None:
@@ -188,6 +189,8 @@ def test_changed_frames_show_their_places_whatever_the_batch() -> None:
     assert (once - frames[changed.places]).std() == pytest.approx(
         0.15 * 0.7**0.5, rel=0.3
     )  # 1.5 times as much
+    unread = FrameRange(route, 0, 300)  # which cannot begin anywhere
+    torch.testing.assert_close(torch.cat(list(Stretches(unread, 300, plain).batches(9))), frames[same.places])
     with refused("ready features"):
         Stretches(open_source_of(torch.rand(30, 4)), 30, plain)
 
@@ -257,6 +260,12 @@ def test_a_map_without_calibration_tells_no_probability() -> None:
         DejaVu().calibrate(features)
     with refused("neither a reference nor views"):
         model.calibrate(None)
+    with refused("60 frames and 64 places"):
+        model.calibrate(None, Views(open_source_of(features[:60]), torch.arange(64)))
+    with refused("shows place 64", "one of the map's 64"):
+        model.calibrate(None, Views(open_source_of(features), torch.arange(64) + 1))
+    with refused("calibrating by", "none of"):
+        model.calibrate(None, Views(open_source_of(features.flip(0)[:20]), torch.arange(20)))
     model.calibrate(None, Views(open_source_of(features + 0.01), torch.arange(64)))
     assert model.localize(features).probability is not None
 
