@@ -546,7 +546,7 @@ class DejaVu(nn.Module):
             seen = "the map is not calibrated"
         else:
             seen = "the map is calibrated for single queries and for a filter that always searches"
-        raise InputError(f"the precision is {self.precision}, but {seen}; expected a threshold, or none")
+        raise InputError(f"the precision is {self.precision}, but {seen}; expected a threshold in its place")
 
     def threshold_of(self, sequence: SequenceModel | None) -> float | None:
         """What the score of a query, or of a sequence, has to be below to be accepted."""
