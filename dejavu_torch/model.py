@@ -729,6 +729,21 @@ class DejaVu(nn.Module):
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
 
 
+def check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
+    """How many features a frame gives; refuse, before the long work, traverses that do not give as many."""
+    device = model.map.positions.device
+    counts = [
+        next(feature_batches(traverse, model.pipeline, 1, device)).shape[1] for traverse in (reference, query)
+    ]
+    if counts[0] != counts[1]:
+        seen = " and ".join(
+            f"{traverse.name} gives {count} features a frame of {' x '.join(map(str, traverse.frame_shape))}"
+            for traverse, count in zip((reference, query), counts, strict=True)
+        )
+        raise InputError(f"{seen}; expected as many, as frames of one size give")
+    return counts[0]
+
+
 def check_precision(precision: float | None) -> None:
     """Refuse a precision that no answers can be asked for.
 

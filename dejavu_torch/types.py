@@ -96,6 +96,10 @@ class Traverse(ABC):
         """What frame i is called where it comes from: a file name, the time in a video; "" for no name."""
         return ""
 
+    def frame_time(self, i: int) -> float:
+        """When frame i was taken, in seconds; NaN where that is not known."""
+        return math.nan
+
     def batch_size(self, most: int) -> int:
         """How many frames to read at a time: `most`, or fewer where frames are large.
 

@@ -143,6 +143,18 @@ def test_frames_are_dropped_in_real_time_only(
     assert "8 frames, 0 dropped" in capsys.readouterr().err
 
 
+def test_a_part_of_a_video_is_brought_to_the_size_of_the_map_and_keeps_its_times(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = next(open_source(folder / "first.mkv").batches(24))
+    path = clip(tmp_path / "large.mkv", _pixels(torch.nn.functional.interpolate(frames, scale_factor=2)))
+    run("live", folder / "map.safetensors", f"{path}?start=4&stop=20", "--realtime", "--sequence", "1")
+    found = lines_of(capsys.readouterr().out)
+    assert all(line["place"] == 4 + line["frame"] for line in found)
+    expected = [(4 + line["frame"]) / 25 for line in found]
+    assert [line["time"] for line in found] == pytest.approx(expected, abs=2e-3)
+
+
 def test_an_interrupt_ends_with_the_summary(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

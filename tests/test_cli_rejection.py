@@ -66,6 +66,12 @@ def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> 
     asked = {one["asked"]: one for one in facts["precision"]}
     assert report["accepted_right"] == pytest.approx(asked[0.9]["kept"] * report["recall_at_1"] * 64)
     assert (out / "reliability.png").exists()
+    run("evaluate", out / "matches.csv", "--truth", "0", "--out", tmp_path / "file")
+    of_file = report_of(tmp_path / "file")["rejection"]
+    for key in ("expected_calibration_error", "auc"):
+        assert of_file[key] == pytest.approx(facts[key], abs=1e-5)
+    assert of_file["precision"] == facts["precision"]
+    assert (tmp_path / "file" / "reliability.png").exists()
     run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", "--out", tmp_path / "again")
     strict = ("--filter", "--threshold", "1e-9")  # in place of the map's precision
     run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", *strict, "--out", tmp_path / "none")
@@ -135,3 +141,14 @@ def test_traverses_that_do_not_serve(
     error = fails(capsys, "compare", ROUTE, AGAIN, "--out", tmp_path / "out", *words)
     assert [word for word in told if word not in error] == [], error
     assert not (tmp_path / "out").exists()
+
+
+def test_frames_of_another_size_are_told_ahead_of_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.save(tmp_path / "small.npy", np.zeros((64, 32, 32), np.uint8))
+    monkeypatch.setattr(DejaVu, "learn", None)
+    words = ("--map", tmp_path / "map.safetensors", "--calibration", tmp_path / "small.npy")
+    error = fails(capsys, "learn", ROUTE, *words)
+    assert "small.npy gives" in error
+    assert "one size" in error

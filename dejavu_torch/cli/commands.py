@@ -20,7 +20,7 @@ from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import REGISTRY, DejaVu, check_precision
+from dejavu_torch.model import REGISTRY, DejaVu, check_precision, check_sizes
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import NEVER
@@ -248,12 +248,14 @@ def run_live(
             for any that is free
         reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
         realtime: take the frames of a video at their times, and drop those that come too fast
-        timeout: seconds without a frame after which a camera, address or pipe has stalled
+        timeout: seconds without a frame after which a camera, address or pipe, the only ones it is for, has
+            stalled
         as_is: take the frames as they are, though the map's are resampled
         device: as of `dejavu localize`
         features: class of the map's features, if not ours
     """
     from dejavu_torch.cli.live import follow
+    from dejavu_torch.data.camera import without_password
 
     where = device_of(device)
     if reference is not None and page is None:
@@ -268,7 +270,7 @@ def run_live(
         filter = True
     matcher = _sequence_of(1 if sequence is None else sequence, speeds, filter, moves, APART, threshold)
     model.check_precision(matcher)
-    follow(model, matcher, source, f"{source} on {map}", page, reference, realtime, timeout)
+    follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
 
 
 def run_compare(
@@ -686,6 +688,7 @@ def _with_calibration(
     for other in (reference, query):
         if other is not None and Path(traverse.name).resolve() == Path(other.name).resolve():
             raise InputError(f"--calibration {source} is {other.name} itself; expected another traverse")
+    check_sizes(model, reference, traverse)
     reference = model.resample(reference, model.step, progress=True)
     return reference, model.places_shown(reference, traverse, truth)
 

@@ -9,14 +9,12 @@ import sys
 from collections import deque
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
-from pathlib import Path
 
 import numpy as np
 
 from dejavu_torch.cli.process import interrupts_raise, reader_left
 from dejavu_torch.data.camera import Camera, Shot, is_stream, shots_of, stretched
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.video import SUFFIXES, Video
 from dejavu_torch.live.feed import Feed, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
 from dejavu_torch.live.page import Moment, Page, ReferencePictures
@@ -88,17 +86,11 @@ def shots_from(source: str, model: DejaVu, realtime: bool) -> tuple[Iterable[Sho
             raise InputError(f"--realtime: {source} has its own time; expected a video file with it")
         camera = Camera(source, size)
         return _noted(camera), True, camera.name
-    traverse = open_source(source)
-    path = Path(source)
-    if size is not None and (path.is_dir() or path.suffix.lower() in SUFFIXES):  # and no options of its own
-        own = traverse.frame_shape
-        if own[1:] != size:
-            note = stretched(traverse.name, (own[1], own[2]), size)
-            if note:
-                log.warning("%s", note)
-            traverse = open_source(f"{source}?width={size[1]}&height={size[0]}")
-    if realtime and not isinstance(traverse, Video):
-        raise InputError(f"--realtime: {traverse.name} has no times; expected a video file with it")
+    own, traverse = open_source(source).frame_shape, open_source(source, size)
+    if traverse.frame_shape != own and size is not None:
+        note = stretched(traverse.name, (own[1], own[2]), size)
+        if note:
+            log.warning("%s", note)
     shots = shots_of(traverse)
     return (in_real_time(shots, traverse.name) if realtime else shots), realtime, traverse.name
 

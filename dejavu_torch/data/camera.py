@@ -44,11 +44,21 @@ def is_stream(source: str) -> bool:
     """Whether a source is a camera, an address or a pipe, and no file or folder."""
     if source == PIPE or "://" in source or source.startswith("/dev/"):
         return True
-    try:
-        mode = os.stat(source).st_mode
-    except (OSError, ValueError):
-        return False
-    return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
+    return _mode_is(source, stat.S_ISCHR) or _mode_is(source, stat.S_ISFIFO)
+
+
+def without_password(source: str) -> str:
+    """A source as messages name it, printable: an address without what only its user is to know.
+
+    Example:
+        >>> without_password("rtsp://me:secret@192.168.0.7/stream?token=1")
+        'rtsp://192.168.0.7/stream'
+    """
+    kind, mark, rest = source.partition("://")
+    if not mark:
+        return printable(source)
+    host, slash, path = rest.partition("/")
+    return printable(f"{kind}://{host.rpartition('@')[2]}{slash}{path.partition('?')[0]}")
 
 
 class Camera:
@@ -69,9 +79,9 @@ class Camera:
     """
 
     def __init__(self, source: str, size: tuple[int, int] | None = None) -> None:
-        self.source, self.size, self.name = source, size, printable(source)
-        self.device = source.startswith("/dev/") or _mode_is(source, stat.S_ISCHR)
+        self.source, self.size, self.name = source, size, without_password(source)
         self.ends = source == PIPE or _mode_is(source, stat.S_ISFIFO)
+        self.device = not self.ends and (source.startswith("/dev/") or _mode_is(source, stat.S_ISCHR))
         if source == PIPE:
             self.name = "standard input"
         self.note = ""
@@ -179,6 +189,5 @@ def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> 
 
 def shots_of(traverse: Traverse) -> Iterator[Shot]:
     """The frames of a traverse one by one, those of a video with their times."""
-    time_of = getattr(traverse, "frame_time", None)
     for i, batch in enumerate(traverse.batches(1)):
-        yield Shot(i, math.nan if time_of is None else time_of(i), batch[0])
+        yield Shot(i, traverse.frame_time(i), batch[0])

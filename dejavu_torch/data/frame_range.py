@@ -97,3 +97,6 @@ class FrameRange(Traverse):
 
     def frame_name(self, i: int) -> str:
         return self.traverse.frame_name(self.frames[i])
+
+    def frame_time(self, i: int) -> float:
+        return self.traverse.frame_time(self.frames[i])

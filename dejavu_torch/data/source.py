@@ -27,7 +27,7 @@ EXPECTED = (
 )
 
 
-def open_source(source: str | Path) -> Traverse:
+def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Traverse:
     """Open what a command was given to read.
 
     Args:
@@ -37,6 +37,8 @@ def open_source(source: str | Path) -> Traverse:
             underground; or `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window slid along one long
             image. Of all of them `start=`, `stop=` and `step=` take the frames [start, stop) only, every
             step-th of them, see `FrameRange`.
+        size: (height, width) in pixels that images of a folder and frames of a video are brought to where
+            the source names neither.
 
     Raises:
         InputError: missing, empty, or nothing that can be read.
@@ -52,6 +54,9 @@ def open_source(source: str | Path) -> Traverse:
     reader = _reader(text, address)
     arguments = _arguments(text, query, reader)
     part = {name: arguments.pop(name) for name in PART if name in arguments}
+    sides = {"height", "width"}
+    if size is not None and sides <= inspect.signature(reader).parameters.keys() - arguments.keys():
+        arguments["height"], arguments["width"] = size
     return FrameRange(reader(**arguments), **part) if part else reader(**arguments)
 
 

@@ -18,7 +18,7 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match
 
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
-EXPECTED = "columns query,place,score and, if wanted, accepted and rank"
+EXPECTED = "columns query,place,score and, if wanted, accepted, probability and rank"
 _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 
 
@@ -95,19 +95,20 @@ def read_matches(path: Path) -> Matches:
         path: a csv with a header. query: number of the query frame, in any order, each once or in lines that
             follow one another, as where resampled footage shows a frame several times. place: number of the
             reported frame of the reference, -1 for none. score: lower is better, inf for none. accepted: 1 or
-            0; where the column is missing, every match with a finite score is accepted. rank: where there is
+            0; where the column is missing, every match with a finite score is accepted. probability: of being
+            right, from 0 to 1; where the column is missing, none is known. rank: where there is
             such a column, the lines of a query are its candidates, ranks 1 to K in this order with one K for
             all queries, and the first is its match. Other columns are ignored.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
-        accepted.
+        accepted, probability 0.
 
     Raises:
         InputError: what cannot be read, with the number of the line.
     """
     queries: list[int] = []
     seen: set[int] = set()
-    reports: list[tuple[int, float, bool]] = []
+    reports: list[tuple[int, float, bool, float]] = []
     ranked: list[list[int]] = []
     for where, cells in _rows(path):
         query, place = (
@@ -123,6 +124,10 @@ def read_matches(path: Path) -> Matches:
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:
             raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
+        probability = as_number(cells.get("probability", "0"))
+        if probability is None or not 0 <= probability <= 1:
+            seen_ = f"probability is {cells['probability']!r}"
+            raise InputError(f"{where}: {seen_}; expected a number from 0 to 1")
         nothing = place < 0 or math.isinf(score)
         if rank > 1:
             ranked[-1].append(-1 if nothing else place)
@@ -130,15 +135,17 @@ def read_matches(path: Path) -> Matches:
         ranked.append([-1 if nothing else place])
         queries.append(query)
         seen.add(query)
-        reports.append((-1, math.inf, False) if nothing else (place, score, accepted))
+        reports.append((-1, math.inf, False, 0.0) if nothing else (place, score, accepted, probability))
     if not queries:
         raise InputError(f"{path} holds no matches; expected a line for each query")
     for query, places in zip(queries, ranked, strict=True):
         if len(places) != len(ranked[0]):
             seen_ = f"query {query} has {len(places)} ranks"
             raise InputError(f"{path}: {seen_}; expected {len(ranked[0])}, as query {queries[0]} has")
-    index, scores, accepted_ = zip(*reports, strict=True)
+    index, scores, accepted_, right = zip(*reports, strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
+    if "probability" in cells:
+        match = match.with_probability(torch.tensor(right, dtype=torch.float64))
     return Matches(torch.tensor(queries), match, torch.tensor(ranked))
 
 

@@ -35,11 +35,10 @@ from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
 from dejavu_torch.experiments.storage import noise_over_map, storage_curve
-from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import REGISTRY, DejaVu
+from dejavu_torch.model import REGISTRY, DejaVu, check_sizes
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
@@ -227,21 +226,6 @@ def _check_arguments(
         )
     if truth is not None:
         check_ground_truth(truth, interpolate)
-
-
-def check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
-    """How many features a frame gives; refuse, before the long work, traverses that do not give as many."""
-    device = model.map.positions.device
-    counts = [
-        next(feature_batches(traverse, model.pipeline, 1, device)).shape[1] for traverse in (reference, query)
-    ]
-    if counts[0] != counts[1]:
-        seen = " and ".join(
-            f"{traverse.name} gives {count} features a frame of {' x '.join(map(str, traverse.frame_shape))}"
-            for traverse, count in zip((reference, query), counts, strict=True)
-        )
-        raise InputError(f"{seen}; expected as many, as frames of one size give")
-    return counts[0]
 
 
 def _check_map(model: DejaVu, features: Tensor, name: str, tolerance: int) -> None:

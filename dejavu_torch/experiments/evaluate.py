@@ -28,6 +28,7 @@ from dejavu_torch.evaluation.curves import (
 from dejavu_torch.evaluation.matches import read_matches
 from dejavu_torch.evaluation.pictures import draw_coverage, draw_curves
 from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.model import read_place_map
 from dejavu_torch.text import printable
@@ -97,6 +98,7 @@ def evaluate_file(
     )
     accepted = facts["accepted"]
     facts |= candidate_facts(candidates, known, tolerance)
+    facts |= rejection_facts(match, known, tolerance, {})
     facts |= {
         "accepted_precision": facts["accepted_right"] / accepted if accepted else None,
         "matches": str(matches),
@@ -107,6 +109,7 @@ def evaluate_file(
     borders = torch.tensor([seen]) if place_map is None else place_map.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
     pictures |= draw_coverage(match, known, tolerance, borders, queries, facts["unit"])
+    pictures |= draw_reliability(match, known, tolerance)
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
 
 

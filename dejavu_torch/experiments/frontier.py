@@ -23,10 +23,9 @@ from dejavu_torch.evaluation.contenders import evaluate_each, sequences_as_json
 from dejavu_torch.evaluation.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments.bench import peak_memory
-from dejavu_torch.experiments.compare import check_sizes
 from dejavu_torch.experiments.reproduce import paper_model
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.model import DejaVu
+from dejavu_torch.model import DejaVu, check_sizes
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.matching import LENGTHS, Found, Matching, lengths_beside
 from dejavu_torch.recognition.sequence import SequenceMatcher

@@ -70,7 +70,7 @@ class Page:
     ) -> None:
         if not 0 <= port < 2**16:
             raise InputError(f"port {port}; expected one from 0 to 65535, 0 being any that is free")
-        self.title, self.reference, self.over = title, reference, ""
+        self.title, self.reference = title, reference
         self.moment: Moment | None = None
         page = self
 
@@ -132,7 +132,7 @@ class Page:
     def state(self, seen: str = "") -> dict[str, Any]:
         """What the page asks for again and again; without pictures where it has `seen` that frame."""
         moment = self.moment
-        state: dict[str, Any] = {"title": self.title, "over": self.over, "number": -1}
+        state: dict[str, Any] = {"title": self.title, "number": -1}
         if moment is None:
             return state
         shot, match = moment.shot, moment.match

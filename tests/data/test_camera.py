@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from videos import H264, clip, numbers, pictures, piped
 from dejavu_torch import open_source
 from dejavu_torch.data.camera import Camera, is_stream, shots_of
 from dejavu_torch.data.video import Video
+from dejavu_torch.types import InputError
 
 FRAMES = pictures(12)
 
@@ -101,6 +103,22 @@ def test_an_answer_names_no_file_of_this_machine(tmp_path: Path, stream: bytes) 
         with piped(tmp_path, (tmp_path / "list").read_bytes()) as pipe, refused("pipe"):
             list(Camera(pipe))
         (tmp_path / "pipe").unlink()
+
+
+def test_an_open_pipe_is_one_by_whatever_name(stream: bytes) -> None:
+    reading, writing = os.pipe()
+    thread = threading.Thread(target=lambda: (os.write(writing, stream), os.close(writing)))
+    thread.start()
+    assert len(list(Camera(f"/dev/fd/{reading}"))) == 12
+    thread.join()
+    os.close(reading)
+
+
+def test_messages_keep_what_only_the_user_of_an_address_is_to_know() -> None:
+    with pytest.raises(InputError) as error:
+        list(Camera("rtsp://me:secret@127.0.0.1:1/cam?token=hidden"))
+    assert "rtsp://127.0.0.1:1/cam" in str(error.value)
+    assert not {"me", "secret", "hidden"} & set(re.findall(r"\w+", str(error.value)))
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,8 @@ def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path: Path) -> No
         (PLAIN + "3,1,0.5\n", ("line 5", "3 cells", "expected 4")),
         (PLAIN + "0,1,0.5,1\n", ("line 5", "query 0", "twice")),
         (PLAIN + "3," + "1" * 200_000 + ",1,1\n", ("line 5", "field larger")),
+        ("query,place,score,probability\n3,1,0.5,1.5\n", ("line 2", "probability is '1.5'", "0 to 1")),
+        ("query,place,score,probability\n3,1,0.5,nan\n", ("line 2", "probability is 'nan'")),
         ("query,place,score\n", ("no matches",)),
         ("", ("no matches",)),
         (b"\x89PNG\r\n\x1a\n", ("UTF-8",)),
