@@ -17,6 +17,9 @@ from dejavu_torch.types import InputError, Scorer, SequenceModel
 TOLERANCE = 5  # places within which an answer is right
 MARGIN = 2.0  # weight of the margin beside the score itself
 SPREADS = 3.0  # nats that a filter's track counts for each standard deviation it stands out by
+MISSED = (
+    20  # wrong answers in a row, as a stretch of like places gives them, that a visit may have had none of
+)
 MEMORY = 0.9  # of what a track told, from one query to the next
 NEAR = 2  # places around an answer whose best score counts for a track
 SURE = 1e-6  # least distance of a filter's probability from 0 and 1
@@ -139,8 +142,8 @@ class Track:
     """How much a filter's answers stand out, one behind the other, which a single posterior cannot tell: off
     the map it follows the best of places that are all wrong.
 
-    The log odds of the answer, and `SPREADS` times how many standard deviations single queries have scored
-    below their mean there lately.
+    The log odds of the answer, and `SPREADS` times how much single queries have stood out there lately: how
+    many standard deviations they scored below their mean, and below the best place beyond `TOLERANCE`.
     """
 
     def __init__(self) -> None:
@@ -149,10 +152,11 @@ class Track:
     def __call__(self, found: Tensor, scores: Tensor) -> Tensor:
         """Of the filter's scores and those of single queries, each (B,N) -> (B,) float64 on the CPU."""
         match = best_match(found)
-        near = match.index.clamp(min=0)[:, None] + torch.arange(-NEAR, NEAR + 1, device=found.device)
         mean, spread, _ = moments_of(scores)
-        own = scores.gather(1, near.clamp(0, scores.shape[1] - 1)).amin(1)
-        deviations = torch.where(own.isfinite(), (mean[:, 0] - own) / spread[:, 0], 0)
+        own = scores.gather(1, _around(match.index, NEAR, scores)).amin(1)
+        rival = scores.scatter(1, _around(match.index, TOLERANCE, scores), math.inf).amin(1)
+        margin = torch.where(rival.isfinite(), rival - own, 0)
+        deviations = torch.where(own.isfinite(), (mean[:, 0] - own + margin) / spread[:, 0], 0)
         lately = []
         for one in deviations.tolist():
             self.told = MEMORY * self.told + (1 - MEMORY) * one
@@ -164,6 +168,12 @@ class Track:
         return torch.where(score.isfinite(), odds + SPREADS * stood, -math.inf)
 
 
+def _around(index: Tensor, far: int, scores: Tensor) -> Tensor:
+    """The places up to so far from each of (B,), of those that there are, (B, 2 far + 1)."""
+    near = index.clamp(min=0)[:, None] + torch.arange(-far, far + 1, device=index.device)
+    return near.clamp(0, scores.shape[1] - 1)
+
+
 @torch.no_grad()
 def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = False) -> Calibration:
     """Fit on queries whose places are known, and on the same with the place and its surroundings, twice the
@@ -171,7 +181,7 @@ def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = Fal
 
     Args:
         another_visit: the queries are of another visit, whose own wrong answers tell how often to expect one.
-            Those off the map then count as one together, and not where there are others.
+            Those off the map then count, together, for as many as lack to `MISSED`.
 
     Raises:
         InputError: no right answer of single queries, or none whose place is known.
@@ -181,10 +191,7 @@ def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = Fal
         scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
         known = places >= 0
-        near = places.clamp(min=0)[:, None] + torch.arange(
-            -2 * TOLERANCE, 2 * TOLERANCE + 1, device=scores.device
-        )
-        away = scores.scatter(1, near.clamp(0, scores.shape[1] - 1), math.inf)
+        away = scores.scatter(1, _around(places, 2 * TOLERANCE, scores), math.inf)
         for one, is_there in ((scores, True), (away, False)):
             filtered = PlaceFilter()(one)
             for kind, found, evidence in (
@@ -201,7 +208,7 @@ def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = Fal
     for pairs in kinds.values():
         evidence, right, there = map(torch.cat, zip(*pairs, strict=True))
         wrong = int((there & ~right).sum())
-        off_map = max(0.0, 1.0 - wrong) / max(1, int((~there).sum())) if another_visit else 1.0
+        off_map = max(0, MISSED - wrong) / max(1, int((~there).sum())) if another_visit else 1.0
         weight = torch.where(there, 1.0, off_map)
         platts.append(fit(evidence, right, weight) if not platts or bool(right.any()) else None)
     return Calibration(*platts)

@@ -124,14 +124,16 @@ def test_single_evidence_is_the_margin_beyond_the_tolerance_and_the_score() -> N
 
 def test_a_track_remembers_how_its_answers_stood_out() -> None:
     single = torch.full((3, 20), 1.0)
-    single[:, 4] = torch.tensor([0.0, 0.0, 1.0])
+    single[:, 4] = torch.tensor([0.0, 0.0, 0.8])
+    single[:, 9], single[:, 10] = 0.4, 0.5  # 9 is within the tolerance of 4, 10 is not
     found = torch.full((3, 20), 5.0)
     found[:, 4] = math.log(2)  # even odds
-    spread = single[0].std(correction=0)
-    stood = float((single[0].mean() - 0) / spread)
-    second = (0.09 * stood + 0.1 * stood) / 0.19
-    third = (0.9 * 0.19 * second + 0.1 * 0) / 0.271
-    expected = [3 * stood, 3 * second, 3 * third]
+    spread = single.std(1, correction=0)
+    own = torch.tensor([0.0, 0.0, 0.8])
+    first, _, last = ((single.mean(1) - own + 0.5 - own) / spread).tolist()
+    second = (0.09 * first + 0.1 * first) / 0.19
+    third = (0.9 * 0.19 * second + 0.1 * last) / 0.271
+    expected = [3 * first, 3 * second, 3 * third]
     track = Track()
     assert track(found, single).tolist() == pytest.approx(expected, rel=1e-5)
     other = Track()
