@@ -17,9 +17,7 @@ from dejavu_torch.types import InputError, Scorer, SequenceModel
 TOLERANCE = 5  # places within which an answer is right
 MARGIN = 2.0  # weight of the margin beside the score itself
 SPREADS = 3.0  # nats that a filter's track counts for each standard deviation it stands out by
-MISSED = (
-    20  # wrong answers in a row, as a stretch of like places gives them, that a visit may have had none of
-)
+MISSED = 20  # wrong answers that a visit may have been spared: they come in stretches of like places
 MEMORY = 0.9  # of what a track told, from one query to the next
 NEAR = 2  # places around an answer whose best score counts for a track
 SURE = 1e-6  # least distance of a filter's probability from 0 and 1
