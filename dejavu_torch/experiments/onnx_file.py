@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import math
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -203,6 +204,7 @@ def run_session(session: Any, frames: Tensor) -> Tensor:
 
 
 def _require_packages() -> None:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # onnxruntime's: it is for its user to switch on
     for name in PACKAGES:
         try:
             import_module(name)

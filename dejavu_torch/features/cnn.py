@@ -121,7 +121,7 @@ class SmallCNN(nn.Module):
                 f"SmallCNN got frames {tuple(frames.shape)}; expected (B,{self.channels},H,W), "
                 f"as channels={self.channels} says"
             )
-        frames = resize_frames(frames, self.resize)
+        frames = resize_frames(frames, self.resize).to(self.linear.weight.dtype)
         if self.cell:
             frames = local_contrast(frames, self.cell)
         features: Tensor = self.linear(self.convolutions(frames).flatten(1))

@@ -207,6 +207,8 @@ class Embedding(nn.Module):
             frames = select_channel(frames, "grey")
         frames = frames.expand(-1, self.channels, -1, -1)
         frames = resize_frames(frames, self.resize)
+        weight = next(self.network.parameters(), frames)
+        frames = frames.to(weight.dtype) if weight.is_floating_point() else frames
         if self.cell:
             frames = local_contrast(frames, self.cell)
         return self._pooled(self.network(frames))

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import torch
 from helpers import refused
-from torch import Tensor
+from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import FLAT, SmallCNN, local_contrast
+from dejavu_torch.features.embedding import Embedding
 
 
 def small(**settings: Any) -> SmallCNN:
@@ -110,6 +111,13 @@ def test_in_eval_mode_a_batch_is_its_frames_one_by_one() -> None:
     net.eval()
     alone = torch.cat([net(frame[None]) for frame in frames])
     torch.testing.assert_close(net(frames), alone, rtol=0, atol=1e-5)
+
+
+def test_frames_in_double_precision_are_described_in_that_of_the_weights() -> None:
+    net, frames = small().eval(), torch.rand(2, 3, 20, 20)
+    torch.testing.assert_close(net(frames.double()), net(frames))
+    of_any = Embedding(nn.Conv2d(3, 4, 3), dimension=5, resize=(16, 24)).eval()
+    torch.testing.assert_close(of_any(frames.double()), of_any(frames))
 
 
 def test_light_changes_little_unless_the_contrast_is_left_as_it_is() -> None:

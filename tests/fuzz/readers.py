@@ -13,9 +13,12 @@ import math
 import os
 import shutil
 import struct
+import threading
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 from types import SimpleNamespace
@@ -32,6 +35,7 @@ from dejavu_torch.cli import commands, train
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import FOLDER, with_configs
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.camera import Camera
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database import mapfile
@@ -42,6 +46,7 @@ from dejavu_torch.evaluation.matches import read_matches
 from dejavu_torch.experiments import bench, compare, frontier, reproduce
 from dejavu_torch.experiments import evaluate as evaluating
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.model import DejaVu, read_place_map
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -432,6 +437,14 @@ localize in/templates.safetensors in/query.npy --out out/m.csv --top 3 --thresho
 localize in/named.safetensors in/query.npy --out out/m.csv --sequence=3 --speeds [.8,1]
 localize in/learned.safetensors in/query.npy --out m.csv --filter --moves [.2,.6,.2]
 localize in/plain.safetensors in/features.npy --out out/m.csv --as_is
+localize in/spectral.safetensors in/query.npy --out out/m.csv --precision .5 --device cpu
+learn in/frames.npy --map out/m.safetensors --calibration in/query.npy --calibration_truth 0 --precision .9
+live in/spectral.safetensors in/frames.npy --timeout .2 --precision .5
+live in/spectral.safetensors in/clip.mp4?stop=5 --realtime --page 0 --reference in/frames.npy --timeout .2
+live in/named.safetensors in/fifo.mp4 --timeout .2 --sequence 2 --threshold 3
+live in/resampled.safetensors in/frames.npy --as_is --moves [.2,.6,.2] --timeout .2
+export in/spectral.safetensors --onnx out/m.onnx --filter
+export in/learned.safetensors --onnx out/m.onnx --sequence 3 --speeds [1] --threshold .4
 info in/chunked.safetensors
 info in/resampled.safetensors
 evaluate in/matches.csv --truth in/truth.csv --out out/scores --interpolate
@@ -453,6 +466,7 @@ SLOW_LINES = [
 compare in/frames.npy in/query.npy --out out/report --truth 0 --tolerance 2
 compare in/frames.npy in/query.npy --out out/r --map in/spectral.safetensors --top 2
 compare in/features.npy in/features.npy --out out/r --config local_maxima --leave_out 3
+compare in/frames.npy in/query.npy --out out/r --truth 0 --distractors in/photos --precision .9 --filter
 """.strip().splitlines()
 ]
 
@@ -476,6 +490,10 @@ in/empty in/a_file in out missing utm:25 in/last.ckpt in/fifo.csv in/fifo.npy in
 --features.help Whitening --whitening.seed -1 --whitening.views=2 --whitening in/fifo.safetensors --config
 --preprocess.grid=[2,2] --threshold=nan --query in/query.npy --config paper --config in/config.yaml
 --truth utm --config in/fifo.yaml --tolerance 9223372036854775808
+--precision 1 --precision nan --calibration in/fifo.npy --calibration none --distractors [in/empty,in/a_file]
+--device cuda:99 --device meta --timeout 0 --page 70000 --page 0 --reference in/photos
+--onnx in/spectral.safetensors
+/dev/video99 /dev/null rtsp://127.0.0.1:1/x in/fifo.mp4
 --seed -1 --seed 1180591620717411303424 --batch_size 0
 --top 999 --sequence 999 --sequence=3 --filter --speeds [nan] --moves [0,0] --out in/a_file --out out/no/m.csv
 --map in/spectral.safetensors --map in/fifo.safetensors --truth in/fifo.npz --out in/empty
@@ -660,6 +678,71 @@ def video(case: Case) -> None:
     clip.write_bytes(mutate_bytes(random, path.read_bytes()))
     case.begin()
     take(open_source(f"{clip}{random.choice(('', '', '?width=8', '?start=3&stop=9&step=2'))}"))
+
+
+@reader("stream", videos, share=1)
+def stream(case: Case) -> None:
+    """A pipe of bytes that may break off or go on as another video."""
+    random = case.random
+    first, second = (random.choice(sorted(case.made(videos).iterdir())).read_bytes() for _ in range(2))
+    broken = first[: random.randrange(len(first))] + second
+    data = mutate_bytes(random, first) if random.random() < 0.7 else broken
+    size = random.choice((None, None, (16, 16), (32, 48), (1, 1)))
+    reading, writing = os.pipe()
+    threading.Thread(target=_send, args=(writing, data), daemon=True).start()
+    case.begin()
+    try:
+        for shot in Camera(f"/dev/fd/{reading}", size):
+            if shot.pixels.dtype != np.uint8 or shot.pixels.shape[2:] != (3,):
+                raise Wrong(f"frames {shot.pixels.shape} {shot.pixels.dtype}")
+            if size is not None and shot.pixels.shape[:2] != size:
+                raise Wrong("frames of another size")
+    finally:
+        os.close(reading)
+
+
+def _send(pipe: int, data: bytes) -> None:
+    with suppress(OSError), open(pipe, "wb") as file:
+        file.write(data)
+
+
+@reader("live frame", maps, share=1)
+def live_frame(case: Case) -> None:
+    """A frame of any type, shape and values, in between two that fit."""
+    random, path = case.random, case.random.choice(sorted(case.made(maps).glob("*.safetensors")))
+    good = np.load(path.with_suffix(".npy"))
+    noise = np.random.default_rng(random.randrange(2**32))
+    fits = good.shape[1:]
+    any_shape = tuple(random.choice((0, 1, 3, 16, 40)) for _ in range(3))
+    odd: Any = noise.random(random.choice((fits, fits, (*fits, 3), (3, *fits), (1,), (0, 0), any_shape)))
+    odd *= random.choice((1, 1, 1, 255, -1, 1e30))
+    if odd.size and random.random() < 0.2:
+        odd.flat[random.randrange(odd.size)] = random.choice((np.nan, np.inf))
+    kind = random.choice(("u1", "u1", "f4", "f4", "f8", ">f4", "f2", "i8", "?", "c8", "O", "U3"))
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        odd = odd.astype(kind)
+    if random.random() < 0.3 and odd.ndim > 1:
+        odd = odd[::-1].T
+    if random.random() < 0.3 and kind in ("u1", "f4", "f8", "i8", "?"):
+        odd = torch.from_numpy(odd.copy())
+    odd = random.choice((odd, odd, odd, odd, None, [[1.0]], "frame"))
+    case.begin()
+    model = DejaVu.load(path)
+    model.velocity = None
+    sequence = random.choice((None, SequenceMatcher(2), PlaceFilter()))
+    localizer, undisturbed = LiveLocalizer(model, sequence), LiveLocalizer(model, sequence)
+    frames = [frame if frame.ndim > 1 else frame.astype(np.float32) for frame in good]
+    expected = [undisturbed(frame).place for frame in frames[:2]]
+    found = [localizer(frames[0]).place]
+    try:
+        match = localizer(odd, random.choice((0, 0, 3, 10**9)))
+    except InputError:
+        if [*found, localizer(frames[1]).place] != expected:
+            raise Wrong("a frame that is refused changes the next answer") from None
+        raise
+    if not -1 <= match.place < model.map.places or math.isnan(match.score):
+        raise Wrong(f"{match}")
 
 
 PLAUSIBLE = ("0", "1", "2", "3", "5", "8", "20", "25", "1:2", "3:9", "true", "-1", "100")
