@@ -141,7 +141,8 @@ class Track:
     the map it follows the best of places that are all wrong.
 
     The log odds of the answer, and `SPREADS` times how much single queries have stood out there lately: how
-    many standard deviations they scored below their mean, and below the best place beyond `TOLERANCE`.
+    many standard deviations they scored below their mean, and `MARGIN` times how many below the best place
+    beyond `TOLERANCE`.
     """
 
     def __init__(self) -> None:
@@ -154,7 +155,7 @@ class Track:
         own = scores.gather(1, _around(match.index, NEAR, scores)).amin(1)
         rival = scores.scatter(1, _around(match.index, TOLERANCE, scores), math.inf).amin(1)
         margin = torch.where(rival.isfinite(), rival - own, 0)
-        deviations = torch.where(own.isfinite(), (mean[:, 0] - own + margin) / spread[:, 0], 0)
+        deviations = torch.where(own.isfinite(), (mean[:, 0] - own + MARGIN * margin) / spread[:, 0], 0)
         lately = []
         for one in deviations.tolist():
             self.told = MEMORY * self.told + (1 - MEMORY) * one

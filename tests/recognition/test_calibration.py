@@ -130,7 +130,7 @@ def test_a_track_remembers_how_its_answers_stood_out() -> None:
     found[:, 4] = math.log(2)  # even odds
     spread = single.std(1, correction=0)
     own = torch.tensor([0.0, 0.0, 0.8])
-    first, _, last = ((single.mean(1) - own + 0.5 - own) / spread).tolist()
+    first, _, last = ((single.mean(1) - own + 2 * (0.5 - own)) / spread).tolist()
     second = (0.09 * first + 0.1 * first) / 0.19
     third = (0.9 * 0.19 * second + 0.1 * last) / 0.271
     expected = [3 * first, 3 * second, 3 * third]
