@@ -3,15 +3,7 @@
 from __future__ import annotations
 
 import torch
-from kornia.augmentation import (
-    RandomAffine,
-    RandomBrightness,
-    RandomContrast,
-    RandomGamma,
-    RandomGaussianBlur,
-    RandomLinearIllumination,
-    VideoSequential,
-)
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.types import InputError
@@ -29,12 +21,12 @@ LARGEST: dict[str, tuple[float, ...]] = {
     "occlusion": (1,),
     "noise": (1,),
 }
-NOISY = 0.7  # the chance that a clip gets noise
-OCCLUDED = 0.7  # and that something stands in its way
+# the chance that a clip gets each kind
+WARPED, DEVELOPED, LIT, BLURRED, OCCLUDED, NOISY = 0.9, 0.7, 0.5, 0.5, 0.7, 0.7
 
 
 class Augmentation(nn.Module):
-    """Light, lens and view of another day, drawn anew for every clip (by `kornia.augmentation`).
+    """Light, lens and view of another day, drawn anew for every clip.
 
     Every argument is the largest strength of one kind of change; what happens to a clip is drawn
     uniformly up to it, and 0 switches the kind off. They act in this order; warp stands for rotation,
@@ -94,27 +86,7 @@ class Augmentation(nn.Module):
         super().__init__()
         given = locals()
         self.strengths = {name: _checked(name, given[name]) for name in LARGEST}
-        self.colour, self.noise, self.occlusion = self.strengths["colour"], noise, occlusion
         self.radius = max(1, round(blur)) if blur else 0
-        gain, offset = exposure
-        steps: list[nn.Module] = []
-        if rotation or any(shift) or scale:
-            zoom = (1.0 - scale, 1.0 + scale)
-            steps.append(RandomAffine(float(rotation), tuple(shift), zoom, padding_mode="border", p=0.9))
-        if offset:  # kornia's brightness is an offset, its factor less 1
-            steps.append(RandomBrightness((1.0 - offset, 1.0 + offset)))
-        if gain:  # and its contrast is a gain
-            steps.append(RandomContrast((1.0 - gain, 1.0 + gain)))
-        if gamma:
-            steps.append(RandomGamma((1 / (1 + gamma), 1.0 + gamma), p=0.7))
-        if illumination:
-            steps.append(RandomLinearIllumination((min(0.01, illumination), float(illumination))))
-        if blur:
-            size = 2 * self.radius + 1
-            apart = size > 3  # 3 x 3 in one go takes half the time of rows and columns apart
-            steps.append(RandomGaussianBlur((size, size), (min(0.1, blur), float(blur)), separable=apart))
-        # in a tuple, which keeps kornia's buffers out of checkpoints: they hold strengths, nothing learned
-        self._steps = (VideoSequential(*steps),)
 
     @property
     def acts(self) -> bool:
@@ -134,19 +106,58 @@ class Augmentation(nn.Module):
             raise InputError(
                 f"the frames are {shape}; expected some, of more than {self.radius} pixels a side to blur"
             )
-        (steps,) = self._steps
-        clips: Tensor = frames if frames.ndim == 5 else frames[:, None]
-        clips = steps(self._coloured(clips))
-        if self.occlusion:
+        clips = frames if frames.ndim == 5 else frames[:, None]
+        clips = self._as_on_another_day(self._coloured(clips))
+        if self._of("occlusion"):
             clips = self._occluded(clips)
-        if self.noise:
+        if self._of("noise"):
             noisy = torch.rand(len(clips), 1, 1, 1, 1, device=clips.device) < NOISY
-            clips = torch.randn_like(clips).mul_(self.noise * noisy).add_(clips)
+            clips = torch.randn_like(clips).mul_(self._of("noise") * noisy).add_(clips)
         return clips.clamp_(0, 1).reshape(shape)  # in place: the input was copied for its colour
+
+    def _of(self, name: str) -> float:
+        """The one number of a strength."""
+        return self.strengths[name][0]
+
+    def _as_on_another_day(self, clips: Tensor) -> Tensor:
+        """View and light of clips (B,T,C,H,W), which may be written to."""
+        count, device = len(clips), clips.device
+
+        def drawn(low: float, high: float) -> Tensor:
+            return low + (high - low) * torch.rand(count, device=device)
+
+        def happens(chance: float) -> Tensor:
+            return torch.rand(count, device=device) < chance
+
+        (across, along), (gain, offset) = self.strengths["shift"], self.strengths["exposure"]
+        turn, zoom, gamma = (self._of(name) for name in ("rotation", "scale", "gamma"))
+        if turn or across or along or zoom:
+            angle = drawn(-turn, turn).deg2rad()
+            moved = torch.stack([drawn(-across, across), drawn(-along, along)], 1)
+            clips = torch.where(
+                _each(happens(WARPED)),
+                warped(clips, angle, moved, drawn(1 - zoom, 1 + zoom)),
+                clips,
+            )
+        if offset:
+            clips = clips.add_(_each(drawn(-offset, offset))).clamp_(0, 1)
+        if gain:
+            clips = clips.mul_(_each(drawn(1 - gain, 1 + gain))).clamp_(0, 1)
+        if gamma:
+            power = _each(drawn(1 / (1 + gamma), 1 + gamma))
+            clips = torch.where(_each(happens(DEVELOPED)), clips.log().mul_(power).exp_(), clips)  # 0 of 0
+        if self._of("illumination"):
+            most = torch.where(happens(LIT), drawn(-1, 1) * self._of("illumination"), 0.0)
+            side = torch.randint(4, (count,), device=device)
+            clips = clips.add_(_falling(most, side, *clips.shape[-2:])).clamp_(0, 1)
+        if self.radius:
+            sigma = torch.where(happens(BLURRED), drawn(min(0.1, self._of("blur")), self._of("blur")), 0.0)
+            clips = blurred(clips, sigma, self.radius)
+        return clips
 
     def _coloured(self, clips: Tensor) -> Tensor:
         """Gain and offset of each channel."""
-        gain, offset = self.colour
+        gain, offset = self.strengths["colour"]
         draw = torch.rand(2, len(clips), 1, clips.shape[2], 1, 1, device=clips.device) * 2 - 1
         return (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)
 
@@ -154,7 +165,7 @@ class Augmentation(nn.Module):
         """A rectangle of each clip taken from the one before."""
         count, (height, width) = len(clips), clips.shape[-2:]
         area, ratio, y, x, chance = torch.rand(5, count, 1, 1, device=clips.device)
-        area, ratio = area * self.occlusion, 3 ** (2 * ratio - 1)
+        area, ratio = area * self._of("occlusion"), 3 ** (2 * ratio - 1)
 
         def inside(pixels: int, side: Tensor, where: Tensor) -> Tensor:
             side = (side.clamp(max=1) * pixels).round()
@@ -181,3 +192,48 @@ def _checked(name: str, value: object) -> tuple[float, ...]:
         expected = " and ".join(f"a number from 0 to {limit}" for limit in most)
         raise InputError(f"{name} is {value!r}; expected {expected}")
     return numbers
+
+
+def warped(clips: Tensor, angle: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """Clips (B,T,C,H,W) turned by `angle` (B,) radians, enlarged by `scale` (B,), and shifted by `shift`
+    (B,2), fractions of width and height; the border is repeated."""
+    images, aspect = clips.flatten(1, 2), clips.shape[-2] / clips.shape[-1]
+    # of the middle of each pixel, the frame being -1..1
+    y, x = (torch.arange(1 - n, n, 2, dtype=clips.dtype, device=clips.device) / n for n in clips.shape[-2:])
+    x = (x - 2 * shift[:, :1])[:, None, :, None]
+    y = (y - 2 * shift[:, 1:])[:, :, None, None]
+    cos, sin = angle.cos() / scale, angle.sin() / scale
+    along_x = torch.stack([cos, sin / aspect], 1)[:, None, None]
+    along_y = torch.stack([-aspect * sin, cos], 1)[:, None, None]
+    grid = (x * along_x).add(y * along_y)
+    sampled = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    return sampled.view(clips.shape)
+
+
+def blurred(clips: Tensor, sigma: Tensor, radius: int) -> Tensor:
+    """Clips (B,T,C,H,W) under a Gaussian of `sigma` (B,) pixels, 0 for none, cut off at `radius`; the border
+    reflects."""
+    away = torch.arange(radius + 1, device=clips.device)[:, None]
+    weight = torch.exp(-0.5 * (away / sigma.clamp(min=1e-3)).square())
+    weight = weight / (2 * weight.sum(0) - weight[0])  # (radius + 1, B)
+    images = clips.flatten(1, 2)
+    for axis, sides in ((3, (radius, radius, 0, 0)), (2, (0, 0, radius, radius))):
+        padded, size = F.pad(images, sides, mode="reflect"), images.shape[axis]
+        images = images * _each(weight[0])[:, 0]
+        for k in range(1, radius + 1):
+            both = padded.narrow(axis, radius - k, size) + padded.narrow(axis, radius + k, size)
+            images = images.addcmul_(both, _each(weight[k])[:, 0])
+    return images.view(clips.shape)
+
+
+def _falling(most: Tensor, side: Tensor, height: int, width: int) -> Tensor:
+    """(B,1,1,H,W): `most` (B,) at one side of the frame, evenly down to 0 at the opposite one."""
+    x = torch.linspace(0, 1, width, device=most.device).expand(height, width)
+    y = torch.linspace(0, 1, height, device=most.device)[:, None].expand(height, width)
+    ramps = torch.stack([x, 1 - x, y, 1 - y])
+    return (_each(most)[:, 0] * ramps[side][:, None])[:, None]
+
+
+def _each(values: Tensor) -> Tensor:
+    """One number for each clip, (B,) -> (B,1,1,1,1)"""
+    return values[:, None, None, None, None]

@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import copy
 import json
+import sys
 from inspect import signature
 from typing import Any
 
 import pytest
 import torch
 from helpers import refused
+from kornia.filters import gaussian_blur2d
+from kornia.geometry.transform import get_affine_matrix2d, warp_affine
 from torch import Tensor
 
-from dejavu_torch.features.augmentation import LARGEST, Augmentation
+from dejavu_torch.features.augmentation import LARGEST, Augmentation, blurred, warped
+from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
 
 OFF: dict[str, Any] = {name: 0.0 if len(most) == 1 else (0.0, 0.0) for name, most in LARGEST.items()}
 DEFAULTS = {name: argument.default for name, argument in signature(Augmentation).parameters.items()}
 EACH = pytest.mark.parametrize("name", DEFAULTS)
+
+
+@pytest.fixture(autouse=True, params=[Augmentation, KorniaAugmentation])
+def _kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of it holds for both."""
+    monkeypatch.setattr(sys.modules[__name__], "Augmentation", request.param)
 
 
 def only(**strengths: Any) -> Augmentation:
@@ -252,3 +262,25 @@ def test_wrong_frames_are_refused() -> None:
         only(blur=4.0)(torch.rand(2, 3, 4, 16))
     with refused("(0, 3, 16, 16)", "expected some"):
         Augmentation()(torch.rand(0, 3, 16, 16))
+
+
+def test_warps_are_those_of_kornia() -> None:
+    clips, turns = torch.rand(5, 2, 3, 20, 30), torch.tensor([0.0, 10.0, -25.0, 3.0, 0.0])
+    shift = torch.tensor([[0.1, -0.2], [0.0, 0.0], [0.02, 0.04], [-0.3, 0.1], [0.0, 0.0]])
+    scale = torch.tensor([1.0, 1.2, 0.7, 0.9, 1.5])
+    centre, pixels = torch.tensor([[29 / 2, 19 / 2]]).expand(5, 2), shift * torch.tensor([30.0, 20.0])
+    matrix = get_affine_matrix2d(pixels, centre, scale[:, None].expand(5, 2), turns)[:, :2]
+    settings: dict[str, Any] = {"padding_mode": "border", "align_corners": True}
+    expected = warp_affine(clips.flatten(1, 2), matrix, (20, 30), **settings)
+    found = warped(clips, -turns.deg2rad(), shift, scale)  # kornia turns the other way
+    torch.testing.assert_close(found.flatten(1, 2), expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("radius", [1, 3])
+def test_blurs_are_those_of_kornia(radius: int) -> None:
+    clips, sigma = torch.rand(4, 2, 3, 12, 10), torch.tensor([0.0, 0.3, 1.2, 4.0])
+    found = blurred(clips, sigma, radius)
+    assert torch.equal(found[0], clips[0])
+    size = (2 * radius + 1, 2 * radius + 1)
+    expected = gaussian_blur2d(clips.flatten(1, 2)[1:], size, sigma[1:, None].expand(3, 2))
+    torch.testing.assert_close(found[1:].flatten(1, 2), expected, rtol=0, atol=1e-6)
