@@ -465,19 +465,24 @@ def run_bench(
     codebooks: str | None = None,
     whitening: Path | None = None,
     places: Sequence[int] = (),
+    steps: int | None = None,
+    seeds: Sequence[int] = (),
 ) -> None:
     """Set this package beside what a user would pick instead: its speed, memory, or accuracy over bytes.
 
     Args:
         what: matcher (time of HOG, L1 distances, sequences, filters), live (time of single frames on 100000
-            places), memory (of learning and localizing) or storage (accuracy over bytes)
-        sources: of storage, pairs REFERENCE QUERY; the built-in routes if not given
+            places), train (seconds of a training, and accuracy), memory (of learning and localizing) or
+            storage (accuracy over bytes)
+        sources: of storage and train, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
         codebooks: of storage, another route, where codebooks and a whitening are learned that count nothing
         whitening: of storage, a map whose whitening describes all routes; each learns its own if not given
         places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given. Of memory, frames
             that are learned; 1000, 10000 and 50000 if not given
+        steps: of train, those of each training; 600 if not given
+        seeds: of train, a training each; 0, 1 and 2 if not given
     """
     from dejavu_torch.evaluation.report import text_table
     from dejavu_torch.experiments import bench, footprint, frontier, live_speed
@@ -492,6 +497,18 @@ def run_bench(
         for line in frontier.skipped_lines(found):
             _say(line)
         _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
+        return
+    if what != "train" and (steps is not None or seeds):
+        raise InputError(f"bench {what} takes no steps or seeds; bench train does")
+    if what == "train":
+        from dejavu_torch.experiments import train_speed
+
+        if map or codebooks or whitening or places:
+            raise InputError(
+                "bench train takes no maps, codebooks, whitening or places; expected steps, seeds"
+            )
+        print(text_table(train_speed.train_table(train_speed.run_train(out, sources, steps, seeds))))
+        _say(f"each row changes one thing of the row above; next: open {out / 'bench.png'}")
         return
     known = what in bench.BENCHES or what in ("memory", "live")
     if known and (sources or map or codebooks or whitening or (places and what != "memory")):

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
 from jsonargparse import Namespace
 from lightning_fabric.plugins import CheckpointIO
 from lightning_fabric.utilities.exceptions import MisconfigurationException
@@ -26,6 +27,7 @@ from dejavu_torch.text import one_line
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import LastCheckpoint, MapExport
+from dejavu_torch.training.precision import has_bf16
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
 
@@ -37,6 +39,7 @@ RANGES = {  # of numbers that Lightning takes as they are, and fails on later
     "trainer.accumulate_grad_batches": (1, math.inf, "of at least 1"),
 }
 MAY_BE_NULL = ("trainer.val_check_interval", "trainer.check_val_every_n_epoch")
+BF16 = ("bf16-mixed", "bf16")
 EVERY = 500  # steps between two validations, and between two checkpoints
 TRAINER = {
     "max_steps": 3000,
@@ -184,6 +187,10 @@ class TrainCLI(LightningCLI):
         for plugin in _listed(asked["plugins"]):
             if isinstance(plugin, CheckpointIO) and getattr(plugin, "checkpoint_io", plugin) is None:
                 plugin.checkpoint_io = CheckpointFiles()  # type: ignore[attr-defined]  # what it wraps
+        on_cpu = asked["accelerator"] == "cpu" or not torch.cuda.is_available()
+        if asked["precision"] in BF16 and on_cpu and not has_bf16():
+            log.warning("this processor has no numbers of 16 bits, which would be slower: training in 32")
+            kwargs["precision"] = "32-true"
         try:
             return super().instantiate_trainer(callbacks=own, **kwargs)
         except (ImportError, ValueError) as error:

@@ -416,7 +416,9 @@ def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> lis
         InputError: an unknown bench, or a folder that cannot be made or written in.
     """
     if what not in BENCHES:
-        raise InputError(f"bench {what!r} is unknown; expected {', '.join(BENCHES)}, memory or storage")
+        raise InputError(
+            f"bench {what!r} is unknown; expected {', '.join(BENCHES)}, live, train, memory or storage"
+        )
     check_output_folder(out)  # before the long work
     rows = BENCHES[what](frames, repeats)
     with whole_folder(out) as folder:

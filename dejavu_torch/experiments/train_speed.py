@@ -1,0 +1,223 @@
+"""How fast a descriptor is trained, and what it is then worth: `dejavu bench train`."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytorch_lightning as pl
+import torch
+from torch import nn
+from tqdm import tqdm
+
+import dejavu_torch
+from dejavu_torch.data.output import check_output_folder, whole_folder
+from dejavu_torch.data.source import open_source
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.score_plots import plot_ratios
+from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
+from dejavu_torch.motion.resampling import ground_truth_of
+from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.precision import has_bf16
+from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.types import GroundTruth, InputError, Traverse
+
+ROUTE = ("sim:aerial?frames=1000", "sim:aerial?frames=1000&traverse=1")
+STEPS = 600
+SEEDS = (0, 1, 2)
+BUDGETS = (2.4, 1.0)  # route bytes per place of the maps that are made of a descriptor
+TOLERANCE = 5
+STRENGTHS = {"shift": (0.02, 0.08), "occlusion": 0.5}  # of configs/train_road.yaml
+WEIGHT_DECAY = 0.5
+
+
+class Rung(NamedTuple):
+    """A way to train: backbone, augmentation, precision of the trainer."""
+
+    name: str
+    backbone: Callable[[], nn.Module]
+    augmentation: Callable[[], Augmentation]
+    precision: str = "32-true"
+
+
+def fine() -> SmallCNN:
+    """The network whose first convolution divides by two."""
+    return SmallCNN(squeeze=24, cell=0)
+
+
+def coarse() -> SmallCNN:
+    """That of configs/train_road.yaml."""
+    return SmallCNN(widths=(32, 64, 96), squeeze=24, cell=0, stem=4)
+
+
+def ladder() -> list[Rung]:
+    """Each rung changes one thing of the one before."""
+
+    def kornia() -> Augmentation:
+        return KorniaAugmentation(**STRENGTHS)
+
+    def fused() -> Augmentation:
+        return Augmentation(**STRENGTHS)  # type: ignore[arg-type]
+
+    rungs = [
+        Rung("kornia's augmentation", fine, kornia),
+        Rung("fused augmentation", fine, fused),
+        Rung("a stem of 4", coarse, fused),
+    ]
+    return [*rungs, Rung("16 bits", coarse, fused, "bf16-mixed")] if has_bf16() else rungs
+
+
+class TrainRow(NamedTuple):
+    """One training. seconds: of its steps alone. auc, recall_at_1: by route bytes per place of the map."""
+
+    case: str
+    contender: str
+    seed: int
+    steps: int
+    seconds: float
+    auc: dict[str, float]
+    recall_at_1: dict[str, float]
+    threads: int
+
+
+class Clock(pl.Callback):
+    """Seconds of the steps of a training."""
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.began = time.perf_counter()
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.seconds = time.perf_counter() - self.began
+
+
+def bench_train(
+    reference: Traverse,
+    query: Traverse,
+    steps: int = STEPS,
+    seeds: Sequence[int] = SEEDS,
+    rungs: Sequence[Rung] | None = None,
+    progress: bool = False,
+) -> list[TrainRow]:
+    """Train a descriptor of the reference in several ways, and find the query on spectral maps of it.
+
+    Args:
+        reference, query: traverses of one route.
+        steps: of each training. seeds: a training each. rungs: `ladder` if None.
+        progress: show a progress bar on a terminal.
+
+    Raises:
+        InputError: no steps or seeds, or nothing that tells the right places.
+    """
+    if steps < 1 or not seeds:
+        raise InputError(f"bench train got {steps} steps and seeds {list(seeds)}; expected at least one each")
+    truth = ground_truth_of(None, reference, query)
+    if truth is None:
+        raise InputError(
+            f"nothing tells the places of {query.name}: it has {query.length} frames, {reference.name} "
+            f"{reference.length}; expected as many"
+        )
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    works = [(rung, seed) for rung in (ladder() if rungs is None else rungs) for seed in seeds]
+    shown = tqdm(works, desc="train", disable=None if progress else True, leave=False)
+    return [_trained(rung, seed, reference, query, truth, steps) for rung, seed in shown]
+
+
+def _trained(
+    rung: Rung, seed: int, reference: Traverse, query: Traverse, truth: GroundTruth, steps: int
+) -> TrainRow:
+    pl.seed_everything(seed, verbose=False)
+    task = PlaceRecognitionTask(rung.backbone(), SpectralMapper(BUDGETS[0]), weight_decay=WEIGHT_DECAY)
+    data = RouteData(reference, tolerance=TOLERANCE, augmentation=rung.augmentation())
+    clock = Clock()
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = pl.Trainer(
+            accelerator="cpu",
+            max_steps=steps,
+            precision=rung.precision,  # type: ignore[arg-type]
+            gradient_clip_val=5.0,
+            callbacks=[clock],
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            limit_val_batches=0,
+            default_root_dir=folder,
+        )
+        trainer.fit(task, datamodule=data)
+    model = task.deployed()
+    places, queries = model.extract_all(reference), model.extract_all(query)
+    auc, recall = {}, {}
+    for budget in BUDGETS:
+        model.mapper = SpectralMapper(budget)
+        model.learn_features(places, reference)
+        scores = evaluate(model.localize_descriptors(queries), truth, TOLERANCE)
+        auc[f"{budget:g}"], recall[f"{budget:g}"] = scores.auc, scores.recall_at_1
+    return TrainRow(
+        f"{reference.name}, {steps} steps",
+        rung.name,
+        seed,
+        steps,
+        clock.seconds,
+        auc,
+        recall,
+        torch.get_num_threads(),
+    )
+
+
+def run_train(
+    out: Path, sources: Sequence[str] = (), steps: int | None = None, seeds: Sequence[int] = ()
+) -> list[TrainRow]:
+    """Run the bench, and write bench.json and bench.png into the folder `out`.
+
+    Args:
+        sources: REFERENCE QUERY; 1000 simulated places if empty. steps, seeds: see `bench_train`.
+
+    Raises:
+        InputError: as `bench_train`, other than two sources, or a folder that cannot be made or written in.
+    """
+    if len(sources) not in (0, 2):
+        raise InputError(f"bench train got {len(sources)} sources; expected REFERENCE QUERY, or none")
+    reference, query = (open_source(source) for source in sources or ROUTE)
+    check_output_folder(out)
+    rows = bench_train(
+        reference, query, STEPS if steps is None else steps, tuple(seeds) or SEEDS, progress=True
+    )
+    facts = {
+        "rows": [row._asdict() for row in rows],
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "bf16": has_bf16(),
+        "versions": {"dejavu_torch": dejavu_torch.__version__, "torch": torch.__version__},
+    }
+    with whole_folder(out) as folder:
+        (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        figure, _ = plot_ratios({rows[0].case: _means(rows)}, "seconds of a training, mean of the seeds")
+        figure.savefig(folder / "bench.png")
+    return rows
+
+
+def _means(rows: Sequence[TrainRow]) -> dict[str, float]:
+    seconds: dict[str, list[float]] = {}
+    for row in rows:
+        seconds.setdefault(row.contender, []).append(row.seconds)
+    return {name: sum(some) / len(some) for name, some in seconds.items()}
+
+
+def train_table(rows: Sequence[TrainRow]) -> list[list[str]]:
+    """The figures as rows of text, the header first: means of the seeds, and their lowest and highest."""
+    table = [["", "seconds", *(f"AUC at {budget:g} B" for budget in BUDGETS), "steps", "seeds"]]
+    for name in dict.fromkeys(row.contender for row in rows):
+        own = [row for row in rows if row.contender == name]
+        line = [name, f"{_means(own)[name]:.1f}"]
+        for budget in BUDGETS:
+            found = [row.auc[f"{budget:g}"] for row in own]
+            line.append(f"{sum(found) / len(found):.3f} ({min(found):.3f} to {max(found):.3f})")
+        table.append([*line, str(own[0].steps), str(len(own))])
+    return table
