@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import pytest
 import torch
 from helpers import refused
+from torch import Tensor
 
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.simulate.train import Railway
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.curves import evaluate
@@ -42,6 +45,7 @@ from dejavu_torch.types import Match
 
 PAPER = {"min_period": 8, "peaks": "bins", "false_alarm": None, "short": "refuse"}
 FRAMES, LENGTHS = 1024, (512, 1024, 2048)
+RIDE = 400  # frames; the last chunk is shorter than the others, of 64
 
 
 @pytest.fixture(scope="module")
@@ -144,11 +148,12 @@ def test_other_datasets_are_refused() -> None:
 
 @pytest.mark.slow
 def test_the_command_writes_an_index_over_the_reports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    aerial: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    short = partial(reproduce, frames=FRAMES, lengths=(1024,))
+    short = create_autospec(reproduce, return_value=aerial)
     monkeypatch.setattr("dejavu_torch.experiments.reproduce.reproduce", short)
     main(["reproduce", "aerial", "--out", str(tmp_path / "out")])
+    assert short.call_args.args == ("aerial",)
     assert "aerial: the paper, its own footage" in capsys.readouterr().out
     page = (tmp_path / "out" / "index.html").read_text()
     links = re.findall(r'href="([^"]+)"', page)
@@ -161,16 +166,32 @@ def test_the_command_writes_an_index_over_the_reports(
     assert {"ideal", "ideal_leave_out", "chunk_lengths", "published", "auc", "null"} <= set(report)
 
 
+def drawn_once(draw: Callable[[Railway, Tensor], Tensor]) -> Callable[[Railway, Tensor], Tensor]:
+    """Frames of a train take long to draw, and are read several times."""
+    held: dict[tuple[str, int], Tensor] = {}
+
+    def frames(self: Railway, at: Tensor) -> Tensor:
+        keys = [(self.name, i) for i in at.tolist()]
+        new = [key for key in keys if key not in held]
+        if new:
+            held.update(zip(new, draw(self, torch.tensor([i for _, i in new])), strict=True))
+        return torch.stack([held[key] for key in keys])
+
+    return frames
+
+
 @pytest.fixture(scope="module")
 def outdoor() -> Comparison:
-    """The first 420 frames, from the start of the train on, in chunks of 64."""
+    """The first frames, from the start of the train on, in chunks of 64."""
     paper = paper_model(open_source("sim:outdoor?frames=1"))
     paper.mapper = TemplateMapper(SpectrogramAnalysis(64, **PAPER), reduction="sum")
-    return reproduce("outdoor", paper, frames=420, lengths=(32, 64))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Railway, "_frames", drawn_once(Railway._frames))
+        return reproduce("outdoor", paper, frames=RIDE, lengths=(32, 64))
 
 
 def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.Tensor:
-    distance: torch.Tensor = open_source(f"sim:outdoor?frames=420&traverse={traverse}").distance[frames]
+    distance: torch.Tensor = open_source(f"sim:outdoor?frames={RIDE}&traverse={traverse}").distance[frames]
     return distance
 
 
@@ -178,13 +199,13 @@ def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.
 def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
     facts, route = outdoor.report.facts, outdoor.run.model.map
     assert facts["unit"] != "frames"
-    assert facts["resampling"]["reference_frames"] == facts["resampling"]["query_frames"] == 420
+    assert facts["resampling"]["reference_frames"] == facts["resampling"]["query_frames"] == RIDE
     assert facts["frames"] == len(outdoor.run.reference_features) == route.places
 
     def bend(metres: torch.Tensor) -> float:
         return float((metres - torch.linspace(0, 1, len(metres)) * metres[-1]).abs().max())
 
-    assert bend(metres_of(outdoor, 0, torch.arange(420))) > 15  # the train speeds up all the time
+    assert bend(metres_of(outdoor, 0, torch.arange(RIDE))) > 15  # the train speeds up all the time
     assert bend(metres_of(outdoor, 0, route.frame_of(torch.arange(route.places)))) < 2.5
 
 
@@ -209,7 +230,7 @@ def test_the_truth_of_even_steps_is_where_the_train_was(outdoor: Comparison) -> 
 
 @pytest.mark.slow
 def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
-    cuts = structure_cuts(open_source("sim:outdoor?frames=420"))
+    cuts = structure_cuts(open_source(f"sim:outdoor?frames={RIDE}"))
     assert cuts
     facts, route = outdoor.report.facts, outdoor.run.model.map
     places = route.place_of(torch.tensor(cuts)).unique()
@@ -238,7 +259,8 @@ def test_comparable_scores_are_means_on_the_same_map(outdoor: Comparison) -> Non
 @pytest.mark.slow
 def test_other_lengths_store_the_positions_of_the_frames_too(outdoor: Comparison) -> None:
     row = outdoor.report.facts["chunk_lengths"][1]
-    assert (row["window"], row["map_bytes"]) == (64, outdoor.report.facts["map_bytes"])
+    assert row["window"] == 64
+    assert row["map_bytes"] == pytest.approx(outdoor.report.facts["map_bytes"], abs=200)  # calibrated or not
 
 
 class Rails(ArrayTraverse):
