@@ -288,11 +288,11 @@ def test_every_setting_of_a_model_is_an_option_and_a_key(capsys: pytest.CaptureF
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libgomp is the OpenMP of Linux builds")
 @pytest.mark.parametrize(("given", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "active"}, "ACTIVE")])
-def test_threads_do_not_spin_while_they_wait(given: dict[str, str], policy: str, small_map: Path) -> None:
+def test_threads_do_not_spin_while_they_wait(given: dict[str, str], policy: str) -> None:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
     environment = {**kept, "OMP_DISPLAY_ENV": "true", **given}
-    command = [sys.executable, "-m", "dejavu_torch.cli", "info", str(small_map)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-m", "dejavu_torch.cli", "info", "nowhere"]  # for which torch is loaded
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert f"OMP_WAIT_POLICY = '{policy}'" in done.stderr
 
 
