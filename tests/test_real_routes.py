@@ -236,8 +236,10 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
 @pytest.mark.parametrize(
     ("column", "options"),
     [
-        pytest.param(0, (), id="road"),
-        pytest.param(1, ("--mapper.route_bytes_per_place", "2.5"), id="road, small", marks=pytest.mark.figures),
+        pytest.param(0, (), id="road", marks=pytest.mark.figures),
+        pytest.param(
+            1, ("--mapper.route_bytes_per_place", "2.5"), id="road, small", marks=pytest.mark.figures
+        ),
         pytest.param(2, ("--tolerance", "0"), id="corridor"),
         pytest.param(3, (), id="railway", marks=pytest.mark.figures),
     ],
