@@ -47,10 +47,10 @@ SLOW = (
 
 # modules that run whole commands again and again
 FEW_VIEWS = {
-    *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_rejection", "test_cli_resampling"),
-    *("test_several_places", "test_faults", "test_readme", "test_footprint"),
+    *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_resampling", "test_several_places"),
+    *("test_faults", "test_readme", "test_footprint"),
 }
-PIXELS = FEW_VIEWS | {"test_real_routes", "test_reproduce"}
+PIXELS = FEW_VIEWS | {"test_real_routes", "test_reproduce", "test_cli_rejection"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

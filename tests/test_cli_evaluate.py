@@ -78,12 +78,13 @@ def test_evaluate_writes_a_report_and_says_what_was_judged(
     assert (report["queries"], report["judged"], report["unknown"], report["with_answer"]) == (84, 3, 81, 2)
     page = (tmp_path / "out" / "index.html").read_text()
     assert "<pre>dejavu evaluate" in page
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 3
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "report.json",
         "index.html",
         "pr.png",
         "coverage.png",
+        "reliability.png",  # the map is calibrated
     }
 
 
