@@ -45,10 +45,12 @@ SLOW = (
 )
 
 
-PIXELS = {
-    *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_rejection", "test_several_places"),
-    "test_real_routes",
+# modules that run whole commands again and again
+FEW_VIEWS = {
+    *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_resampling", "test_several_places"),
+    *("test_faults", "test_readme", "test_footprint"),
 }
+PIXELS = FEW_VIEWS | {"test_real_routes", "test_reproduce", "test_cli_rejection"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -67,14 +69,19 @@ def _one_thread() -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _small_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Where whole commands run again and again, their pictures are drawn but written as one pixel each, which
-    takes half of their time; what a picture looks like is tested elsewhere."""
+def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Where whole commands run again and again, their pictures are drawn but written as one pixel each, and
+    whitening and calibration learn from few copies of frames: both take most of their time, and what a
+    picture looks like, and how many copies there are, is tested elsewhere."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem in PIXELS:
             one = io.BytesIO()
             Image.new("L", (1, 1)).save(one, "png")
             patch.setattr("dejavu_torch.evaluation.report.as_png", lambda picture: one.getvalue())
+        if request.path.stem in FEW_VIEWS:
+            patch.setattr("dejavu_torch.features.whitening.VIEWS", 1)
+            patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", 1)
+            patch.setattr("dejavu_torch.features.views.FEWEST", 100)
         yield
 
 

@@ -21,8 +21,9 @@ from dejavu_torch.cli import COMMANDS, commands
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.types import Training
 
-SMALL = "sim:aerial?frames=256"
-QUERY = "sim:aerial?frames=256&traverse=1"
+SMALL = "sim:aerial?frames=96"
+QUERY = "sim:aerial?frames=96&traverse=1"
+LONG = "sim:aerial?frames=256"  # longer than the window of periods that some tests give
 MAPPER = "{class_path: dejavu_torch.TemplateMapper, init_args: {"
 WINDOW = "{class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: "
 
@@ -54,7 +55,7 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     match = model.localize(open_source(QUERY))
     columns = ["query", "place", "score", "accepted", "probability", "query_name", "place_name"]
     assert list(rows[0]) == columns
-    assert [int(row["query"]) for row in rows] == list(range(256))
+    assert [int(row["query"]) for row in rows] == list(range(96))
     assert match.probability is not None
     assert [float(row["probability"]) for row in rows] == pytest.approx(match.probability.tolist(), abs=1e-4)
     assert [int(row["place"]) for row in rows] == match.index.tolist()
@@ -73,13 +74,13 @@ def test_convention_4_threshold_option_then_map_then_all(
     capsys.readouterr()
     run("localize", route, QUERY, "--out", out)
     assert "no threshold" in capsys.readouterr().out
-    assert accepted() == 256
-    score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[100]
+    assert accepted() == 96
+    score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[40]
     run("learn", SMALL, "--map", route, "--threshold", str(score))
     capsys.readouterr()
     run("localize", route, QUERY, "--out", out)
     assert "no threshold" not in capsys.readouterr().out
-    assert 90 <= accepted() <= 101
+    assert 35 <= accepted() <= 41
     run("localize", route, QUERY, "--out", out, "--threshold", "0")
     assert accepted() == 0
 
@@ -115,7 +116,7 @@ def test_config_and_options(tmp_path: Path) -> None:
         "periods: {class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: 128}}}}\n"
     )
     route = tmp_path / "a.safetensors"
-    run("learn", SMALL, "--map", route, "--config", config, "--batch_size", "16")
+    run("learn", LONG, "--map", route, "--config", config, "--batch_size", "16")
     model = DejaVu.load(route)
     assert model.mapper.periods.window == 128
     assert model.map.reduction == "sum"
@@ -137,7 +138,7 @@ def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
 )
 def test_parts_of_a_mapper_of_templates_as_options(templates: tuple[str, ...], tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
-    run("learn", SMALL, "--map", route, *templates, "--mapper.periods.window", "128")
+    run("learn", LONG, "--map", route, *templates, "--mapper.periods.window", "128")
     model = DejaVu.load(route)
     assert (model.mapper.periods.window, model.mapper.periods.peaks) == (128, "local")
     assert model.whitening is None
@@ -287,26 +288,19 @@ def test_every_setting_of_a_model_is_an_option_and_a_key(capsys: pytest.CaptureF
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libgomp is the OpenMP of Linux builds")
 @pytest.mark.parametrize(("given", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "active"}, "ACTIVE")])
-def test_threads_do_not_spin_while_they_wait(given: dict[str, str], policy: str, small_map: Path) -> None:
+def test_threads_do_not_spin_while_they_wait(given: dict[str, str], policy: str) -> None:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
     environment = {**kept, "OMP_DISPLAY_ENV": "true", **given}
-    command = [sys.executable, "-m", "dejavu_torch.cli", "info", str(small_map)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-m", "dejavu_torch.cli", "info", "nowhere"]  # for which torch is loaded
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert f"OMP_WAIT_POLICY = '{policy}'" in done.stderr
 
 
 def test_quiet_where_not_a_terminal(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "dejavu_torch.cli",
-        "learn",
-        SMALL,
-        "--map",
-        str(tmp_path / "a.safetensors"),
-    ]
+    words = ["learn", SMALL, "--map", str(tmp_path / "a.safetensors"), "--whitening.views", "1"]
+    command = [sys.executable, "-m", "dejavu_torch.cli", *words]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert [line for line in done.stderr.splitlines() if "window shrunk" not in line] == []
+    assert done.stderr == ""
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"]])
@@ -438,7 +432,7 @@ def test_paper_preset_refuses_less_than_its_window(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "-c", "paper")
-    assert "256" in error
+    assert "96" in error
     assert "1024" in error
 
 
@@ -675,17 +669,14 @@ def test_what_torch_cannot_allocate_is_one_line_and_a_bug_is_a_traceback(
 @pytest.mark.slow
 def test_localize_memory_does_not_grow_with_the_queries(small_map: Path, tmp_path: Path) -> None:
     code = (
-        "import resource, sys; from dejavu_torch.cli import main; main(sys.argv[1:]);"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+        "import resource, sys; from dejavu_torch.cli import main\n"
+        "for count in (128, 1280):\n"
+        "    main(['localize', sys.argv[1], f'sim:aerial?frames={count}', '--out', sys.argv[2]])\n"
+        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
-
-    def peak(count: int) -> int:
-        arguments = ["localize", small_map, f"sim:aerial?frames={count}", "--out", tmp_path / "m.csv"]
-        command = [sys.executable, "-c", code, *map(str, arguments)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        return int(done.stdout.splitlines()[-1])
-
-    few, many = peak(128), peak(1280)
+    command = [sys.executable, "-c", code, str(small_map), str(tmp_path / "m.csv")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    few, many = (int(line) for line in done.stdout.splitlines() if line.isdigit())
     # features of the further frames would take 8 MB, their frames 57 MB, the painted route takes 2 MB
     assert many - few < 8_000
 

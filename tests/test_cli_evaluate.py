@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -82,12 +78,13 @@ def test_evaluate_writes_a_report_and_says_what_was_judged(
     assert (report["queries"], report["judged"], report["unknown"], report["with_answer"]) == (84, 3, 81, 2)
     page = (tmp_path / "out" / "index.html").read_text()
     assert "<pre>dejavu evaluate" in page
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 3
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "report.json",
         "index.html",
         "pr.png",
         "coverage.png",
+        "reliability.png",  # the map is calibrated
     }
 
 
@@ -142,26 +139,6 @@ def test_channel_and_contrast_are_options_and_stay_with_the_map(
     assert "frames with 1 channel" in error
     error = fails(capsys, "learn", "sim:aerial?frames=128", "--map", route, "--preprocess.channel", "X")
     assert "'X'" in error
-
-
-def test_a_command_that_is_ended_leaves_no_broken_file(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    run("learn", "sim:aerial?frames=64", "--map", tmp_path / "map.safetensors")
-    (tmp_path / "out").mkdir()
-    source = ("sim:aerial?frames=32768", "--out", str(tmp_path / "out" / "m.csv"))
-    command = [
-        sys.executable,
-        "-m",
-        "dejavu_torch.cli",
-        "localize",
-        str(tmp_path / "map.safetensors"),
-        *source,
-    ]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    while not list((tmp_path / "out").iterdir()) and process.poll() is None:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 143
-    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_what_is_taken_for_the_truth_is_told(

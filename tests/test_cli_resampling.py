@@ -66,7 +66,7 @@ def test_compare_is_learn_localize_and_evaluate(folder: Path, tmp_path: Path) ->
     assert report["unit"] == alone["unit"]
     assert report["frames"] == report["queries"] == 101
     for picture in ("velocity", "ground"):
-        assert (tmp_path / "c" / f"{picture}.png").stat().st_size > 1000
+        assert (tmp_path / "c" / f"{picture}.png").is_file()
     assert (tmp_path / "c" / "matches.csv").read_text() == (folder / "matches.csv").read_text()
     assert "right within 5 places at even steps" in (tmp_path / "c" / "index.html").read_text()
 

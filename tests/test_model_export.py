@@ -42,19 +42,23 @@ BACKBONES: dict[str, Callable[[], nn.Module]] = {
     "SmallCNN": lambda: SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4),
     "Embedding": lambda: Embedding(nn.Conv2d(3, 4, 3), dimension=8, resize=(16, 16), grid=2, cell=4),
 }
+SPECTRAL: dict[str, dict[str, Any]] = {
+    "default": {},
+    "chunks": {"chunk": 25},
+    "dct, l2": {"transform": "dct", "metric": "l2"},
+}
 SETTINGS: dict[str, dict[str, Any]] = {
-    "l1": {"metric": "l1"},
     "l1, sum": {"metric": "l1", "reduction": "sum"},
     "l2": {"metric": "l2"},
     "cosine, sum": {"metric": "cosine", "reduction": "sum"},
     "callable": {"metric": lambda a, b: (a[:, None] - b).abs().amax(2)},
-    "temperature": {"temperature": 0.1},
+    "l1, temperature": {"temperature": 0.1},
 }
 
 
-def spectral(backbone: str = "HOG", **settings: Any) -> DejaVu:
+def spectral(backbone: str) -> DejaVu:
     """The default, a spectral map of whitened descriptors, of a route of 60 colour frames."""
-    model = DejaVu(BACKBONES[backbone](), Whitening(views=1), SpectralMapper(16.0, **settings))
+    model = DejaVu(BACKBONES[backbone](), Whitening(views=1), SpectralMapper(16.0))
     return model.learn(torch.rand(60, 3, 32, 24)).eval()
 
 
@@ -86,15 +90,8 @@ def test_the_exported_model_scores_frames_as_the_model_does(backbone: str) -> No
 
 
 @pytest.mark.parametrize("backbone", ["HOG", "Embedding"])
-@pytest.mark.parametrize(
-    "settings",
-    [{}, {"chunk": 25}, {"transform": "dct", "metric": "l2"}],
-    ids=["default", "chunks", "dct, l2"],
-)
-def test_the_exported_model_of_a_spectral_map_scores_frames_as_the_model_does(
-    backbone: str, settings: dict[str, Any]
-) -> None:
-    model = spectral(backbone, **settings)
+def test_the_exported_model_of_a_spectral_map_scores_frames_as_the_model_does(backbone: str) -> None:
+    model = spectral(backbone)
     program, buffer = exported(model, torch.rand(2, 3, 32, 24)), io.BytesIO()
     torch.export.save(program, buffer)
     buffer.seek(0)
@@ -105,10 +102,20 @@ def test_the_exported_model_of_a_spectral_map_scores_frames_as_the_model_does(
             torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("settings", SPECTRAL.values(), ids=SPECTRAL)
+def test_every_setting_of_a_spectral_map_is_exported(settings: dict[str, Any]) -> None:
+    """Of whitened features."""
+    model = DejaVu(mapper=SpectralMapper(16.0, **settings)).learn(torch.rand(60, 8)).eval()
+    run = exported(model, torch.rand(2, 8)).module()
+    for batch in BATCHES:
+        queries = torch.rand(batch, 8)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("backbone", ["HOG", "Embedding"])
-def test_the_compiled_model_of_a_spectral_map_scores_frames_as_the_model_does(backbone: str) -> None:
-    model = spectral(backbone)
+def test_the_compiled_model_of_a_spectral_map_scores_frames_as_the_model_does() -> None:
+    """Traced for one frame, for 8, and for any number."""
+    model = spectral("HOG")
     torch.compiler.reset()
     run = torch.compile(model, fullgraph=True, backend="eager")
     for batch in BATCHES:
@@ -119,10 +126,11 @@ def test_the_compiled_model_of_a_spectral_map_scores_frames_as_the_model_does(ba
 @pytest.mark.slow
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_the_compiled_model_scores_frames_as_the_model_does(backbone: str) -> None:
+    """Traced for any number of frames."""
     model = learned(backbone)
     torch.compiler.reset()
-    run = torch.compile(model, fullgraph=True, backend="eager")
-    for batch in BATCHES:
+    run = torch.compile(model, fullgraph=True, backend="eager", dynamic=True)
+    for batch in (8, 100):
         queries = torch.rand(batch, 3, 32, 24)
         torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
 
@@ -196,14 +204,6 @@ def test_frames_that_run_in_parts_are_exported_whole() -> None:
     for batch in (1, 42, 43, 100):
         queries = torch.rand(batch, 3, 64, 64)
         assert (len(hog_module.parts(queries)) > 1) == (batch > 42)
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-def test_whitened_features_are_exported() -> None:
-    model = DejaVu().learn(torch.rand(60, 8)).eval()
-    run = exported(model, torch.rand(2, 8)).module()
-    for batch in BATCHES:
-        queries = torch.rand(batch, 8)
         torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
 
 

@@ -125,6 +125,7 @@ def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_d
     assert moved == pytest.approx(still, rel=0.02)
 
 
+@pytest.mark.figures
 def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
     pytest.importorskip("cv2")
     clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
@@ -137,7 +138,7 @@ def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
         assert float(ground.distance.diff().mean()) == pytest.approx(mean, rel=0.03)
 
 
-@pytest.mark.parametrize("resampled", [False, True])
+@pytest.mark.parametrize("resampled", [pytest.param(False, marks=pytest.mark.figures), True])
 def test_even_steps_leave_the_period_of_a_constant_speed(
     resampled: bool, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -186,6 +187,7 @@ def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(da
             assert peak == pytest.approx(told_height, abs=0.015)
 
 
+@pytest.mark.figures
 @pytest.mark.parametrize("channel", ["grey", "R-B"])
 def test_the_dash_of_the_road_is_the_strongest_layer_in_the_difference_of_red_and_blue(
     channel: str, data_dir: Path, tmp_path: Path
@@ -233,8 +235,14 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
 
 @pytest.mark.parametrize(
     ("column", "options"),
-    [(0, ()), (1, ("--mapper.route_bytes_per_place", "2.5")), (2, ("--tolerance", "0")), (3, ())],
-    ids=["road", "road, small", "corridor", "railway"],
+    [
+        pytest.param(0, (), id="road", marks=pytest.mark.figures),
+        pytest.param(
+            1, ("--mapper.route_bytes_per_place", "2.5"), id="road, small", marks=pytest.mark.figures
+        ),
+        pytest.param(2, ("--tolerance", "0"), id="corridor"),
+        pytest.param(3, (), id="railway", marks=pytest.mark.figures),
+    ],
 )
 def test_spectral_maps(column: int, options: tuple[str, ...], data_dir: Path, tmp_path: Path) -> None:
     cut = "halve=1&rows=32:128&width=96"

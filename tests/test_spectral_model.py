@@ -88,14 +88,6 @@ def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
     assert torch.equal(fresh(frames), model(frames))
 
 
-def test_the_model_is_exported(model: DejaVu, second: Traverse) -> None:
-    frames = torch.cat(list(second.batches(100)))[:100]
-    dims = {"queries": {0: torch.export.Dim("batch")}}
-    program = torch.export.export(model.eval(), (frames[:3],), dynamic_shapes=dims).module()
-    for batch in (1, 8, 100):
-        assert torch.allclose(program(frames[:batch]), model(frames[:batch]), atol=1e-4)
-
-
 def test_whitening_by_a_second_traverse(reference: Traverse, second: Traverse) -> None:
     learned = spectral().learn(reference, second=Views(second, torch.arange(FRAMES)))
     plain = spectral().learn(reference)

@@ -114,6 +114,10 @@ class TrainParser(Parser, LightningArgumentParser):
 class TrainCLI(LightningCLI):
     """fit writes DIR/map.safetensors; validate, test and export take a checkpoint."""
 
+    def __init__(self, args: list[str], **settings: Any) -> None:
+        self.words = args  # also for what to do next
+        super().__init__(args=args, **settings)
+
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
         """Lightning's without predict, which `dejavu localize` does, and with export."""
@@ -128,6 +132,14 @@ class TrainCLI(LightningCLI):
         )
         return parser
 
+    def _prepare_subcommand_parser(
+        self, klass: type, subcommand: str, **kwargs: Any
+    ) -> LightningArgumentParser:
+        """Options of the command that is asked for, where it is known: those of all four take longer."""
+        if {*self.words[:1]} & ({*self.subcommands()} - {subcommand}):
+            return self.init_parser(**kwargs)
+        return super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+
     def add_core_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Our options ahead of Lightning's."""
         parser.add_lightning_class_args(PlaceRecognitionTask, "model")
@@ -136,8 +148,7 @@ class TrainCLI(LightningCLI):
         parser.set_defaults({f"trainer.{name}": value for name, value in TRAINER.items()} | PARTS)
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Keep the words, for what to do next; refuse numbers that Lightning fails on later."""
-        self.words = list(args)
+        """Refuse numbers that Lightning fails on later."""
         super().parse_arguments(parser, args)
         chosen = self.config[self.config["subcommand"]]
         for part in ("trainer", "model", "data"):
@@ -356,10 +367,10 @@ def run_train(arguments: Sequence[str]) -> None:
         warnings.filterwarnings("ignore", f".*{message}.*")
     try:
         TrainCLI(
-            PlaceRecognitionTask,
-            RouteData,
+            list(arguments),
+            model_class=PlaceRecognitionTask,
+            datamodule_class=RouteData,
             trainer_class=MapTrainer,
-            args=list(arguments),
             parser_kwargs={"prog": "dejavu train", "description": "Train features that repeat, end to end."},
             seed_everything_default=0,
             save_config_callback=ConfigFile,

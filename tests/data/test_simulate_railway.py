@@ -344,7 +344,7 @@ def test_the_ground_is_a_strip_beside_the_sleepers(kind: type[Railway], height: 
 @pytest.mark.parametrize("traverse", [0, 1])
 @both
 def test_the_ground_moves_as_the_train_does(kind: type[Railway], traverse: int) -> None:
-    train, start, stop = ride_of(kind, traverse), 600, 900
+    train, start, stop = ride_of(kind, traverse), 700, 800
     frames = frames_at(train, torch.arange(start, stop))
     shift, confidence = GroundOdometry(train.ground, (32, 32))(frames)
     metres = float(shift.sum()) * train.ground_span / 31

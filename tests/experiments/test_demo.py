@@ -163,6 +163,7 @@ def test_readme_tells_what_the_demo_measures(report: dict[str, Any]) -> None:
             assert figures[3:] == pytest.approx(measured, rel=0.02)
 
 
+@pytest.mark.figures
 def test_maps_of_templates_are_what_readme_tells(tmp_path: Path) -> None:
     main(["demo", "--config", "local_maxima", "--out", str(tmp_path)])
     report = json.loads((tmp_path / "report.json").read_text())

@@ -384,7 +384,7 @@ def test_what_is_refused(
 
 def test_pairs_of_other_lengths_that_know_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frontier, "contenders_of", lambda *_: [])
-    pair = [f"sim:outdoor?height=32&width=64&stop={stop}&traverse={stop % 2}" for stop in (60, 51)]
+    pair = [f"sim:aerial?frames=60&stop={stop}&traverse={stop % 2}" for stop in (60, 51)]
     assert list(bench_storage(pair)) == []
 
 

@@ -97,28 +97,21 @@ def test_a_file_says_what_it_is(flights: tuple[Tensor, Tensor], tmp_path: Path) 
         torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "part",
-    [
-        {"features": SmallCNN(8, resize=(16, 16), widths=(4, 8), squeeze=4)},
-        {"preprocess": Preprocess("R-B", "patch")},
-    ],
-    ids=["CNN", "patches"],
-)
-def test_other_parts_score_as_in_torch(
-    part: dict[str, Any], flights: tuple[Tensor, Tensor], tmp_path: Path
-) -> None:
+def test_other_parts_score_as_in_torch(flights: tuple[Tensor, Tensor], tmp_path: Path) -> None:
     mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), "l1", "sum")
-    model = DejaVu(mapper=mapper, **part).learn(flights[0]).eval()
+    network = SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
+    model = DejaVu(network, mapper=mapper, preprocess=Preprocess("R-B", "patch")).learn(flights[0]).eval()
     export_onnx(model, tmp_path / "map.onnx")
     found = run_session(session_of(str(tmp_path / "map.onnx")), flights[1])
     with torch.no_grad():
         torch.testing.assert_close(found, model(flights[1]), rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
-def test_a_map_of_features_takes_features(metric: str, tmp_path: Path) -> None:
-    model, queries = of_features(metric=metric, temperature=0.1 if metric == "l1" else None), torch.rand(9, 4)
+@pytest.mark.parametrize(
+    "settings", [{"metric": "l2", "temperature": 0.1}, {"metric": "cosine"}], ids=["l2", "cosine"]
+)
+def test_a_map_of_features_takes_features(settings: dict[str, Any], tmp_path: Path) -> None:
+    model, queries = of_features(**settings), torch.rand(9, 4)
     facts = export_onnx(model, tmp_path / "map.onnx").facts
     assert facts["inputs"] == {"features": ["batch", 4]}
     assert "threshold" not in facts
@@ -127,20 +120,23 @@ def test_a_map_of_features_takes_features(metric: str, tmp_path: Path) -> None:
     torch.testing.assert_close(found, model(queries), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "model", [SequenceMatcher(5, (1, 0.5)), PlaceFilter(within=2)], ids=["sum", "filter"]
-)
-def test_a_sequence_goes_from_state_to_state(model: SequenceModel, tmp_path: Path) -> None:
-    route, queries = of_features(), torch.rand(20, 4)
-    facts = export_onnx(route, tmp_path / "map.onnx", model).facts
-    state = [31] if isinstance(model, PlaceFilter) else [4, 30]
+def assert_streams(file: Path, route: DejaVu, model: SequenceModel, state: list[int]) -> dict[str, Any]:
+    """A file goes from state to state as a sequence model does; its facts."""
+    session, queries = session_of(str(file)), torch.rand(20, 4)
+    facts = facts_of(session)
     assert facts["inputs"] == {"features": [1, 4], "state": state}
     assert facts["outputs"] == {"scores": [1, 30], "next_state": state}
-    assert facts.get("threshold") == model.threshold_of(None)
     with torch.no_grad():
         (expected,) = model.stream([route(queries)])
-    found = run_session(session_of(str(tmp_path / "map.onnx")), queries)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(run_session(session, queries), expected, rtol=0, atol=1e-4)
+    return facts
+
+
+def test_a_filter_goes_from_state_to_state(tmp_path: Path) -> None:
+    route, model = of_features(), PlaceFilter(within=2)
+    facts = export_onnx(route, tmp_path / "map.onnx", model).facts
+    assert facts == assert_streams(tmp_path / "map.onnx", route, model, [31])
+    assert facts["threshold"] == model.threshold_of(None)
 
 
 class Solves(nn.Module):
@@ -185,6 +181,8 @@ def test_clahe_is_refused(tmp_path: Path) -> None:
 
 
 def test_scores_that_differ_are_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, given in {"_program": None, "_serialised": b"", "session_of": None}.items():
+        monkeypatch.setattr(onnx_file, name, lambda *_, given=given: given)
     monkeypatch.setattr(onnx_file, "run_session", lambda session, frames: torch.zeros(len(frames), 30))
     with refused("differ from torch's by", "expected at most"):
         export_onnx(of_features(), tmp_path / "map.onnx")
@@ -235,11 +233,11 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     model = of_features()
     model.save(tmp_path / "map.safetensors")
     words = ("export", tmp_path / "map.safetensors", "--onnx")
-    run(*words, tmp_path / "map.onnx", "--sequence", "3", "--threshold", "0.5")
+    run(*words, tmp_path / "map.onnx", "--sequence", "5", "--speeds", "[1,0.5]", "--threshold", "0.5")
     out = capsys.readouterr().out
-    for told in ("features (1, 4)", "state (2, 30)", f"opset {OPSET}", f"written to {tmp_path / 'map.onnx'}"):
+    for told in ("features (1, 4)", "state (4, 30)", f"opset {OPSET}", f"written to {tmp_path / 'map.onnx'}"):
         assert told in out
-    facts = facts_of(session_of(str(tmp_path / "map.onnx")))
+    facts = assert_streams(tmp_path / "map.onnx", model, SequenceMatcher(5, (1, 0.5)), [4, 30])
     assert (facts["threshold"], facts["first_state"]) == (0.5, "nan")
     before = (tmp_path / "map.onnx").read_bytes()
     assert "such as route.onnx" in fails(capsys, *words, tmp_path / "map.pt")

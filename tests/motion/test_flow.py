@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 
 import pytest
@@ -96,7 +95,7 @@ def test_each_pair_by_itself(method: str) -> None:
 
 @pytest.mark.parametrize(("method", "most"), [("lk", 0.15), ("dis", 0.3)])
 def test_unrelated_ground_is_not_believed(method: str, most: float) -> None:
-    for one, other in (texture(40, 96).split(20), torch.rand(40, 1, 96, 96).split(20)):
+    for one, other in (texture(20, 96).split(10), torch.rand(20, 1, 96, 96).split(10)):
         assert flow_shift(one, other, method)[1].max() < most
 
 
@@ -138,12 +137,3 @@ def test_without_opencv_one_line_says_what_to_install(method: str, monkeypatch: 
     with refused("OpenCV", "pip install 'dejavu_torch[flow]'"):
         GroundOdometry(flow=method)
     GroundOdometry()(torch.rand(2, 1, 240, 320))
-
-
-def test_opencv_is_loaded_only_when_used() -> None:
-    code = (
-        "import sys; from dejavu_torch import GroundOdometry as V; V(); print('cv2' in sys.modules);"
-        "V(flow='lk'); print('cv2' in sys.modules)"
-    )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.split() == ["False", "True"]

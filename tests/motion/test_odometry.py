@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, ground_patch, region_length
-from dejavu_torch.motion.odometry import GroundOdometry, interpolated
+from dejavu_torch.motion.odometry import GroundOdometry, Odometry, interpolated
 from dejavu_torch.motion.phase_correlation import shift_between
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.types import Traverse
@@ -114,6 +114,11 @@ class Shown(Traverse):
 @cache
 def journey() -> Shown:
     return Shown(drive(JOURNEY), JOURNEY)
+
+
+@cache
+def measured() -> Odometry:
+    return GroundOdometry().distances(journey(), 100)
 
 
 @cache
@@ -269,13 +274,13 @@ def path_error(distance: Tensor, position: Tensor) -> float:
 
 
 def test_a_drive_with_stops_and_a_reversal() -> None:
-    measured = GroundOdometry().distances(journey())
-    assert measured.distance.dtype == torch.float64
-    assert path_error(measured.distance, JOURNEY) < 0.01
-    assert (measured.distance - JOURNEY).abs().max() < 0.01 * JOURNEY.diff().abs().sum()
+    distance = measured().distance
+    assert distance.dtype == torch.float64
+    assert path_error(distance, JOURNEY) < 0.01
+    assert (distance - JOURNEY).abs().max() < 0.01 * JOURNEY.diff().abs().sum()
     stands = JOURNEY.diff() == 0
-    assert (measured.distance.diff()[stands] == 0).all()
-    assert measured.confidence.min() > 0.6
+    assert (distance.diff()[stands] == 0).all()
+    assert measured().confidence.min() > 0.6
 
 
 def single_scale(first: Tensor, second: Tensor) -> Tensor:
@@ -305,20 +310,17 @@ def test_frame_rate_changes_nothing() -> None:
 
 
 def test_frames_reversed_go_the_way_back() -> None:
-    there, back = (
-        GroundOdometry().distances(Shown(frames)).distance
-        for frames in (journey().frames, journey().frames.flip(0))
-    )
+    there = measured().distance
+    back = GroundOdometry().distances(Shown(journey().frames.flip(0))).distance
     torch.testing.assert_close(back, there.flip(0) - there[-1], rtol=0, atol=1.0)
 
 
 @settings(max_examples=3)
 @given(size=st.integers(1, 90))
 def test_batches_do_not_matter(size: int) -> None:
-    whole = GroundOdometry().distances(journey(), 100)
     parts = GroundOdometry().distances(journey(), size)
-    torch.testing.assert_close(parts.distance, whole.distance, rtol=0, atol=1e-3)
-    torch.testing.assert_close(parts.confidence, whole.confidence, rtol=0, atol=1e-4)
+    torch.testing.assert_close(parts.distance, measured().distance, rtol=0, atol=1e-3)
+    torch.testing.assert_close(parts.confidence, measured().confidence, rtol=0, atol=1e-4)
 
 
 def test_forward_gives_the_steps_as_measured() -> None:

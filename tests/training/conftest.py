@@ -9,6 +9,10 @@ import pytest
 import torch
 from small_training import CONFIG, MINE, footage, train
 
+from dejavu_torch import DejaVu
+
+CALIBRATED = ("test_export", "test_train_command")
+
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -28,6 +32,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.chdir(folder)
         train("fit")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _without_calibration(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of many small trainings, of which it takes a third; those of the command are calibrated."""
+    if request.path.stem not in CALIBRATED:
+        monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda model, reference: None)
 
 
 @pytest.fixture

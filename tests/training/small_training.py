@@ -165,17 +165,13 @@ class Hungry(Plain):
 class Masked(Plain):
     def __init__(self) -> None:
         super().__init__()
+        self.linear = nn.Sequential(nn.LazyBatchNorm1d(), nn.LazyLinear(8))
         self.register_buffer("mask", torch.full((4, 4), -torch.inf).triu(1))
         self.register_buffer("wide", torch.ones(1, 4).expand(4, 4))
     def get_extra_state(self):
         return {"best": -torch.inf, "seen": torch.ones(2)}
     def set_extra_state(self, state):
         assert state["best"] == -torch.inf
-
-class Lazy(Plain):
-    def __init__(self) -> None:
-        super().__init__()
-        self.linear = nn.Sequential(nn.LazyBatchNorm1d(), nn.LazyLinear(8))
 
 class Interrupted(Plain):
     def forward(self, frames):

@@ -56,6 +56,7 @@ def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder: Path) ->
     model = DejaVu.load(folder / "run" / "map.safetensors")
     assert model.trained is not None
     assert (model.trained.steps, model.trained.seed) == (4, 0)
+    assert model.calibration is not None
 
 
 def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,6 @@ from dejavu_torch.cli import main
 
 STOP, WATCH = (["--trainer.callbacks+", name] for name in ("EarlyStopping", "ModelCheckpoint"))
 ANOTHER = ["--ckpt_path", "run/checkpoints/last.ckpt"]
-EVERY = ("fit", "validate", "test", "export")
 SPECTRAL = ["--model.mapper", "SpectralMapper"]
 
 
@@ -65,14 +64,15 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
             ["check_val_every_n_epoch is 0", "of at least 1"],
         ),
         ("fit", ["--trainer.max_steps", "-2"], ["trainer.max_steps is -2", "-1 for no end"]),
-        *((command, ["--trainer.devices", "2"], ["runs on one device", "devices is 2"]) for command in EVERY),
+        *(
+            (command, ["--trainer.devices", "2"], ["runs on one device", "devices is 2"])
+            for command in ("fit", "export")
+        ),
         ("fit", ["--trainer.devices", "[0,1]"], ["runs on one device", "devices is [0, 1]"]),
         ("fit", ["--trainer.devices", "0,1"], ["runs on one device", "devices is 0,1"]),
         ("fit", ["--trainer.devices", "-1"], ["runs on one device", "devices is -1"]),
         ("fit", ["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
-        ("fit", ["--trainer.devices", "1000000000000"], ["runs on one device", "devices is 1000000000000"]),
         ("fit", ["--trainer.num_nodes", "2"], ["runs on one device", "num_nodes is 2"]),
-        ("fit", ["--trainer.num_nodes", "1000000000000"], ["num_nodes is 1000000000000"]),
         ("fit", ["--model.backbone", "mine.Hungry"], ["not enough memory: it ran out"]),
         ("fit", ["--seed_everything", str(2**63)], ["seed_everything", "expected whole numbers of at most"]),
         ("fit", ["--data.batch_size", str(2**63)], ["data.batch_size", "expected whole numbers of at most"]),

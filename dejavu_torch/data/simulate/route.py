@@ -9,6 +9,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import field, fields
+from functools import cached_property
 from hashlib import blake2b
 from numbers import Integral, Real
 from typing import Any, ClassVar, TypeVar
@@ -63,6 +64,11 @@ class SimulatedRoute(IndexedTraverse):
     @abstractmethod
     def _frames(self, at: Tensor) -> Tensor:
         """Draw the frames with these numbers. Shape: (B,) int64 -> (B,3,H,W) float32 in [0,1]."""
+
+    @cached_property
+    def frame_shape(self) -> tuple[int, ...]:
+        """See `Traverse`; a frame takes long to draw."""
+        return super().frame_shape
 
     def read(self, frames: range) -> Tensor:
         return self._frames(torch.arange(frames.start, frames.stop, frames.step))
