@@ -507,8 +507,10 @@ def run_bench(
             raise InputError(
                 "bench train takes no maps, codebooks, whitening or places; expected steps, seeds"
             )
-        print(text_table(train_speed.train_table(train_speed.run_train(out, sources, steps, seeds))))
-        _say(f"each row changes one thing of the row above; next: open {out / 'bench.png'}")
+        trained = train_speed.run_train(out, sources, steps, seeds)
+        print(text_table(train_speed.train_table(trained)))
+        seen = f"{trained[0].case}, {len({row.seed for row in trained})} seeds, {trained[0].threads} threads"
+        _say(f"{seen}; each row changes one thing of the row above; next: open {out / 'bench.png'}")
         return
     known = what in bench.BENCHES or what in ("memory", "live")
     if known and (sources or map or codebooks or whitening or (places and what != "memory")):

@@ -212,12 +212,12 @@ def _means(rows: Sequence[TrainRow]) -> dict[str, float]:
 
 def train_table(rows: Sequence[TrainRow]) -> list[list[str]]:
     """The figures as rows of text, the header first: means of the seeds, and their lowest and highest."""
-    table = [["", "seconds", *(f"AUC at {budget:g} B" for budget in BUDGETS), "steps", "seeds"]]
+    table = [["", "seconds", *(f"AUC at {budget:g} B" for budget in BUDGETS)]]
     for name in dict.fromkeys(row.contender for row in rows):
         own = [row for row in rows if row.contender == name]
         line = [name, f"{_means(own)[name]:.1f}"]
         for budget in BUDGETS:
             found = [row.auc[f"{budget:g}"] for row in own]
-            line.append(f"{sum(found) / len(found):.3f} ({min(found):.3f} to {max(found):.3f})")
-        table.append([*line, str(own[0].steps), str(len(own))])
+            line.append(f"{sum(found) / len(found):.3f} ({min(found):.3f}-{max(found):.3f})")
+        table.append(line)
     return table
