@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 from torch import Tensor, nn
 
@@ -11,7 +10,6 @@ from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
 FLAT = 2 / 255  # contrast below which nothing is blown up
-KERNELS = {2: (5, 2), 4: (6, 1)}  # side and padding of the first convolution, by its stride
 
 
 def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
@@ -61,9 +59,7 @@ class SmallCNN(nn.Module):
         dimension: D, number of features.
         channels: of the frames, 3 or 1.
         resize: (height, width) in pixels that frames are brought to, antialiased.
-        widths: channels after each convolution; each halves height and width, but for the first.
-        stem: by how much the first divides them: 2 with a kernel of 5 x 5, or 4 with one of 6 x 6, several
-            times as fast.
+        widths: channels after each convolution; each halves height and width.
         squeeze: channels ahead of the linear layer.
         cell: of `local_contrast`, pixels; 0 leaves the contrast as it is.
 
@@ -87,13 +83,9 @@ class SmallCNN(nn.Module):
         widths: Sequence[int] = (16, 32, 64, 96),
         squeeze: int = 32,
         cell: int = 8,
-        stem: Literal[2, 4] = 2,
     ) -> None:
         super().__init__()
         check_size(resize, 1, "SmallCNN got resize")
-        if stem not in KERNELS or min(resize) < KERNELS[stem][0] - 2 * KERNELS[stem][1]:
-            seen = f"stem={stem} for frames of {resize[0]} x {resize[1]}"
-            raise InputError(f"SmallCNN got {seen}; expected 2 or 4, and no smaller frames")
         sizes = [dimension, channels, squeeze, *widths]
         if not widths or min(sizes) < 1 or cell < 0:
             raise InputError(
@@ -107,17 +99,16 @@ class SmallCNN(nn.Module):
         self.widths = tuple(int(width) for width in widths)
         self.squeeze = squeeze
         self.cell = cell
-        self.stem = stem
         layers: list[nn.Module] = []
         height, width = self.resize
         for before, after in zip((channels, *self.widths), self.widths, strict=False):
-            stride, side, pad = (2, 3, 1) if layers else (stem, *KERNELS[stem])
+            side = 3 if layers else 5
             layers += [
-                nn.Conv2d(before, after, side, stride=stride, padding=pad, bias=False),
+                nn.Conv2d(before, after, side, stride=2, padding=side // 2, bias=False),
                 nn.BatchNorm2d(after),
                 nn.ReLU(inplace=True),
             ]
-            height, width = ((n + 2 * pad - side) // stride + 1 for n in (height, width))
+            height, width = -(-height // 2), -(-width // 2)
         self.convolutions = nn.Sequential(
             *layers, nn.Conv2d(self.widths[-1], squeeze, 1), nn.ReLU(inplace=True)
         )
@@ -140,5 +131,5 @@ class SmallCNN(nn.Module):
     def extra_repr(self) -> str:
         return (
             f"dimension={self.dimension}, channels={self.channels}, resize={self.resize}, "
-            f"widths={self.widths}, squeeze={self.squeeze}, cell={self.cell}, stem={self.stem}"
+            f"widths={self.widths}, squeeze={self.squeeze}, cell={self.cell}"
         )

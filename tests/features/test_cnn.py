@@ -98,17 +98,6 @@ def test_any_resize_fits_the_linear_layer(resize: tuple[int, int]) -> None:
     assert small(resize=resize).eval()(torch.rand(2, 3, 30, 30)).shape == (2, 6)
 
 
-@pytest.mark.parametrize("resize", [(96, 96), (4, 7), (33, 18), (64, 5)])
-def test_a_coarse_stem_divides_by_four_at_once(resize: tuple[int, int]) -> None:
-    net = SmallCNN(dimension=6, resize=resize, widths=(4, 6), squeeze=3, stem=4)
-    assert net(torch.rand(2, 3, 20, 20)).shape == (2, 6)
-    assert net.convolutions[0].stride == (4, 4)
-    with refused("stem=4", "3 x 9", "no smaller"):
-        small(resize=(3, 9), stem=4)
-    with refused("stem=3", "2 or 4"):
-        small(stem=3)
-
-
 def test_features_of_the_training_frames_are_standardised() -> None:
     features = small().train()(torch.rand(40, 3, 16, 24))
     torch.testing.assert_close(features.mean(0), torch.zeros(6), rtol=0, atol=1e-5)
