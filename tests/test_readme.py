@@ -161,7 +161,7 @@ def test_training_in_python_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_training_that_is_shown_would_be_understood() -> None:
-    config = "dejavu train fit --config train_road"
+    config = "dejavu train fit --config train_residues"
     understand(f"{config} --data.source sim:aerial --trainer.default_root_dir out --trainer.max_steps 50")
     for wrong in ("--data.colour red", "--trainer.max_steps many", "--model.mapper.periods.bin 0.5"):
         with pytest.raises(UsageError):

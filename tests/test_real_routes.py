@@ -221,7 +221,7 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
             tmp_path / f"{flight}.png"
         )
     first, second = (f"strip:{tmp_path}/{flight}.png?halve=1&rows=32:128&width=96" for flight in (1, 2))
-    config = ["--config", str(ROOT / "configs" / "train_road.yaml"), "--seed_everything", "0"]
+    config = ["--config", str(ROOT / "configs" / "train_residues.yaml"), "--seed_everything", "0"]
     small = ["--data.resize", "[48,48]", "--model.backbone.resize", "[48,48]"]
     small += ["--model.backbone.network.resize", "[48,48]"]
     short = ["--trainer.max_steps", "300", "--trainer.limit_val_batches", "0"]

@@ -20,7 +20,7 @@ ROUTE, AGAIN = "sim:aerial?frames=64", "sim:aerial?frames=64&traverse=1"
 
 
 def small() -> SmallCNN:
-    return SmallCNN(dimension=12, resize=(16, 16), widths=(4, 8), squeeze=4, cell=0, stem=4)
+    return SmallCNN(dimension=12, resize=(16, 16), widths=(4, 8), squeeze=4, cell=0)
 
 
 @pytest.fixture(scope="module")
