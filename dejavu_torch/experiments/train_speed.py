@@ -37,15 +37,17 @@ BUDGETS = (2.4, 1.0)  # route bytes per place of the maps that are made of a des
 TOLERANCE = 5
 STRENGTHS = {"shift": (0.02, 0.08), "occlusion": 0.5}  # of configs/train_road.yaml
 WEIGHT_DECAY = 0.5
+RATE = 6e-3  # the learning rate of configs/train_road.yaml
 
 
 class Rung(NamedTuple):
-    """A way to train: backbone, augmentation, precision of the trainer."""
+    """A way to train: backbone, augmentation, precision of the trainer, learning rate."""
 
     name: str
     backbone: Callable[[], nn.Module]
     augmentation: Callable[[], Augmentation]
     precision: str = "32-true"
+    lr: float = 3e-3
 
 
 def network() -> SmallCNN:
@@ -62,8 +64,12 @@ def ladder() -> list[Rung]:
     def fused() -> Augmentation:
         return Augmentation(**STRENGTHS)  # type: ignore[arg-type]
 
-    rungs = [Rung("kornia's augmentation", network, kornia), Rung("fused augmentation", network, fused)]
-    return [*rungs, Rung("16 bits", network, fused, "bf16-mixed")] if has_bf16() else rungs
+    rungs = [
+        Rung("kornia's augmentation", network, kornia),
+        Rung("fused augmentation", network, fused),
+        Rung("twice the learning rate", network, fused, lr=RATE),
+    ]
+    return [*rungs, Rung("16 bits", network, fused, "bf16-mixed", RATE)] if has_bf16() else rungs
 
 
 class TrainRow(NamedTuple):
@@ -125,7 +131,9 @@ def _trained(
     rung: Rung, seed: int, reference: Traverse, query: Traverse, truth: GroundTruth, steps: int
 ) -> TrainRow:
     pl.seed_everything(seed, verbose=False)
-    task = PlaceRecognitionTask(rung.backbone(), SpectralMapper(BUDGETS[0]), weight_decay=WEIGHT_DECAY)
+    task = PlaceRecognitionTask(
+        rung.backbone(), SpectralMapper(BUDGETS[0]), lr=rung.lr, weight_decay=WEIGHT_DECAY
+    )
     data = RouteData(reference, tolerance=TOLERANCE, augmentation=rung.augmentation())
     clock = Clock()
     with tempfile.TemporaryDirectory() as folder:

@@ -259,7 +259,7 @@ class Whitening(nn.Module):
             places: (N,D), the descriptors of the route; they may lie in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
         """
-        kept = self._kept(len(places), places.shape[1], views is not None)
+        kept = self.kept(len(places), places.shape[1], views is not None)
         mean, basis, variances = principal_components(
             places, kept if views is None else self.components, self.seed
         )
@@ -293,7 +293,8 @@ class Whitening(nn.Module):
         )
         self.take(mean + basis @ centre, basis @ projection, None)
 
-    def _kept(self, places: int, features: int, views: bool) -> int:
+    def kept(self, places: int, features: int, views: bool) -> int:
+        """How many numbers are kept of so many features: K, unless the route turns out to have fewer."""
         if self.numbers is not None:
             return self.numbers
         return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS

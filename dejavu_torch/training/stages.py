@@ -89,6 +89,8 @@ class DescriptorStage(Stage):
             with torch.no_grad(), in_mode(task.dejavu.features, False):
                 one = described(task, reference.values[:1], descriptor_of(task))
             self.proxies = nn.Parameter(torch.randn(count, one.shape[1], device=task.device))
+            if task.made:
+                _check_map(task, len(reference), one.shape[1])
         elif len(self.proxies) != count:
             raise InputError(
                 f"the descriptor was learned on {len(self.proxies)} stretches of {every} frames, "
@@ -240,6 +242,13 @@ def views_of(task: PlaceRecognitionTask, rounds: int, most: int) -> Iterator[Vie
                     frames = data.augmented(batch.frames.to(task.device), data.clip)[known]
                     views = features_of(frames, describe, "the batch").float()
                     yield Views(views, batch.truth.positives[known].to(task.device))
+
+
+def _check_map(task: PlaceRecognitionTask, places: int, dimension: int) -> None:
+    """Refuse ahead of the training a map that could not be made behind it, as of too few bytes."""
+    whitening = task.dejavu.whitening
+    numbers = dimension if whitening is None else whitening.kept(places, dimension, True)
+    task.dejavu.mapper(torch.randn(places, numbers, generator=torch.Generator().manual_seed(0)))
 
 
 def make_map(task: PlaceRecognitionTask) -> None:

@@ -58,6 +58,7 @@ def test_each_rung_of_the_ladder_changes_one_thing() -> None:
             networks[0] != networks[1],
             days[0] != days[1] or types[0] != types[1],
             before.precision != after.precision,
+            before.lr != after.lr,
         ]
         assert sum(changed) == 1
 
