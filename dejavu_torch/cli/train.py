@@ -169,12 +169,16 @@ class TrainCLI(LightningCLI):
         classes that it names."""
 
     def before_instantiate_classes(self) -> None:
-        """Validation is by steps, unless it is asked for by epochs or otherwise; one device of several."""
-        trainer = self.config[self.subcommand]["trainer"]
+        """Validation is by steps, unless it is asked for by epochs or otherwise; where a map is made for each,
+        at the end. One device of several."""
+        chosen = self.config[self.subcommand]
+        trainer, mapper = chosen["trainer"], chosen["model"]["mapper"]
+        made = isinstance(mapper, Namespace) and not mapper["class_path"].endswith("TemplateMapper")
         trainer["devices"] = 1 if trainer["devices"] == "auto" else trainer["devices"]
         if trainer["check_val_every_n_epoch"] is None and trainer["val_check_interval"] is None:
             steps = trainer["max_steps"]
-            trainer["val_check_interval"] = min(EVERY, steps) if steps > 0 else EVERY
+            every = steps if made else min(EVERY, steps)
+            trainer["val_check_interval"] = every if steps > 0 else EVERY
 
     def instantiate_classes(self) -> None:
         """What a part's constructor refuses, in one line."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.types import InputError, Traverse
 
 BLOCK = 64  # frames augmented at once
@@ -16,7 +16,6 @@ STRETCH, EVERY = 20, 10  # frames of a stretch, and which of the stretches are t
 STRONGER = 1.5  # than what a whitening knows, since it has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all stretches together
 TIMES = 2  # of a short route, as many as it has itself at most
-LARGEST = {"scale": 0.9, "rotation": 180.0, "gamma": 10.0, "blur": 20.0}  # strengths that make sense; else 1
 
 
 class Views(NamedTuple):
@@ -52,18 +51,14 @@ class AugmentedTraverse(Traverse):
         strengths: Mapping[str, Any],
         seed: int = 0,
     ) -> None:
-        from dejavu_torch.features.augmentation import Augmentation  # kornia takes a second to import
+        from dejavu_torch.features.kornia_augmentation import KorniaAugmentation  # takes a second to import
 
         if len(traverse.frame_shape) != 3:
             raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
         self.traverse, self.copies, self.seed = traverse, copies, seed
         self.shown = range(0, frames, max(1, -(-frames * copies // most)))
         self.block = traverse.batch_size(BLOCK)  # of frames, whatever the batch size: the same copies
-        try:
-            self.augmentation = Augmentation(**strengths).train()
-        except TypeError as error:
-            known = ", ".join(inspect.signature(Augmentation).parameters)
-            raise InputError(f"the strengths of whitening are {strengths}; expected {known}") from error
+        self.augmentation = KorniaAugmentation(**_checked(strengths)).train()
         self.name = f"augmented copies of {traverse.name}"
         self.length = copies * len(self.shown)
 
@@ -104,7 +99,7 @@ class Stretches(Traverse):
     """
 
     def __init__(self, traverse: Traverse, frames: int, strengths: Mapping[str, Any], seed: int = 0) -> None:
-        from dejavu_torch.features.augmentation import Augmentation
+        from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
 
         if len(traverse.frame_shape) != 3:
             raise InputError(f"{traverse.name} holds ready features; expected frames to calibrate by")
@@ -114,7 +109,7 @@ class Stretches(Traverse):
         wanted = min(FEWEST, TIMES * frames)
         self.times = max(1, -(-wanted // (len(self.starts) * length)))
         self.traverse, self.stretch, self.seed = traverse, length, seed
-        self.augmentation = Augmentation(**{name: _stronger(name, one) for name, one in strengths.items()})
+        self.augmentation = KorniaAugmentation(**_checked(strengths, STRONGER))
         self.name, self.length = f"changed frames of {traverse.name}", len(self.places)
 
     @property
@@ -161,8 +156,15 @@ class Stretches(Traverse):
         return Views(self, self.places)
 
 
-def _stronger(name: str, strength: Any) -> Any:
-    most = LARGEST.get(name, 1.0)
-    if isinstance(strength, (list, tuple)):
-        return type(strength)(min(STRONGER * one, most) for one in strength)
-    return min(STRONGER * strength, most)
+def _checked(strengths: Mapping[str, Any], factor: float = 1.0) -> dict[str, Any]:
+    """Strengths, which may come from a file, times a factor, as far as `Augmentation` takes them."""
+    try:
+        known = Augmentation(**strengths).strengths
+    except TypeError as error:
+        expected = ", ".join(LARGEST)
+        raise InputError(f"the strengths of whitening are {strengths}; expected {expected}") from error
+    scaled = {
+        name: tuple(min(factor * one, most) for one, most in zip(known[name], LARGEST[name], strict=True))
+        for name in strengths
+    }
+    return {name: pair if len(pair) > 1 else pair[0] for name, pair in scaled.items()}

@@ -195,6 +195,9 @@ def test_changed_frames_show_their_places_whatever_the_batch() -> None:
     torch.testing.assert_close(torch.cat(list(Stretches(unread, 300, plain).batches(9))), frames[same.places])
     with refused("ready features"):
         Stretches(open_source_of(torch.rand(30, 4)), 30, plain)
+    for strengths in ({"noise": {}}, {"noise": float("nan")}, {"nose": 0.1}):  # of a file
+        with refused("nois" if "noise" in strengths else "nose"):
+            Stretches(open_source("sim:aerial?frames=30"), 30, strengths)
 
 
 def open_source_of(features: Tensor):  # type: ignore[no-untyped-def]
