@@ -169,8 +169,8 @@ class TrainCLI(LightningCLI):
         classes that it names."""
 
     def before_instantiate_classes(self) -> None:
-        """Validation is by steps, unless it is asked for by epochs or otherwise, and at the end where a map is
-        made for it; one device of several."""
+        """Validation is by steps unless it is asked for otherwise, and at the end where a map is made for it;
+        one device of several."""
         chosen = self.config[self.subcommand]
         trainer, mapper = chosen["trainer"], chosen["model"]["mapper"]
         made = isinstance(mapper, Namespace) and not mapper["class_path"].endswith("TemplateMapper")
