@@ -21,7 +21,7 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "evaluate": "evaluate the matches in a csv, whatever found them",
     "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
     "train": "train features that repeat: fit, validate, test or export",
-    "bench": "speed, memory, or accuracy over bytes, beside what a user would pick instead",
+    "bench": "speed, trainings, memory, or accuracy over bytes, beside what a user would pick instead",
     "export": "write a map, and what is ahead of it, as an ONNX file",
     "info": "what is in a map",
 }

@@ -392,7 +392,7 @@ def run_evaluate(
     """Evaluate the matches in a csv, whatever found them: scores, curve, coverage.
 
     Args:
-        matches: csv of query,place,score[,accepted][,rank]
+        matches: csv of query,place,score[,accepted][,probability][,rank]
         truth: as of `dejavu compare`
         out: folder for report and pictures
         tolerance: right within this many places, inclusive
@@ -489,6 +489,8 @@ def run_bench(
 
     for file in (out, out / "bench.json", out / "bench.png"):
         check_not_read(file, *sources, codebooks)
+    if what != "train" and (steps is not None or seeds):
+        raise InputError(f"bench {what} takes no steps or seeds; bench train does")
     if what == "storage":
         given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
         found = frontier.run_storage(out, sources, places, codebooks, given, shared, progress=True)
@@ -498,8 +500,6 @@ def run_bench(
             _say(line)
         _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
-    if what != "train" and (steps is not None or seeds):
-        raise InputError(f"bench {what} takes no steps or seeds; bench train does")
     if what == "train":
         from dejavu_torch.experiments import train_speed
 
@@ -509,7 +509,8 @@ def run_bench(
             )
         trained = train_speed.run_train(out, sources, steps, seeds)
         print(text_table(train_speed.train_table(trained)))
-        seen = f"{trained[0].case}, {len({row.seed for row in trained})} seeds, {trained[0].threads} threads"
+        seeded = ", ".join(dict.fromkeys(str(row.seed) for row in trained))
+        seen = f"{trained[0].case}, seeds {seeded}, threads: {trained[0].threads}"
         _say(f"{seen}; each row changes one thing of the row above; next: open {out / 'bench.png'}")
         return
     known = what in bench.BENCHES or what in ("memory", "live")

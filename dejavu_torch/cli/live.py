@@ -82,9 +82,9 @@ def shots_from(source: str, model: DejaVu, realtime: bool) -> tuple[Iterable[Sho
     shape = model.frame_shape
     size = (shape[1], shape[2]) if shape is not None and len(shape) == 3 else None
     if is_stream(source):
-        if realtime:
-            raise InputError(f"--realtime: {source} has its own time; expected a video file with it")
         camera = Camera(source, size)
+        if realtime:
+            raise InputError(f"--realtime: {camera.name} has its own time; expected a video file with it")
         return _noted(camera), True, camera.name
     own, traverse = open_source(source).frame_shape, open_source(source, size)
     if traverse.frame_shape != own and size is not None:

@@ -202,9 +202,12 @@ class TrainCLI(LightningCLI):
         for plugin in _listed(asked["plugins"]):
             if isinstance(plugin, CheckpointIO) and getattr(plugin, "checkpoint_io", plugin) is None:
                 plugin.checkpoint_io = CheckpointFiles()  # type: ignore[attr-defined]  # what it wraps
-        on_cpu = asked["accelerator"] == "cpu" or not torch.cuda.is_available()
+        accelerators = torch.cuda.is_available() or torch.backends.mps.is_available()
+        on_cpu = asked["accelerator"] == "cpu" or (asked["accelerator"] == "auto" and not accelerators)
         if asked["precision"] in BF16 and on_cpu and not has_bf16():
-            log.warning("this processor has no numbers of 16 bits, which would be slower: training in 32")
+            log.warning(
+                "this processor is not known to have numbers of 16 bits: 32 are taken, which are faster"
+            )
             kwargs["precision"] = "32-true"
         try:
             return super().instantiate_trainer(callbacks=own, **kwargs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -55,10 +56,8 @@ def without_password(source: str) -> str:
         'rtsp://192.168.0.7/stream'
     """
     kind, mark, rest = source.partition("://")
-    if not mark:
-        return printable(source)
-    host, slash, path = rest.partition("/")
-    return printable(f"{kind}://{host.rpartition('@')[2]}{slash}{path.partition('?')[0]}")
+    shown = re.split("[?#]", rest)[0].rpartition("@")[2]  # a password may hold anything but an @
+    return printable(f"{kind}://{shown}" if mark else source)
 
 
 class Camera:

@@ -54,8 +54,8 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     reader = _reader(text, address)
     arguments = _arguments(text, query, reader)
     part = {name: arguments.pop(name) for name in PART if name in arguments}
-    sides = {"height", "width"}
-    if size is not None and sides <= inspect.signature(reader).parameters.keys() - arguments.keys():
+    resizes = getattr(reader, "func", None) in (ImageFolder, Video)
+    if size is not None and resizes and not {"height", "width"} & arguments.keys():
         arguments["height"], arguments["width"] = size
     return FrameRange(reader(**arguments), **part) if part else reader(**arguments)
 

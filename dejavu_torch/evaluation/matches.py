@@ -124,11 +124,11 @@ def read_matches(path: Path) -> Matches:
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:
             raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
-        probability = as_number(cells.get("probability", "0"))
+        nothing = place < 0 or math.isinf(score)
+        probability = 0.0 if nothing else as_number(cells.get("probability", "0"))
         if probability is None or not 0 <= probability <= 1:
             seen_ = f"probability is {cells['probability']!r}"
             raise InputError(f"{where}: {seen_}; expected a number from 0 to 1")
-        nothing = place < 0 or math.isinf(score)
         if rank > 1:
             ranked[-1].append(-1 if nothing else place)
             continue

@@ -103,7 +103,7 @@ def bench_train(
     rungs: Sequence[Rung] | None = None,
     progress: bool = False,
 ) -> list[TrainRow]:
-    """Train a descriptor of the reference in several ways, and find the query on spectral maps of it.
+    """Train a descriptor of the reference in several ways on the CPU, and find the query on spectral maps of it.
 
     Args:
         reference, query: traverses of one route.
@@ -113,8 +113,9 @@ def bench_train(
     Raises:
         InputError: no steps or seeds, or nothing that tells the right places.
     """
-    if steps < 1 or not seeds:
-        raise InputError(f"bench train got {steps} steps and seeds {list(seeds)}; expected at least one each")
+    if steps < 1 or not seeds or not all(0 <= seed < 2**32 for seed in seeds):
+        seen = f"bench train got {steps} steps and seeds {list(seeds)}"
+        raise InputError(f"{seen}; expected at least one each, and seeds from 0 to 2^32 - 1")
     truth = ground_truth_of(None, reference, query)
     if truth is None:
         raise InputError(

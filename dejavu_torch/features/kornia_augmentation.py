@@ -1,4 +1,4 @@
-"""The changes of `Augmentation` by kornia, which are several times as slow."""
+"""The changes of `Augmentation` by kornia, which take about twice as long."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class AugmentedTraverse(Traverse):
         strengths: Mapping[str, Any],
         seed: int = 0,
     ) -> None:
-        from dejavu_torch.features.kornia_augmentation import KorniaAugmentation  # takes a second to import
+        from dejavu_torch.features.kornia_augmentation import KorniaAugmentation  # kornia takes a second
 
         if len(traverse.frame_shape) != 3:
             raise InputError(f"{traverse.name} holds ready features; expected frames to augment")

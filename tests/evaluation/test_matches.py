@@ -126,6 +126,11 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path, text: str | bytes, words
         read_matches(written(tmp_path, text))
 
 
+def test_what_reports_nothing_needs_no_probability(tmp_path: Path) -> None:
+    text = "query,place,score,probability\n0,-1,inf,\n1,4,0.5,0.75\n"
+    assert read_matches(written(tmp_path, text)).match.probability.tolist() == [0, 0.75]
+
+
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with refused("none.csv", "is not there", "query,place,score"):
         read_matches(tmp_path / "none.csv")

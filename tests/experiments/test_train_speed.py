@@ -80,5 +80,7 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
         bench_train(route, again, steps=0)
     with refused("seeds []"):
         bench_train(route, again, seeds=())
+    with refused("seeds [-1]", "from 0"):
+        bench_train(route, again, seeds=(-1,))
     with refused("1 sources", "REFERENCE QUERY"):
         train_speed.run_train(tmp_path, [ROUTE])
