@@ -103,7 +103,7 @@ def bench_train(
     rungs: Sequence[Rung] | None = None,
     progress: bool = False,
 ) -> list[TrainRow]:
-    """Train a descriptor of the reference in several ways on the CPU, and find the query on spectral maps of it.
+    """Train a descriptor of the reference in several ways, on the CPU, and find the query on maps of it.
 
     Args:
         reference, query: traverses of one route.
