@@ -45,7 +45,8 @@ ARROWS = {
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
-    "experiments": "types text data features periods database recognition motion model live evaluation",
+    "experiments": "types text data features periods database recognition motion model live evaluation "
+    "training",
     "cli": "types text data features periods database recognition motion model live evaluation training "
     "experiments",
 }

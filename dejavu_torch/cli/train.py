@@ -103,7 +103,7 @@ class MapTrainer(Trainer):
             model.relearn()
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
-        export.write(model, folder)
+        export.write(model, folder, datamodule.reference if model.made else None)
         print_written(export, datamodule)
 
 

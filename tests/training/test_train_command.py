@@ -246,6 +246,7 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
         train("export", "--ckpt_path", last, *options)
         assert ("this route needs about" in capfd.readouterr().out) == (size == 1.2)
     maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("plain", "12", "6")]
+    assert all(model.calibration is not None for model in maps)
     levels = [model.map.levels for model in maps]
     assert torch.equal(levels[0], levels[1])
     assert (levels[2] != 0).sum() < (levels[1] != 0).sum()
