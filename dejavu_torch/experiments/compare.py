@@ -137,15 +137,7 @@ def compare(
             "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
         )
     with timed(seconds, work):
-        if has_map and reference.length is not None:
-            _check_places(model.map, reference.name, reference.length)
-        text = "describing the reference" if progress else None
-        if has_map:
-            places = model.extract_all(reference, text)
-            _check_map(model, places, reference.name, tolerance)
-        else:
-            places = model.describe_reference(reference, second, text)
-            model.learn_features(places, reference)
+        places = _described(model, reference, second, tolerance, progress)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
             model.calibrate_if_possible(reference, calibration)
         model.check_precision(sequence)
@@ -194,6 +186,22 @@ def compare(
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
     return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run, candidates)
+
+
+def _described(
+    model: DejaVu, reference: Traverse, second: Views | None, tolerance: int, progress: bool
+) -> Tensor:
+    """Descriptors of the reference (N,K), whose map is checked where there is one, and learned otherwise."""
+    text = "describing the reference" if progress else None
+    if not model.map.places:
+        places = model.describe_reference(reference, second, text)
+        model.learn_features(places, reference)
+        return places
+    if reference.length is not None:
+        _check_places(model.map, reference.name, reference.length)
+    places = model.extract_all(reference, text)
+    _check_map(model, places, reference.name, tolerance)
+    return places
 
 
 def _probability(model: DejaVu, traverse: Traverse, sequence: SequenceModel | None) -> Tensor:
