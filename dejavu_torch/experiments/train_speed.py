@@ -201,7 +201,9 @@ def run_train(
     }
     with whole_folder(out) as folder:
         (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-        figure, _ = plot_ratios({rows[0].case: _means(rows)}, "seconds of a training, mean of the seeds")
+        figure, _ = plot_ratios(
+            {f"{rows[0].steps} steps": _means(rows)}, "seconds of a training, mean of the seeds"
+        )
         figure.savefig(folder / "bench.png")
     return rows
 
