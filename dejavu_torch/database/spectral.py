@@ -511,43 +511,6 @@ class SpectralMapper(Mapper):
         )
 
 
-class SpectralCode(nn.Module):
-    """Lines of a spectrum that are trained together with the step they are coded in.
-
-    Args:
-        lines: (W,K) float, see `spectrum`. step: of the quantisation. transform: of the lines.
-
-    Shape: () -> the series as a map of these lines holds it, (W,K), as `lines` are.
-
-    Convention: rounding passes the gradient of the lines straight through, and the step's is that of its
-        rounding error (learned step size quantisation: Esser et al., ICLR 2020).
-
-    Example:
-        >>> code = SpectralCode(spectrum(torch.randn(3, 64)).T, step=0.5)
-        >>> code().square().sum().backward()
-        >>> code.lines.grad.shape, code.step.grad.ndim
-        (torch.Size([64, 3]), 0)
-    """
-
-    def __init__(self, lines: Tensor, step: float, transform: Transform = "dft") -> None:
-        super().__init__()
-        if lines.ndim != 2 or not lines.is_floating_point() or not 0 < step < math.inf:
-            raise InputError(
-                f"SpectralCode got lines {tuple(lines.shape)} {lines.dtype} and step {step}; expected floats "
-                "(W,K) and a step above 0"
-            )
-        self.transform = transform
-        self.lines = nn.Parameter(lines.detach().clone())
-        self.step = nn.Parameter(lines.new_tensor(step))
-
-    def forward(self, noise: Tensor | None = None) -> Tensor:
-        """The series; `noise` (W,K), in steps, takes the place of the rounding error."""
-        wanted = self.lines / self.step
-        if noise is None:
-            noise = (quantise(self.lines, self.step) - wanted).detach()
-        return from_spectrum(((wanted + noise) * self.step).T, self.transform).T
-
-
 def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:
     """Refuse settings that no spectral map has."""
     if metric not in get_args(SpectralMetric):

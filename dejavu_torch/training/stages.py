@@ -10,11 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.database.distance import phase_distances
+from dejavu_torch.database.spectrum import Transform
 from dejavu_torch.features.embedding import Coder, Embedding, to_length
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.text import one_line
 from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames
 from dejavu_torch.training.losses import Losses, place_cross_entropy
+from dejavu_torch.training.rate import STEP, bands_of, coded_proxies
 from dejavu_torch.types import InputError
 
 if TYPE_CHECKING:
@@ -88,7 +90,7 @@ class DescriptorStage(Stage):
             self.every.fill_(every)
             with torch.no_grad(), in_mode(task.dejavu.features, False):
                 one = described(task, reference.values[:1], descriptor_of(task))
-            self.proxies = nn.Parameter(torch.randn(count, one.shape[1], device=task.device))
+            self.make(count, one.shape[1], task)
             if task.made:
                 _check_map(task, len(reference), one.shape[1])
         elif len(self.proxies) != count:
@@ -97,6 +99,10 @@ class DescriptorStage(Stage):
                 f"{task.data.reference.name} has {count}; expected the route that it was learned on"
             )
 
+    def make(self, stretches: int, dimension: int, task: PlaceRecognitionTask) -> None:
+        """Proxies to start from."""
+        self.proxies = nn.Parameter(torch.randn(stretches, dimension, device=task.device))
+
     def end(self, task: PlaceRecognitionTask) -> None:
         self.proxies = nn.Parameter(self.proxies.detach()[:0])  # no later checkpoint needs them
 
@@ -104,10 +110,14 @@ class DescriptorStage(Stage):
         return [*_trainable(network_of(task.dejavu.features)), *self.parameters()]
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+        return self.losses_to(self.proxies, task, batch)
+
+    def losses_to(self, proxies: Tensor, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+        """The losses of a batch, to proxies (W,K)."""
         frames, places = task.data.augmented(batch.frames, task.data.clip), len(task.data.sets["reference"])
         descriptors = to_length(descriptor_of(task)(frames).float())
         noisy = descriptors + NOISE * torch.randn_like(descriptors)
-        distances = phase_distances(noisy, self.proxies, "cosine")
+        distances = phase_distances(noisy, proxies, "cosine")
         stretch = torch.arange(places, device=distances.device) // self.every
         scores, temperature = distances.index_select(1, stretch), self.log_temperature.exp()
         found = place_cross_entropy(scores, batch.truth.positives, task.data.tolerance, temperature)
@@ -117,6 +127,41 @@ class DescriptorStage(Stage):
         given = state.get(f"{prefix}proxies")
         if given is not None:  # however many there are
             self.proxies = nn.Parameter(torch.empty_like(given, device=self.proxies.device))
+        super()._load_from_state_dict(state, prefix, *args)
+
+
+class RateStage(DescriptorStage):
+    """A descriptor that tells stretches apart and is made of few frequencies, since their bits count.
+
+    `proxies` are the lines of their spectra, see `coded_proxies`.
+
+    Args:
+        rate: what a bit per place counts beside the cross-entropy in nats; it rises to that over the steps,
+            so that places are learned first.
+    """
+
+    def __init__(self, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+        self.log_step = nn.Parameter(torch.tensor(math.log(STEP)))
+        self.log_widths = nn.Parameter(torch.zeros(0))  # of one dimension, which weight decay leaves alone
+
+    def make(self, stretches: int, dimension: int, task: PlaceRecognitionTask) -> None:
+        bands = int(bands_of(stretches, _transform(task)).max()) + 1
+        self.proxies = nn.Parameter(torch.randn(stretches, dimension, device=task.device))
+        self.log_widths = nn.Parameter(torch.zeros(bands * dimension, device=task.device))
+
+    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+        coded = coded_proxies(self.proxies, self.log_step, self.log_widths, _transform(task))
+        place = self.losses_to(coded.proxies, task, batch)
+        per_place = coded.bits / len(task.data.sets["reference"])
+        total = place.total + self.rate * task.progress * per_place
+        return Losses(total, place.parts | {"bits": per_place}, place.left_out)
+
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
+        given = state.get(f"{prefix}log_widths")
+        if given is not None:
+            self.log_widths = nn.Parameter(torch.empty_like(given, device=self.log_widths.device))
         super()._load_from_state_dict(state, prefix, *args)
 
 
@@ -166,7 +211,7 @@ class CodeStage(Stage):
         return task.losses(distances, task.scores(distances), positives, task.route, temperature, tolerance)
 
 
-def stages_of(backbone: nn.Module, descriptor: float, made: bool = False) -> list[Stage]:
+def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: float = 0.0) -> list[Stage]:
     """The stages that a backbone needs.
 
     Where the map is made of the descriptor, that is all that is learned. For a map that is trained an
@@ -177,9 +222,10 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool = False) -> lis
     Args:
         descriptor: share of the steps in which a descriptor is learned.
         made: whether the map is made of the descriptor in closed form, and not trained.
+        rate: of the descriptor, for a map that is made of it.
     """
     if made:
-        return [DescriptorStage()]
+        return [RateStage(rate)] if rate else [DescriptorStage()]
     if not isinstance(backbone, Embedding) or backbone.coder is None or backbone.coder.whitened:
         return [CodeStage()]
     if not _trainable(backbone.network):
@@ -211,6 +257,11 @@ def descriptor_of(task: PlaceRecognitionTask) -> Callable[[Tensor], Tensor]:
 
 def _coder(embedding: Embedding) -> Coder:
     return cast(Coder, embedding.coder)
+
+
+def _transform(task: PlaceRecognitionTask) -> Transform:
+    transform: Transform = getattr(task.dejavu.mapper, "transform", "dft")
+    return transform
 
 
 def _trainable(module: nn.Module) -> list[nn.Parameter]:

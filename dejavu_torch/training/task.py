@@ -71,7 +71,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             it is None. None is `TemplateMapper(ImposedPeriods(), temperature=0.03)`.
         whitening: of the descriptor, ahead of a map that is made of it; it learns from views under the
             training's augmentation and of the second traverse, its `strengths` count for nothing. None and
-            "none" are as in `DejaVu`.
+            "none" are as in `DejaVu`, but None is "none" with a `rate`: whitening would mix the features.
         preprocess: as in `DejaVu`.
         feature_weights: learn what a difference in each feature counts, at least 0.
         descriptor: share of the steps in which the network of an `Embedding` with a hidden layer learns its
@@ -85,6 +85,9 @@ class PlaceRecognitionTask(pl.LightningModule):
             0 never.
         losses: which losses count, and how much. Like feature_weights, descriptor and refresh it is of
             templates alone.
+        rate: what a bit per place of the map counts beside the cross-entropy of the place, in nats; of maps
+            that are made of the descriptor alone. With it the descriptor learns to be made of few
+            frequencies, see `coded_proxies`.
         lr: highest learning rate of AdamW; it rises over the first tenth of a stage's steps and falls to 0.
         weight_decay: of weights that are multiplied with something, not of biases, templates and the like.
         batch_size: frames in memory at a time where features are made without gradients.
@@ -110,6 +113,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         batch_norm: Literal["train", "frozen"] = "train",
         refresh: int = 0,
         losses: Objective | None = None,
+        rate: float = 0.0,
         lr: float = 3e-3,
         weight_decay: float = 0.05,
         batch_size: int = 64,
@@ -120,6 +124,8 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"lr is {lr}, weight_decay {weight_decay}, refresh {refresh}; expected an lr above 0, the "
                 "others 0 or more"
             )
+        if not 0 <= rate < math.inf:
+            raise InputError(f"rate is {rate}; expected 0 or more, such as 1")
         if not 0 <= descriptor < 1:
             raise InputError(f"descriptor is {descriptor}; expected a share of the steps, from 0 to below 1")
         backbone = SmallCNN() if backbone is None else backbone
@@ -130,7 +136,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         changed = {"feature_weights": feature_weights, "descriptor": descriptor != DESCRIPTOR}
         changed |= {"refresh": refresh > 0, "losses": losses is not None}
         lost = [name for name, is_changed in changed.items() if is_changed] if self.made else []
-        lost += ["whitening"] if isinstance(whitening, Whitening) and not self.made else []
+        of_made = {"whitening": isinstance(whitening, Whitening), "rate": rate > 0}
+        lost += [] if self.made else [name for name, is_given in of_made.items() if is_given]
         if lost:
             raise InputError(
                 f"{lost[0]} is given, which does nothing for the map of a {type(mapper).__name__}; expected "
@@ -143,6 +150,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             )
         if self.made and isinstance(backbone, Embedding) and has_descriptor(backbone):
             backbone = backbone.without_code()
+        whitening = "none" if whitening is None and rate else whitening
         self.dejavu = DejaVu(backbone, whitening, mapper, batch_size=batch_size, preprocess=preprocess)
         if start is not None:
             start_from(backbone, start)
@@ -152,7 +160,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.feature_weights, self.refresh = feature_weights, refresh
         self.losses = Objective() if losses is None else losses
         self.lr, self.weight_decay = lr, weight_decay
-        self.stages = nn.ModuleList(stages_of(backbone, descriptor, self.made))
+        self.stages = nn.ModuleList(stages_of(backbone, descriptor, self.made, rate))
         self.index = 0  # of the stage
         self.began = 0  # the step at which it began
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
@@ -188,6 +196,11 @@ class PlaceRecognitionTask(pl.LightningModule):
     def in_last_stage(self) -> bool:
         """Whether this is the stage that trains the map, or what it is made of."""
         return self.index == len(self.stages) - 1
+
+    @property
+    def progress(self) -> float:
+        """How many of the stage's steps are done, from 0 to 1."""
+        return (self.global_step - self.began) / max(1, self._stop() - self.began)
 
     @property
     def frame_size(self) -> tuple[int, int] | None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.spectral import SpectralCode, SpectralMap, SpectralMapper, dead_zone, quantise
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, dead_zone, quantise
 from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer
 
@@ -337,31 +337,6 @@ def test_noise_tells_what_half_of_its_variance_needs() -> None:
     assert 0.45 < share < 0.55
     assert SpectralMapper(0.8)(route(800, 60)).needed is None
     assert SpectralMapper(None, step=100.0)(noise).needed == pytest.approx(needed, rel=0.01)
-
-
-def test_code_trains_lines_and_step() -> None:
-    generator = torch.Generator().manual_seed(0)
-    lines = torch.randn(12, 3, dtype=torch.float64, generator=generator)
-    code = SpectralCode(lines, 0.4)
-    learned = SpectralMapper(None, step=0.4)
-    assert torch.allclose(code(), from_spectrum(quantise(lines, 0.4).T * 0.4).T)
-    noise = torch.rand(12, 3, dtype=torch.float64, generator=generator) - 0.5
-
-    def series(own: Tensor, step: Tensor) -> Tensor:
-        code = SpectralCode(lines, 0.4)
-        code.lines, code.step = torch.nn.Parameter(own), torch.nn.Parameter(step)
-        return torch.func.functional_call(code, {"lines": own, "step": step}, (noise,))
-
-    step = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(series, (lines.clone().requires_grad_(), step))
-    weights = torch.randn(12, 3, dtype=torch.float64, generator=generator)
-    (from_spectrum(weights.T).T * code()).sum().backward()
-    assert code.lines.grad is not None
-    assert code.step.grad is not None
-    assert torch.allclose(code.lines.grad, weights)  # straight through
-    error = quantise(lines, 0.4) - lines / 0.4
-    assert torch.allclose(code.step.grad, (weights * error).sum())  # of the rounding
-    assert learned(code().detach().float()).places == 12
 
 
 @pytest.mark.parametrize("transform", ["dft", "dct"])

@@ -1,0 +1,266 @@
+"""A rate in the loss: what levels cost, proxies made of few lines, and trainings that pay for their bits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from small_training import FRAMES, Stop, data_of, fit, footage, mapper, new_task, recall, trainer
+from test_stages import coded
+from torch import Tensor
+
+from dejavu_torch import DejaVu, SpectralMapper, Whitening
+from dejavu_torch.database.spectral import quantise
+from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
+from dejavu_torch.training.losses import laplace_bits
+from dejavu_torch.training.rate import bands_of, coded_proxies
+from dejavu_torch.training.stages import DescriptorStage, RateStage
+from dejavu_torch.training.task import PlaceRecognitionTask
+
+
+def rated(rate: float = 1.0, **settings: Any) -> PlaceRecognitionTask:
+    return new_task(**{"backbone": coded(), "mapper": SpectralMapper(20.0), "rate": rate} | settings)
+
+
+# ------------------------------------------------------------------------ bits
+
+
+def mass(level: float, width: float) -> float:
+    """Of a Laplace distribution within half a step, from its distribution function."""
+
+    def below(x: float) -> float:
+        return 0.5 * math.exp(x / width) if x < 0 else 1 - 0.5 * math.exp(-x / width)
+
+    return below(level + 0.5) - below(level - 0.5)
+
+
+@given(st.floats(-6, 6), st.floats(0.3, 20))
+def test_the_bits_are_those_of_the_mass_within_half_a_step(level: float, width: float) -> None:
+    bits = laplace_bits(torch.tensor(level, dtype=torch.float64), torch.tensor(width, dtype=torch.float64))
+    assert float(bits) == pytest.approx(-math.log2(mass(level, width)), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("width", [0.05, 0.7, 30.0])
+def test_the_masses_of_all_levels_make_one(width: float) -> None:
+    bits = laplace_bits(torch.arange(-2000.0, 2001.0, dtype=torch.float64), torch.tensor(width).double())
+    assert float((-bits).exp2().sum()) == pytest.approx(1)
+
+
+def test_bits_and_their_gradients_are_finite_however_far_a_level_lies_out() -> None:
+    levels = torch.tensor([0.0, 0.5, 1e4, -1e4, 0.49999], requires_grad=True)
+    widths = torch.tensor([1e-3, 1e-3, 1e-2, 1e4, 1e-4], requires_grad=True)
+    bits = laplace_bits(levels, widths)
+    bits.sum().backward()
+    assert levels.grad is not None
+    assert widths.grad is not None
+    assert all(bool(one.isfinite().all()) for one in (bits, levels.grad, widths.grad))
+    assert bits[2] > 1e5
+
+
+def test_gradients_of_bits() -> None:
+    levels = torch.tensor([-3.1, -0.4, 0.0, 0.2, 0.8, 5.0], dtype=torch.float64, requires_grad=True)
+    widths = torch.tensor([[0.3], [2.0]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(laplace_bits, (levels, widths))
+
+
+# --------------------------------------------------------------------- proxies
+
+
+def widths_of(lines: Tensor, width: float, transform: Transform = "dft") -> Tensor:
+    return torch.full((int(bands_of(len(lines), transform).max() + 1) * lines.shape[1],), math.log(width))
+
+
+def noise(count: int, dimension: int, seed: int = 0) -> Tensor:
+    return torch.randn(count, dimension, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_proxies_are_rebuilt_from_their_quantised_lines(transform: Transform) -> None:
+    lines, step = 3 * noise(21, 3), torch.tensor(0.4)
+    coded = coded_proxies(lines, step.log(), widths_of(lines, 0.7, transform), transform, noise=False)
+    unit = lines / lines.square().mean().sqrt()
+    assert torch.allclose(coded.proxies, from_spectrum(quantise(unit, step).T, transform).T, atol=1e-5)
+    assert torch.allclose(coded.bits, laplace_bits(unit / step, torch.tensor(0.7)).sum())
+
+
+@pytest.mark.parametrize(("transform", "halves"), [("dft", [0, 2, 2, 4, 4, 6]), ("dct", range(6))])
+def test_bands_are_half_an_octave_wide(transform: Transform, halves: Sequence[int]) -> None:
+    wanted = [1 + math.floor(2 * math.log2(cycles)) if cycles else 0 for cycles in halves]
+    assert bands_of(6, transform).tolist() == wanted
+
+
+def test_the_widths_are_of_one_band_and_feature() -> None:
+    lines, band = noise(40, 3), bands_of(40)
+    widths = widths_of(lines, 1.0).unflatten(0, (-1, 3)).clone()
+    widths[4, 1] = math.log(5.0)
+    changed = laplace_bits(lines / lines.square().mean().sqrt(), widths.exp()[band]).sum()
+    coded = coded_proxies(lines, torch.zeros(()), widths.flatten(), noise=False)
+    assert torch.allclose(coded.bits, changed)
+
+
+def test_a_wave_costs_one_line_and_noise_costs_all() -> None:
+    time = torch.arange(64.0)
+    wave = torch.cos(time * (2 * math.pi * 4 / 64))[:, None]
+    cost = []
+    for series in (wave, noise(64, 1)):
+        lines = spectrum(series.T).T
+        coded = coded_proxies(lines, torch.tensor(0.5).log(), widths_of(lines, 0.3), noise=False)
+        cost.append(float(coded.bits))
+        assert torch.nn.functional.cosine_similarity(coded.proxies, series, dim=0) > 0.9
+    assert cost[0] < cost[1] / 3
+
+
+def test_steps_and_widths_learn_to_save_bits() -> None:
+    torch.manual_seed(0)
+    lines = noise(50, 4)
+    step, widths = torch.tensor(0.5).log(), widths_of(lines, 1.0)
+    learned = [tensor.requires_grad_() for tensor in (step, widths)]
+    optimizer, seen = torch.optim.Adam(learned, lr=0.05), []
+    for _ in range(60):
+        _, bits = coded_proxies(lines, *learned)
+        optimizer.zero_grad()
+        bits.backward()
+        optimizer.step()
+        seen.append(float(bits))
+    assert seen[-1] < seen[0] / 3
+    assert step.exp() > 0.5
+
+
+def test_gradients_of_the_code() -> None:
+    """Straight through the rounding to the lines; of bits to all three."""
+    lines = noise(12, 3).double().requires_grad_()
+    step = torch.tensor(-0.5, dtype=torch.float64, requires_grad=True)
+    widths = widths_of(lines, 0.8).double().requires_grad_()
+
+    def bits(*given: Tensor) -> Tensor:
+        return coded_proxies(*given, noise=False).bits
+
+    assert torch.autograd.gradcheck(bits, (lines, step, widths))
+    weights = noise(12, 3, 1).double()
+    coded = coded_proxies(lines, step, widths)
+    own = torch.autograd.grad((coded.proxies * weights).sum(), lines)[0]
+    plain = from_spectrum((lines / lines.square().mean().sqrt() / step.exp()).T).T
+    assert torch.allclose(own, torch.autograd.grad((plain * weights).sum(), lines)[0])
+
+
+@pytest.mark.parametrize(
+    ("shapes", "words"),
+    [
+        (((1, 4), (4,)), ("(1, 4)", "at least 2 stretches")),
+        (((5, 0), (0,)), ("(5, 0)", "at least 2 stretches")),
+        (((5, 4), (3,)), ("the widths are (3,)", "expected (24,)")),
+    ],
+)
+def test_shapes_that_do_not_fit(shapes: tuple[tuple[int, ...], ...], words: tuple[str, ...]) -> None:
+    with refused(*words):
+        coded_proxies(torch.ones(shapes[0]), torch.zeros(()), torch.zeros(shapes[1]))
+
+
+# -------------------------------------------------------------------- training
+
+
+def test_without_a_rate_there_is_no_code() -> None:
+    assert type(rated(0.0).stages[0]) is DescriptorStage
+    assert rated(0.0).dejavu.whitening is not None
+
+
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_a_training_with_a_rate_ends_in_a_map_that_finds_its_places(
+    tmp_path: Path, transform: Transform
+) -> None:
+    task = rated(mapper=SpectralMapper(20.0, transform=transform))
+    model = fit(tmp_path, task, data_of(), max_steps=8)
+    assert model.whitening is None  # it would mix what few frequencies make
+    assert recall(model, footage()) > 0.9
+    figures = task.trainer.callback_metrics
+    assert figures["train/bits"] > 0
+    assert figures["train/loss"] > figures["train/descriptor"]
+
+
+def test_whitening_is_there_where_it_is_asked_for(tmp_path: Path) -> None:
+    task = rated(whitening=Whitening(numbers=4), mapper=SpectralMapper(10.0))
+    model = fit(tmp_path, task, data_of())
+    assert model.whitening is not None
+    assert model.map.dimension == 4
+
+
+def test_bits_count_for_more_and_more(tmp_path: Path) -> None:
+    """Nothing at the first step, so that the descriptor learns places first."""
+    seen = []
+
+    class Losses(Stop):
+        def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+            now = {name: float(value) for name, value in trainer.callback_metrics.items()}
+            seen.append((now["train/loss"] - now["train/descriptor"]) / now["train/bits"])
+
+    fit(tmp_path, rated(2.0), data_of(), max_steps=4)
+    task = rated(2.0)
+    trainer(tmp_path, Losses(99), max_steps=4).fit(task, data_of())
+    assert seen == pytest.approx([0.0, 0.5, 1.0, 1.5], abs=1e-3)
+
+
+def test_bits_are_saved_where_they_count(tmp_path: Path) -> None:
+    bits = []
+    for rate in (1e-6, 10.0):
+        torch.manual_seed(1)
+        task = rated(rate, lr=0.02)
+        model = fit(tmp_path / str(rate), task, data_of(), max_steps=60)
+        bits.append(float(task.trainer.callback_metrics["train/bits"]))
+        assert recall(model, footage()) > 0.9
+    assert bits[1] < 0.7 * bits[0]
+
+
+def test_a_resumed_run_ends_as_one_that_was_not_interrupted(tmp_path: Path) -> None:
+    whole = fit(tmp_path / "whole", rated(), data_of(), max_steps=6)
+    settings = {"enable_checkpointing": True, "max_steps": 6}
+    torch.manual_seed(0)
+    first = trainer(tmp_path / "part", Stop(3), **settings)
+    first.fit(rated(), data_of())
+    path = tmp_path / "part.ckpt"
+    first.save_checkpoint(path)
+    again = rated()
+    trainer(tmp_path / "again", **settings).fit(again, data_of(), ckpt_path=path, weights_only=True)
+    assert again.global_step == 6
+    stage = again.stages[0]
+    assert isinstance(stage, RateStage)
+    assert len(stage.proxies) == FRAMES // 2
+    assert recall(DejaVu.load(tmp_path / "again" / "map.safetensors"), footage()) > 0.9
+    assert whole.map.places == FRAMES
+
+
+@pytest.mark.parametrize("rates", [(1.0, 0.0), (0.0, 1.0)])
+def test_a_checkpoint_with_a_rate_is_none_without(tmp_path: Path, rates: tuple[float, float]) -> None:
+    first = trainer(tmp_path, enable_checkpointing=True)
+    first.fit(rated(rates[0]), data_of())
+    path = tmp_path / "one.ckpt"
+    first.save_checkpoint(path)
+    with refused("the checkpoint is of", "expected one of the stages"):
+        trainer(tmp_path, max_steps=8).fit(rated(rates[1]), data_of(), ckpt_path=path, weights_only=True)
+
+
+def test_a_nan_of_the_entropy_model_is_told(tmp_path: Path) -> None:
+    class Spoil(Stop):
+        def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+            task.stages[0].log_widths.data[0] = math.nan  # type: ignore[union-attr]
+
+    task = rated()
+    with refused("the loss is nan at step 1", "bits nan"):
+        trainer(tmp_path, Spoil(99)).fit(task, data_of())
+
+
+@pytest.mark.parametrize("rate", [-0.1, math.nan, math.inf])
+def test_a_rate_out_of_range(rate: float) -> None:
+    with refused(f"rate is {rate}", "0 or more"):
+        rated(rate)
+
+
+def test_templates_have_no_rate() -> None:
+    with refused("rate is given, which does nothing for the map of a TemplateMapper"):
+        new_task(mapper=mapper(), rate=1.0)
