@@ -10,7 +10,7 @@ from fractions import Fraction
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dejavu_torch.database.codec import Stream, check_claim, coded_bytes, decode, encode, from_int8, to_int8
 from dejavu_torch.database.place_map import Mapper, PlaceMap
