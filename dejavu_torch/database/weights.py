@@ -1,7 +1,7 @@
 """Weights of a network in 8 bits each, with one scale for every output channel.
 
-torch.quantize_per_channel did this, but torch gives its quantised tensors up, deprecated in 2.13. torchao, which
-it points to, is a dependency for networks that compute in whole numbers; here only the file holds them.
+torch.quantize_per_channel did this, but torch gives its quantised tensors up, deprecated in 2.13. torchao is
+a dependency for networks that compute in whole numbers; here only the file holds them.
 """
 
 from __future__ import annotations
