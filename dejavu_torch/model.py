@@ -103,7 +103,8 @@ class DejaVu(nn.Module):
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
         velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
             None takes the frames as they are.
-        weight_bits: of each of the features' weights in the file, to which they are rounded in place.
+        weight_bits: of each weight of the features in the file; 8 rounds them in place, with a scale for each
+            output channel.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
