@@ -26,6 +26,7 @@ from dejavu_torch.database.schema import checked, checked_fields
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.database.weights import BITS, is_rounded, packed, round_weights, unpacked
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import check_queries, feature_batches, features_of
@@ -102,6 +103,8 @@ class DejaVu(nn.Module):
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
         velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
             None takes the frames as they are.
+        weight_bits: of each weight of the features in the file; 8 rounds them in place, with a scale for each
+            output channel.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
@@ -128,6 +131,7 @@ class DejaVu(nn.Module):
         preprocess: Preprocess | None = None,
         velocity: GroundOdometry | None = None,
         precision: float | None = None,
+        weight_bits: Literal[8, 32] = 32,
     ) -> None:
         super().__init__()
         if whitening not in (None, "none") and not isinstance(whitening, Whitening):
@@ -140,6 +144,8 @@ class DejaVu(nn.Module):
             raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
         if threshold is not None and not threshold > -math.inf:
             raise InputError(f"the threshold is {threshold}; expected a number, or None")
+        if weight_bits not in BITS:
+            raise InputError(f"weight_bits is {weight_bits!r}; expected one of {', '.join(map(str, BITS))}")
         check_precision(precision)
         if precision is not None and threshold not in (None, math.inf):
             raise InputError(f"a threshold, {threshold}, and a precision, {precision}; expected one of them")
@@ -149,6 +155,12 @@ class DejaVu(nn.Module):
             for name, buffer in module.named_buffers(recurse=False):
                 if not is_lazy(buffer):
                     setattr(module, name, buffer.contiguous())
+        if weight_bits == 8 and not round_weights(self.features):
+            raise InputError(
+                f"weight_bits is 8, but {type(self.features).__name__} has no float32 weights of 2 or more "
+                "dimensions (of lazy layers: yet); expected 32"
+            )
+        self.weight_bits = weight_bits
         self.mapper = SpectralMapper() if mapper is None else mapper
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
@@ -281,6 +293,7 @@ class DejaVu(nn.Module):
         if other.whitening is None or not other.whitening.learned:
             raise InputError("its map was learned without whitening; expected one that was learned with it")
         self.preprocess, self.features, self.whitening = other.preprocess, other.features, other.whitening
+        self.weight_bits = other.weight_bits
         self.whitening.fixed = True
 
     def _require_learning_whitening(self, name: str) -> None:
@@ -615,9 +628,11 @@ class DejaVu(nn.Module):
         """Write the map, with the feature module's weights, as one safetensors file.
 
         Raises:
-            InputError: nothing learnt yet, or the file cannot be written.
+            InputError: nothing learnt yet, weights that were changed since they were rounded, or the file
+                cannot be written.
         """
         self._require_map()
+        self._check_rounded()
         if callable(getattr(self.mapper, "metric", None)):
             raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
         tensors, header = self._file()
@@ -637,17 +652,20 @@ class DejaVu(nn.Module):
             InputError: missing, truncated, foreign or newer file, or other features than the map's.
         """
         with opened(Path(path)) as (tensors, header):
-            parts = _build_parts(header, features, tensors)
+            parts, weights = _build_parts(header, features, tensors), unpacked(tensors, "features.")
             settings = {name: getattr(header, name) for name in ("threshold", "precision", "batch_size")}
             model = cls(**parts, **settings)
             for name in ("frame_shape", "step", "trained", "calibration"):
                 setattr(model, name, getattr(header, name))
-            own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("map.")}
+            own = {name: weights.pop(name) for name in tensors if name.startswith("map.")}
             model.map.load_state_dict(_map_state(model.map, own, header))
-            loaded = model.load_state_dict(tensors, strict=False)
+            _check_types(weights, model.features)
+            loaded = model.load_state_dict(weights, strict=False)
             missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
             if missing or loaded.unexpected_keys:
                 raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
+            model.weight_bits = 8 if len(weights) + len(own) < len(tensors) else 32
+            model._check_rounded()
             if header.names is not None:
                 model.frame_names = decode_names(header.names, len(model.map.positions) or model.map.places)
             model.check()
@@ -673,6 +691,13 @@ class DejaVu(nn.Module):
         ):
             raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 
+    def _check_rounded(self) -> None:
+        if self.weight_bits == 8 and not is_rounded(self.features):
+            raise InputError(
+                f"weights of {type(self.features).__name__} are not rounded to 8 bits; expected all of them, "
+                "and none changed since: a DejaVu that is made of them with weight_bits=8"
+            )
+
     def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         parts = {name: getattr(self, name) for name in PARTS}
         header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
@@ -685,6 +710,8 @@ class DejaVu(nn.Module):
     def _weights(self, part: str) -> dict[str, Tensor]:
         module = getattr(self, part)
         weights = {} if module is None else module.state_dict()
+        if part == "features" and self.weight_bits == 8:
+            weights = packed(module)
         return {f"{part}.{name}": tensor for name, tensor in weights.items() if isinstance(tensor, Tensor)}
 
     def summary(self) -> MapSummary:
@@ -862,6 +889,16 @@ def _check_weights(header: Header, tensors: dict[str, Tensor], given: nn.Module 
         if isinstance(own, Tensor) and (stored is None or stored.shape != own.shape):
             seen = "missing" if stored is None else tuple(stored.shape)
             raise InputError(f"it does not fit: features.{name} is {seen}; expected {tuple(own.shape)}")
+
+
+def _check_types(tensors: dict[str, Tensor], features: nn.Module) -> None:
+    """Refuse whole numbers for weights that are none, such as those of 8 bits without their scales."""
+    for name, own in features.state_dict().items():
+        stored = tensors.get(f"features.{name}")
+        is_float = isinstance(own, Tensor) and own.dtype.is_floating_point
+        if is_float and stored is not None and not stored.dtype.is_floating_point:
+            kind = str(stored.dtype).removeprefix("torch.")
+            raise InputError(f"it does not fit: features.{name} is of {kind}; expected float numbers")
 
 
 def _build_parts(header: Header, features: nn.Module | None, tensors: dict[str, Tensor]) -> dict[str, Any]:

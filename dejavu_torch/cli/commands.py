@@ -603,6 +603,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.trained is not None:
         steps, seed = model.trained
         print(f"trained for {steps} steps, seed {seed}")
+    if model.weight_bits < 32:
+        print(f"weights of {model.weight_bits} bits, a scale for each output channel")
     print(f"map format {FORMAT}, its checksums agree")
     known = [name for name, platt in (model.calibration or NEVER)._asdict().items() if platt is not None]
     print(f"calibrated for: {', '.join(known) or 'nothing'}; precision: {model.precision}")

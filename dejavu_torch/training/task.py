@@ -17,16 +17,16 @@ from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from dejavu_torch.database.mapfile import read_map
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.template_map import TemplateMap, TemplateMapper, log_posterior
+from dejavu_torch.database.weights import BITS, in_bits, round_weights, unpacked
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
-from dejavu_torch.model import DejaVu
+from dejavu_torch.model import DejaVu, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.checkpoint import CheckpointFiles, check_resumable, read_checkpoint, taking_over
@@ -91,6 +91,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         lr: highest learning rate of AdamW; it rises over the first tenth of a stage's steps and falls to 0.
         weight_decay: of weights that are multiplied with something, not of biases, templates and the like.
         batch_size: frames in memory at a time where features are made without gradients.
+        weight_bits: of each weight of the backbone in the map file, 8 or 32, as of `DejaVu`. Training and
+            checkpoints have 32; a map that is made of a descriptor, validation and test see rounded ones.
 
     Convention: what watches a figure, `EarlyStopping` or a `ModelCheckpoint` with `monitor`, begins with the
         last stage, and so does validation: figures of two stages do not compare.
@@ -117,6 +119,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         lr: float = 3e-3,
         weight_decay: float = 0.05,
         batch_size: int = 64,
+        weight_bits: Literal[8, 32] = 8,
     ) -> None:
         super().__init__()
         if not lr > 0 or not weight_decay >= 0 or refresh < 0:
@@ -128,6 +131,8 @@ class PlaceRecognitionTask(pl.LightningModule):
             raise InputError(f"rate is {rate}; expected 0 or more, such as 1")
         if not 0 <= descriptor < 1:
             raise InputError(f"descriptor is {descriptor}; expected a share of the steps, from 0 to below 1")
+        if weight_bits not in BITS:
+            raise InputError(f"weight_bits is {weight_bits!r}; expected one of {', '.join(map(str, BITS))}")
         backbone = SmallCNN() if backbone is None else backbone
         mapper = TemplateMapper(ImposedPeriods()) if mapper is None else mapper
         if not isinstance(mapper, Mapper):
@@ -159,7 +164,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.log_temperature = nn.Parameter(torch.tensor(math.log(temperature or TEMPERATURE)))
         self.feature_weights, self.refresh = feature_weights, refresh
         self.losses = Objective() if losses is None else losses
-        self.lr, self.weight_decay = lr, weight_decay
+        self.lr, self.weight_decay, self.weight_bits = lr, weight_decay, weight_bits
         self.stages = nn.ModuleList(stages_of(backbone, descriptor, self.made, rate))
         self.index = 0  # of the stage
         self.began = 0  # the step at which it began
@@ -246,7 +251,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         The first features are made in training mode, so that running statistics are gathered.
         """
         if self.made:
-            make_map(self)
+            with in_bits(self.dejavu.features, self.weight_bits):
+                make_map(self)
         else:
             self._start_templates()
         if self.data.resize is not None:
@@ -265,7 +271,8 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scores of all places, the very ones that the exported map gives. (B,C,H,W) or (B,D) -> (B,N)."""
-        features = features_of(frames, self.dejavu.describe, "the batch")
+        with in_bits(self.dejavu.features, self.weight_bits):
+            features = features_of(frames, self.dejavu.describe, "the batch")
         if self.made:
             return self.map.scores(self.dejavu.whitened(features))
         return self.scores(self.route.distances(features))
@@ -284,6 +291,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         if self.made and not self.map.places:
             self.relearn()
         model = copy.deepcopy(self.dejavu).eval()
+        if self.weight_bits == 8 and round_weights(model.features):
+            model.weight_bits = 8
         if not self.made:
             route, mapper = cast(TemplateMap, model.map), cast(TemplateMapper, model.mapper)
             route.freeze()
@@ -546,9 +555,10 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
     Raises:
         InputError: no map file, or one of another backbone.
     """
-    tensors, header = read_map(Path(path))
     prefix = "features."
-    weights = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    with opened(Path(path)) as (tensors, header):
+        stored = unpacked(tensors, prefix)
+    weights = {name.removeprefix(prefix): t for name, t in stored.items() if name.startswith(prefix)}
     own = backbone.state_dict()
     code = CODE if bool(weights.get("linear.whitened", False)) else ()
     bare = any(all(name.startswith(NETWORK) for name in one) for one in (weights, own))
@@ -560,7 +570,7 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
         backbone.load_state_dict(weights)
     except RuntimeError as error:
         raise InputError(
-            f"{path} holds weights of {header['features']}; expected those of the same "
+            f"{path} holds weights of {header.features._asdict()}; expected those of the same "
             f"{type(backbone).__name__}"
         ) from error
 

@@ -68,6 +68,15 @@ def maps(folder: Path) -> None:
             frames,
             queries,
         ),
+        "rounded": (
+            DejaVu(
+                SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4),
+                mapper=SpectralMapper(20.0),
+                weight_bits=8,
+            ),
+            frames,
+            queries,
+        ),
         "resampled": (
             DejaVu(
                 velocity=GroundOdometry(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)), (48, 48), step=6.0)

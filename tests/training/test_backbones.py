@@ -87,7 +87,7 @@ def test_a_prefix_of_nothing_is_refused() -> None:
 
 
 def test_a_map_gives_a_backbone_to_start_from(tmp_path: Path) -> None:
-    first, path = new_task(), tmp_path / "map.safetensors"
+    first, path = new_task(weight_bits=32), tmp_path / "map.safetensors"
     fit(tmp_path, first, data_of())
     start_from(module := backbone(), path)
     trained = first.dejavu.features.state_dict()

@@ -85,7 +85,7 @@ def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path: Path, sett
 
 
 def test_the_file_holds_the_network_alone(tmp_path: Path) -> None:
-    task = spectral()
+    task = spectral(weight_bits=32)
     model = fit(tmp_path, task, data_of())
     assert isinstance(model.features, Embedding)
     network = model.features.network.state_dict()
@@ -192,7 +192,7 @@ def test_without_frames_there_is_no_map_to_deploy(tmp_path: Path) -> None:
 def test_the_map_is_of_the_best_checkpoint(tmp_path: Path) -> None:
     best = ModelCheckpoint(tmp_path, monitor="val/recall_at_1_augmented", mode="min", filename="best")
     running = trainer(tmp_path, best, max_steps=6, **EVERY)
-    running.fit(task := spectral(), data_of())
+    running.fit(task := spectral(weight_bits=32), data_of())
     state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
     model = DejaVu.load(tmp_path / "map.safetensors")
     name = "network.linear.weight"
@@ -204,7 +204,9 @@ def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_pat
     stop, handler = Stop(3, exception=KeyboardInterrupt()), signal.getsignal(signal.SIGINT)
     try:
         with pytest.raises(SystemExit):
-            trainer(tmp_path, stop, LastCheckpoint(every=2), max_steps=9).fit(spectral(), data_of())
+            trainer(tmp_path, stop, LastCheckpoint(every=2), max_steps=9).fit(
+                spectral(weight_bits=32), data_of()
+            )
     finally:
         signal.signal(signal.SIGINT, handler)
     model, task = DejaVu.load(tmp_path / "map.safetensors"), spectral()
@@ -272,7 +274,8 @@ def test_whitening_needs_something_that_changes_or_none_of_it(tmp_path: Path) ->
 
 
 def test_a_map_of_either_kind_gives_its_network_to_start_from(tmp_path: Path) -> None:
-    maps = {"code": new_task(backbone=coded(), descriptor=0.5), "own": spectral()}
+    given: dict[str, Any] = {"weight_bits": 32}
+    maps = {"code": new_task(backbone=coded(), descriptor=0.5, **given), "own": spectral(**given)}
     for name, task in maps.items():
         fit(tmp_path / name, task, data_of(), max_steps=4)
         kept = task.dejavu.features.network.state_dict()  # type: ignore[union-attr,operator]

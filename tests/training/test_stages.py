@@ -153,7 +153,7 @@ def test_frames_of_no_known_place_are_not_learned_from(tmp_path: Path) -> None:
 
 
 def test_another_route_keeps_the_descriptor(tmp_path: Path) -> None:
-    first, _ = watched(tmp_path / "first")
+    first, _ = watched(tmp_path / "first", weight_bits=32)
     again = coded(dimension=7)
     fresh = again.linear.layers[0].weight.clone()  # type: ignore[union-attr,operator,index]
     task = new_task(backbone=again, start=str(tmp_path / "first" / "map.safetensors"))

@@ -68,7 +68,7 @@ def test_the_map_holds_how_it_was_trained_and_counts_the_backbone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("PL_GLOBAL_SEED", raising=False)
-    task = new_task()
+    task = new_task(weight_bits=32)
     model = fit(tmp_path, task, data_of())
     assert model.trained == Training(4, None)
     assert not any(part.training for part in model.modules())

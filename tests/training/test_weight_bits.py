@@ -1,0 +1,90 @@
+"""Trained maps whose backbone lies in 8 bits: the map is of the rounded network, the training is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from pytorch_lightning import Callback
+from small_training import assert_same_scores, backbone, data_of, footage, new_task, trainer
+
+from dejavu_torch import HOG, DejaVu, SpectralMapper
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.mapfile import read_map, write_map
+from dejavu_torch.database.weights import is_rounded
+from dejavu_torch.training.task import PlaceRecognitionTask, start_from
+
+KINDS: list[dict[str, Any]] = [{}, {"mapper": SpectralMapper(20.0)}]
+EVERY = {"val_check_interval": 1, "check_val_every_n_epoch": None}
+
+
+class Watch(Callback):
+    """The backbone's weights behind every step."""
+
+    def __init__(self) -> None:
+        self.weights: list[torch.Tensor] = []
+        self.rounded = False
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        self.weights.append(pl_module.dejavu.features.linear.weight.detach().clone())
+        self.rounded |= is_rounded(pl_module.dejavu.features)
+
+
+def trained(folder: Path, **settings: Any) -> tuple[PlaceRecognitionTask, Watch, DejaVu]:
+    torch.manual_seed(0)
+    task, watch = new_task(**settings), Watch()
+    task.dejavu.features.load_state_dict(backbone().state_dict())
+    running = trainer(folder, watch, max_steps=6, enable_checkpointing=True, **EVERY)
+    running.fit(task, data_of())
+    return task, watch, DejaVu.load(folder / "map.safetensors")
+
+
+@pytest.mark.parametrize("settings", KINDS, ids=["templates", "spectral"])
+def test_the_map_is_of_the_network_in_its_file(tmp_path: Path, settings: dict[str, Any]) -> None:
+    task, watch, model = trained(tmp_path, **settings)
+    assert model.weight_bits == 8
+    assert is_rounded(model.features)
+    assert not watch.rounded
+    assert not is_rounded(task.dejavu.features)
+    assert_same_scores(task, model)
+    frames = footage(0.1)[:, None] / 255
+    with torch.no_grad():
+        assert torch.equal(task.deployed()(frames), model(frames))
+    assert not is_rounded(task.dejavu.features)
+    if settings:
+        made = SpectralMapper(20.0)(model.extract_all(ArrayTraverse(footage())))
+        assert torch.equal(made.levels, model.map.levels)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("settings", KINDS, ids=["templates", "spectral"])
+def test_the_training_is_that_of_32_bits(tmp_path: Path, settings: dict[str, Any]) -> None:
+    _, narrow, small = trained(tmp_path / "8", **settings)
+    _, wide, large = trained(tmp_path / "32", weight_bits=32, **settings)
+    assert torch.equal(torch.stack(narrow.weights), torch.stack(wide.weights))
+    assert torch.equal(large.features.linear.weight, wide.weights[-1])  # type: ignore[union-attr,arg-type]
+    assert small.summary().fixed["backbone"] < 0.4 * large.summary().fixed["backbone"]
+
+
+def test_a_network_without_weights_has_none_to_round(tmp_path: Path) -> None:
+    task = new_task(backbone=HOG(cell=4))
+    trainer(tmp_path).fit(task, data_of())
+    assert DejaVu.load(tmp_path / "map.safetensors").weight_bits == 32
+
+
+def test_bits_that_there_are_none_of_are_refused() -> None:
+    with refused("weight_bits is 4", "8, 32"):
+        new_task(weight_bits=4)
+
+
+def test_a_training_starts_from_8_bits_and_refuses_damaged_ones(tmp_path: Path) -> None:
+    _, _, model = trained(tmp_path)
+    start_from(again := backbone(), path := tmp_path / "map.safetensors")
+    own = model.features.state_dict()
+    assert all(torch.equal(tensor, own[name]) for name, tensor in again.state_dict().items())
+    tensors, header = read_map(path)
+    write_map(path, tensors | {"features.linear.weight.scale": torch.zeros(3)}, header)
+    with refused(str(path), "features.linear.weight", "bfloat16"):
+        start_from(again, path)
