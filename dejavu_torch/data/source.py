@@ -66,7 +66,8 @@ def routes_of(source: str | Path) -> list[str]:
     Args:
         source: as of `open_source`; options behind a folder are those of each route.
 
-    Shape: -> sources, sorted by name as images are.
+    Returns:
+        Sources, sorted by name as images are.
 
     Example:
         >>> routes_of("sim:aerial?frames=40")
