@@ -63,6 +63,8 @@ LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors whitened at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
 
+NO_MAP = "a descriptor without a map; expected a map, as `dejavu learn SOURCE --descriptor FILE` makes of it"
+
 # the classes that a map file may name; any other has to be given by the caller
 CLASSES: tuple[type[nn.Module], ...] = (
     Preprocess,
@@ -295,6 +297,22 @@ class DejaVu(nn.Module):
         self.preprocess, self.features, self.whitening = other.preprocess, other.features, other.whitening
         self.weight_bits = other.weight_bits
         self.whitening.fixed = True
+
+    def take_descriptor(self, other: DejaVu) -> None:
+        """Make features as another model does, such as one trained on many routes; whitening is learned anew.
+
+        Example:
+            >>> base = DejaVu(features=HOG(cell=16))
+            >>> model = DejaVu(mapper=SpectralMapper(2.5))
+            >>> model.take_descriptor(base)
+            >>> model.features.cell
+            16
+        """
+        self.preprocess, self.features = other.preprocess, other.features
+
+    def without_map(self) -> DejaVu:
+        """What makes the descriptors, by itself: it serves any route, at its own steps."""
+        return DejaVu(**(self.settings() | {"velocity": None})).train(self.training)
 
     def _require_learning_whitening(self, name: str) -> None:
         if self.whitening is None or self.whitening.fixed:
@@ -627,11 +645,14 @@ class DejaVu(nn.Module):
     def save(self, path: str | Path) -> None:
         """Write the map, with the feature module's weights, as one safetensors file.
 
+        Convention: a descriptor that was trained without a map is written as well, see `take_descriptor`.
+
         Raises:
             InputError: nothing learnt yet, weights that were changed since they were rounded, or the file
                 cannot be written.
         """
-        self._require_map()
+        if self.trained is None:
+            self._require_map()
         self._check_rounded()
         if callable(getattr(self.mapper, "metric", None)):
             raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
@@ -658,7 +679,11 @@ class DejaVu(nn.Module):
             for name in ("frame_shape", "step", "trained", "calibration"):
                 setattr(model, name, getattr(header, name))
             own = {name: weights.pop(name) for name in tensors if name.startswith("map.")}
-            model.map.load_state_dict(_map_state(model.map, own, header))
+            if own or header.map.get("places") != 0:
+                model.map.load_state_dict(_map_state(model.map, own, header))
+            else:
+                checked(header.map, model.map.state, "its map")
+                model.map.set_extra_state(header.map)
             _check_types(weights, model.features)
             loaded = model.load_state_dict(weights, strict=False)
             missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
@@ -682,7 +707,8 @@ class DejaVu(nn.Module):
         if (len(positions) > 0) != resampled or (step is not None) != resampled:
             raise InputError(f"it has step {step} and {len(positions)} frame positions")
         whitening = self.whitening
-        if whitening is not None and whitening.learned and whitening.dimension != self.map.dimension:
+        other = self.map.places and whitening is not None and whitening.dimension != self.map.dimension
+        if whitening is not None and whitening.learned and other:
             raise InputError(
                 f"its whitening makes {whitening.dimension} numbers; expected the map's {self.map.dimension}"
             )
@@ -704,7 +730,8 @@ class DejaVu(nn.Module):
         header |= {name: getattr(self, name) for name in ("threshold", "precision", "batch_size")}
         header |= self.get_extra_state()
         header["map"] = self.map.get_extra_state()
-        tensors = {f"map.{name}": tensor for name, tensor in self.map.packed().items()}
+        packed = self.map.packed() if self.map.places else {}
+        tensors = {f"map.{name}": tensor for name, tensor in packed.items()}
         return tensors | self._weights("features") | self._weights("whitening"), header
 
     def _weights(self, part: str) -> dict[str, Tensor]:
@@ -752,6 +779,10 @@ class DejaVu(nn.Module):
         self.frame_names = [] if told["names"] is None else decode_names(told["names"])
 
     def _require_map(self) -> None:
+        if not self.map.places and self.trained is not None:
+            raise InputError(
+                "this is a descriptor without a map; expected learn(...) of a route with it first"
+            )
         if not self.map.places:
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
 
@@ -857,6 +888,8 @@ def read_place_map(path: Path) -> PlaceMap:
     with opened(path) as (tensors, header):
         mapper = _build(header, "mapper", None)
         assert isinstance(mapper, Mapper)
+        if header.map.get("places") == 0:
+            raise InputError(NO_MAP)
         route = mapper.empty()
         own = {name: tensor for name, tensor in tensors.items() if name.startswith("map.")}
         route.load_state_dict(_map_state(route, own, header))

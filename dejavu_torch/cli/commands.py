@@ -20,7 +20,7 @@ from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import REGISTRY, DejaVu, check_precision, check_sizes
+from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision, check_sizes
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import NEVER
@@ -87,6 +87,7 @@ def run_learn(
     seed: int = 0,
     second: str | None = None,
     second_truth: str | None = None,
+    descriptor: Path | None = None,
     calibration: str | None = None,
     calibration_truth: str | None = None,
     device: str = "cpu",
@@ -102,6 +103,7 @@ def run_learn(
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
+        descriptor: file whose features are taken, as `dejavu train` makes of several routes, or a map
         calibration: another traverse of the same places, which tells how probably answers are right; changed
             frames of the route itself if not given, none if "none"
         calibration_truth: which places it shows, as --truth
@@ -112,7 +114,7 @@ def run_learn(
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
     check_output_file(map)
-    check_not_read(map, source, second, second_truth, calibration, calibration_truth)
+    check_not_read(map, source, second, second_truth, descriptor, calibration, calibration_truth)
     if calibration == NO_CALIBRATION and model.precision is not None:
         raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
     _set_seed(model, seed)
@@ -175,7 +177,7 @@ def run_localize(
     where = device_of(device)
     check_output_file(out)
     check_not_read(out, map, source)
-    model = DejaVu.load(map, features).to(where)
+    model = _load_map(map, features).to(where)
     if corners is not None:
         if as_is or model.velocity is None or model.step is None:
             why = "--as_is measures no ground" if as_is else f"{map} was learned without --velocity"
@@ -262,7 +264,7 @@ def run_live(
         raise InputError(f"--reference {reference} without --page; expected both")
     if not 0 < timeout <= threading.TIMEOUT_MAX:
         raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
-    model = DejaVu.load(map, features).to(where)
+    model = _load_map(map, features).to(where)
     if as_is:
         model.velocity = None
     _accept_by(model, threshold, precision)
@@ -291,6 +293,7 @@ def run_compare(
     filter: bool = False,
     moves: list[float] | None = None,
     top: int | None = None,
+    descriptor: Path | None = None,
     calibration: str | None = None,
     calibration_truth: str | None = None,
     distractors: list[str] | str | None = None,
@@ -318,6 +321,7 @@ def run_compare(
         filter: as of `dejavu localize`
         moves: as of `dejavu localize`
         top: write so many places of each query, no two within the tolerance, a row each with its rank
+        descriptor: as of `dejavu learn`
         calibration: as of `dejavu learn`; a third traverse
         calibration_truth: which places it shows, as --truth
         distractors: another route, or a list of several, '[A,B]': how many of its frames are accepted
@@ -333,12 +337,12 @@ def run_compare(
         model.threshold = None  # of distances: that of the filter is none for the map to keep
     if map is not None:
         given = model
-        model = DejaVu.load(map, None if isinstance(given.features, HOG) else given.features)
+        model = _load_map(map, None if isinstance(given.features, HOG) else given.features)
         _accept_by(model, asked, given.precision)
         model.threshold = None if filter and asked is not None else model.threshold
     model.to(where)
     first, queries = open_source(reference), open_source(query)
-    read = [truth, second_truth, calibration, calibration_truth]
+    read = [truth, second_truth, descriptor, calibration, calibration_truth]
     _check_report_folder(out, COMPARED, [reference, query, second], read)
     others = [distractors] if isinstance(distractors, str) else distractors or []
     strange = [open_source(other) for other in others]
@@ -492,7 +496,8 @@ def run_bench(
     if what != "train" and (steps is not None or seeds):
         raise InputError(f"bench {what} takes no steps or seeds; bench train does")
     if what == "storage":
-        given, shared = (None if path is None else DejaVu.load(path) for path in (map, whitening))
+        given = None if map is None else _load_map(map)
+        shared = None if whitening is None else DejaVu.load(whitening)
         found = frontier.run_storage(out, sources, places, codebooks, given, shared, progress=True)
         for title, table in frontier.storage_tables(found):
             print(*[printable(title)] * bool(title), text_table(table), "", sep="\n")
@@ -563,7 +568,7 @@ def run_export(
         raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")
     check_output_file(onnx)
     check_not_read(onnx, map)
-    model = DejaVu.load(map, features)
+    model = _load_map(map, features)
     _accept_by(model, threshold, None)
     matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
     if matcher is not None and model.precision is not None:
@@ -609,7 +614,20 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     known = [name for name, platt in (model.calibration or NEVER)._asdict().items() if platt is not None]
     print(f"calibrated for: {', '.join(known) or 'nothing'}; precision: {model.precision}")
     print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
-    _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+    if model.map.places:
+        _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+    else:
+        _print_next(
+            "learn", "ROUTE", "--descriptor", map, *_features_of(model, command), "--map", "route.safetensors"
+        )
+
+
+def _load_map(path: Path, features: nn.Module | None = None) -> DejaVu:
+    """As `DejaVu.load`; a descriptor is refused, which finds nothing by itself."""
+    model = DejaVu.load(path, features)
+    if not model.map.places:
+        raise InputError(f"{path} is {NO_MAP.replace('FILE', str(path))}")
+    return model
 
 
 def _features_of(model: DejaVu, command: str) -> list[str]:
@@ -740,7 +758,7 @@ def _print_steps(traverse: Traverse) -> None:
 def print_map(model: DejaVu) -> None:
     """What a map holds, and what it would need where that is next to nothing."""
     summary = model.summary()
-    if not summary.covered:
+    if summary.places and not summary.covered:
         print("this route does not repeat")
     print(summary)
     whitening = model.whitening

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn, get_args, get_origin
+from typing import Any, Literal, NoReturn, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
@@ -32,7 +32,8 @@ HINT = (
     "--mapper.route_bytes_per_place 2.5: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
     "with options such as --mapper.periods.window 512. --whitening also takes none, or a map file, with "
-    "the features that it was learned from."
+    "the features that it was learned from; --descriptor takes those alone, from a map or from what "
+    "`dejavu train` makes of several routes."
 )
 MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 LONGEST = 300  # characters of a message that is told whole
@@ -178,7 +179,8 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         lost = set(changed) - {"features", "threshold", "precision"}  # a map has all but these itself
         told = [word.lstrip("-").partition("=")[0] for word in words if word.startswith("--")]
         if name == "compare" and arguments["map"]:
-            lost |= {one for one in ("second", "second_truth") if arguments[one] is not None}
+            taken = ("second", "second_truth", "descriptor")
+            lost |= {one for one in taken if arguments[one] is not None}
             lost |= {"whitening"} if whitening else set()
             if lost:
                 named = (one.partition(".")[0] for one in told)
@@ -189,7 +191,12 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         if whitening:
             written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"
             check_not_read(written, whitening)
-            _take_whitening(model, whitening, told)
+            _take(model, whitening, told, "whitening")
+        if arguments.get("descriptor"):
+            if whitening:
+                seen = f"--whitening {whitening} has its own features"
+                raise UsageError(f"{seen}; expected it or --descriptor {arguments['descriptor']}")
+            _take(model, arguments["descriptor"], told, "descriptor")
     return arguments
 
 
@@ -232,17 +239,21 @@ def without_whitening_map(words: Sequence[str]) -> tuple[list[str], Path | None]
     return kept, whitening
 
 
-def _take_whitening(model: DejaVu, path: Path, told: Sequence[str]) -> None:
-    """Give a model the whitening of a map file; features of our own come from there as well.
+def _take(model: DejaVu, path: Path, told: Sequence[str], what: Literal["whitening", "descriptor"]) -> None:
+    """Give a model the whitening or the descriptor of a file; features of our own come from there as well.
 
     Args:
         told: the options of the command line.
     """
-    other = [one for one in told if one.startswith(("whitening.", "preprocess"))]
+    of_file = ("preprocess", "whitening.") if what == "whitening" else ("preprocess",)
+    other = [one for one in told if one.startswith(of_file)]
     if other:
-        raise UsageError(f"--{other[0]}: the whitening of {path} has its own; expected one or the other")
+        raise UsageError(f"--{other[0]}: the {what} of {path} has its own; expected one or the other")
     named = any(one.startswith("features") for one in told)
     known = DejaVu.load(path, model.features if named or not isinstance(model.features, HOG) else None)
+    if what == "descriptor":
+        model.take_descriptor(known)
+        return
     try:
         model.take_whitening(known)
     except InputError as error:

@@ -26,7 +26,7 @@ from dejavu_torch.data.output import check_output_folder, make_output_folder, re
 from dejavu_torch.text import one_line
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import LastCheckpoint, MapExport
+from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport
 from dejavu_torch.training.precision import has_bf16
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
@@ -112,7 +112,8 @@ class TrainParser(Parser, LightningArgumentParser):
 
 
 class TrainCLI(LightningCLI):
-    """fit writes DIR/map.safetensors; validate, test and export take a checkpoint."""
+    """fit writes DIR/map.safetensors, of several routes DIR/descriptor.safetensors; validate, test and export
+    take a checkpoint."""
 
     def __init__(self, args: list[str], **settings: Any) -> None:
         self.words = args  # also for what to do next
@@ -228,7 +229,7 @@ class TrainCLI(LightningCLI):
         resumed = self.config_init[self.subcommand].get("ckpt_path") is not None
         if resumed:
             self.before_validate()
-        if not asked["fast_dev_run"] and (root / "map.safetensors").exists() and not resumed:
+        if not asked["fast_dev_run"] and (root / self._written).exists() and not resumed:
             log.warning("%s holds an earlier run, which this one replaces", root)
 
     def fit(self, **arguments: Any) -> None:
@@ -301,7 +302,7 @@ class TrainCLI(LightningCLI):
     def after_validate(self) -> None:
         """Say what the figures are of, and what to do next."""
         checkpoint = self.config_init[self.subcommand]["ckpt_path"]
-        written = Path(self.trainer.default_root_dir) / "map.safetensors"
+        written = Path(self.trainer.default_root_dir) / self._written
         print(f"figures of {checkpoint}")
         if written.is_file():
             print_next(written, self.datamodule)
@@ -310,6 +311,10 @@ class TrainCLI(LightningCLI):
             print(f"next: {shlex.join(['dejavu', 'train', *words])}")
 
     after_test = after_validate
+
+    @property
+    def _written(self) -> str:
+        return DESCRIPTOR if len(self.datamodule.listed["source"]) > 1 else "map.safetensors"
 
     @property
     def _checkpoints(self) -> Path:
@@ -351,12 +356,16 @@ def print_written(export: MapExport, data: RouteData) -> None:
     if export.written is not None:
         path, model = export.written
         print_map(model)
-        print(f"written to {path}; only a second traverse shows what it is worth:")
+        worth = "; only a second traverse shows what it is worth:" if model.map.places else ""
+        print(f"written to {path}{worth}")
         print_next(path, data)
 
 
 def print_next(path: Path, data: RouteData) -> None:
-    """How to see what a map is worth."""
+    """How to see what a map is worth, or to make one with a descriptor."""
+    if len(data.listed["source"]) > 1:
+        print(f"next: dejavu learn ROUTE --descriptor {shlex.quote(str(path))} --map route.safetensors")
+        return
     known = [data.sources[name] for name in ("validation", "query") if data.sources[name]]
     reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], [*known, "SECOND"][0]))
     print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")

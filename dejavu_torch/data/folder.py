@@ -64,7 +64,7 @@ class ImageFolder(IndexedTraverse):
                 (f"; it has folders such as {file.name}" for file in folder.iterdir() if file.is_dir()), ""
             )
             raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
-        self.files = sorted(files, key=lambda file: _natural(file.name))
+        self.files = sorted(files, key=lambda file: natural(file.name))
         self.width, self.height = width, height
         self.name = printable(folder)
         self.length = len(self.files)
@@ -158,7 +158,8 @@ def read_image(path: Path) -> Tensor:
     return torch.from_numpy(channels).float().div_(255)
 
 
-def _natural(name: str) -> tuple[list[str | int], str]:
+def natural(name: str) -> tuple[list[str | int], str]:
+    """What names are sorted by, their numbers as numbers."""
     # odd positions are the digit runs, so that numbers only ever meet numbers
     parts = re.split(r"(\d+)", name)
     return [int(part) if j % 2 else part for j, part in enumerate(parts)], name

@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from dejavu_torch.data.arrays import read_array
-from dejavu_torch.data.folder import SUFFIXES, ImageFolder
+from dejavu_torch.data.folder import SUFFIXES, ImageFolder, natural
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
@@ -58,6 +58,30 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     if size is not None and resizes and not {"height", "width"} & arguments.keys():
         arguments["height"], arguments["width"] = size
     return FrameRange(reader(**arguments), **part) if part else reader(**arguments)
+
+
+def routes_of(source: str | Path) -> list[str]:
+    """The routes that a source holds: of a folder of nothing but folders each of these, else the source.
+
+    Args:
+        source: as of `open_source`; options behind a folder are those of each route.
+
+    Returns:
+        Sources, sorted by name as images are.
+
+    Example:
+        >>> routes_of("sim:aerial?frames=40")
+        ['sim:aerial?frames=40']
+    """
+    address, query = _split(str(source))
+    path = Path(address)
+    inside: list[Path] = []
+    with suppress(OSError, ValueError):  # none, or one that can be no path
+        inside = [one for one in path.iterdir() if one.name[0] != "."] if address else []
+    if not inside or not all(one.is_dir() for one in inside):
+        return [str(source)]
+    behind = f"?{query}" if query else ""
+    return [f"{path / name}{behind}" for name in sorted((one.name for one in inside), key=natural)]
 
 
 def check_not_read(out: Path, *sources: str | Path | None) -> None:

@@ -114,6 +114,8 @@ def describe(summary: MapSummary) -> str:
         1024 of 1024 places covered; 264 templates, 528 numbers
         4096 bytes, 4.0 per place: 4096 of the route, 4.00 per place (templates 2112, layers 1984)
     """
+    if not summary.places:
+        return f"{summary.fixed_bytes} bytes without a map ({_parts(summary.fixed)})"
     lines = [_chunk_line(chunk) for chunk in summary.chunks]
     stored = f"{summary.templates} templates, {summary.template_numbers} numbers"
     if summary.kind == "spectral":

@@ -17,7 +17,7 @@ from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
-from dejavu_torch.data.source import open_source
+from dejavu_torch.data.source import open_source, routes_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.memory import check_room
@@ -99,10 +99,12 @@ class RouteData(LightningDataModule):
 
     Args:
         source: the reference, whose frames are the places of the map: what `open_source` reads, a Traverse,
-            or a tensor of frames or features (see `ArrayTraverse`).
+            or a tensor of frames or features (see `ArrayTraverse`). A list of several routes, or a folder of
+            nothing but folders, trains one descriptor for all of them: their places are numbered one route
+            behind the other, and nothing crosses from one to the next.
         second: another traverse of the same route to train on as well: its frames are positives of the
-            places they show.
-        second_truth: which places those are, see `find_ground_truth`.
+            places they show. Of several routes it is a list as long, None for those without.
+        second_truth: which places those are, see `find_ground_truth`; a list likewise.
         validation: a traverse to validate on during training. None: the reference itself under augmentation,
             the same each time; its figures say what is learned, not how another traverse fares.
         validation_truth: see `find_ground_truth`.
@@ -111,22 +113,29 @@ class RouteData(LightningDataModule):
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
         resize: (height, width) in pixels that frames are stored in; None is what the backbone of the task
-            resizes them to (its `frame_size`) where that is smaller, and their own size otherwise.
+            resizes them to (its `frame_size`) where that is smaller, or several routes are of several sizes,
+            and their own size otherwise.
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
 
     Convention: frames are kept as bytes; beyond `concatenate`'s share of memory they lie in a file.
 
     Raises:
-        InputError: a traverse that cannot be read, no longer than the tolerance, without known places, or of
-            frames of another size than the reference's.
+        InputError: no traverse, one that cannot be read, no longer than the tolerance, without known places,
+            or of frames of another size than the reference's; several routes with a validation or a query.
+
+    Example:
+        >>> data = RouteData([torch.rand(20, 3, 8, 8), torch.rand(30, 3, 8, 8)], tolerance=2)
+        >>> data.setup("fit")
+        >>> data.lengths, data.apart(torch.tensor([19, 20]))
+        ([20, 30], tensor([19, 22]))
     """
 
     def __init__(
         self,
         source: str | Any,
         second: str | Any = None,
-        second_truth: str | None = None,
+        second_truth: str | Any = None,
         validation: str | Any = None,
         validation_truth: str | None = None,
         query: str | Any = None,
@@ -146,36 +155,105 @@ class RouteData(LightningDataModule):
             )
         if resize is not None and (len(resize) != 2 or min(resize) < 1):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
-        self.sources = {"source": source, "second": second, "validation": validation, "query": query}
-        for name, given in self.sources.items():
-            if given is not None and not isinstance(given, (str, Path, Traverse, Tensor)):
-                raise InputError(
-                    f"{name} is of type {type(given).__name__}; expected a path or `sim:` address, a "
-                    "Traverse, or a tensor of frames or features"
-                )
-        self.truths = {"second": second_truth, "validation": validation_truth, "query": truth}
+        routes = routes_of(source) if isinstance(source, (str, Path)) else source
+        self.listed = {"source": list(routes) if isinstance(routes, (list, tuple)) else [routes]}
+        self.truths: dict[str, list[str | None]] = {}
+        others = {"second": (second, second_truth)}
+        others |= {"validation": (validation, validation_truth), "query": (query, truth)}
+        for name, (given, known) in others.items():
+            self.listed[name] = self._one_each(name, given)
+            self.truths[name] = self._one_each(f"{name}_truth" if name != "query" else "truth", known)
+        self._check_sources()
+        # as it was given where there is one route
+        self.sources = {
+            name: given if len(given) > 1 and any(one is not None for one in given) else given[0]
+            for name, given in self.listed.items()
+        }
         self.tolerance, self.batch_size, self.clip = tolerance, batch_size, clip
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
         self.velocity = velocity
-        self.reference: Traverse  # at even steps, where there is `velocity`
+        self.routes: list[Traverse] = []  # at even steps, where there is `velocity`
         self.sets: dict[str, StoredFrames] = {}
         self._wanted: tuple[int, int] | None = None  # size of the stored frames, where it makes them smaller
+
+    def _one_each(self, name: str, given: Any) -> list[Any]:
+        """What is given for each of the routes."""
+        count = len(self.listed["source"])
+        each = list(given) if isinstance(given, (list, tuple)) else [given]
+        each = [None] * count if given is None else each
+        if len(each) != count:
+            raise InputError(
+                f"{name} is of {len(each)}, the routes are {count}; expected one of each route, null for "
+                "those without"
+            )
+        return each
+
+    def _check_sources(self) -> None:
+        routes = self.listed["source"]
+        if not routes:
+            raise InputError("source is an empty list; expected at least one traverse")
+        for name, given in self.listed.items():
+            needless = len(routes) > 1 and name in ("validation", "query")
+            for one in given:
+                if one is not None and needless:
+                    raise InputError(
+                        f"{name} is given, and there are {len(routes)} routes, which make no map; expected "
+                        "none, and `dejavu compare A B --descriptor FILE` for a route"
+                    )
+                missing = one is None and name == "source"
+                if missing or (one is not None and not isinstance(one, (str, Path, Traverse, Tensor))):
+                    raise InputError(
+                        f"{name} is of type {type(one).__name__}; expected a path or `sim:` address, a "
+                        "Traverse, or a tensor of frames or features"
+                    )
+        paths = [str(one) for one in routes if isinstance(one, (str, Path))]
+        twice = next((one for one in paths if paths.count(one) > 1), None)
+        if twice is not None:
+            raise InputError(f"{twice} is given twice; expected each route once, other traverses as second")
+
+    @property
+    def reference(self) -> Traverse:
+        """The route, or the first of several."""
+        return self.routes[0]
+
+    @property
+    def route_name(self) -> str:
+        """Of the routes, for messages."""
+        more = f" and {len(self.routes) - 1} more" * (len(self.routes) > 1)
+        return f"{self.reference.name}{more}"
+
+    @property
+    def lengths(self) -> list[int]:
+        """Places of each route."""
+        return [len(part) for part in self.sets["reference"].parts]
+
+    def apart(self, places: Tensor) -> Tensor:
+        """Places numbered so that those of two routes are further apart than the tolerance; -1 stays -1."""
+        starts = torch.tensor(self.lengths, device=places.device).cumsum(0)[:-1]
+        return places + self.tolerance * torch.bucketize(places, starts, right=True)
 
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
         task = None if self.trainer is None else self.trainer.lightning_module
+        if len(self.listed["source"]) > 1 and task is not None and not getattr(task, "made", False):
+            raise InputError(
+                f"there are {len(self.listed['source'])} routes, and the map in training is of one; expected "
+                "one traverse, or model.mapper SpectralMapper, which trains a descriptor"
+            )
         wanted = getattr(task, "frame_size", None) if self.resize is None else self.resize
         if wanted != self._wanted:
             self.sets.clear()
             self._wanted = wanted
         if "reference" not in self.sets:
-            self.reference = resampled(_open(self.sources["source"]), self.velocity, self.batch_size)
-            values = store(self.reference, self._size)
-            self._check_length(self.reference.name, len(values))
-            self.sets["reference"] = StoredFrames(
-                [values], as_ground_truth(torch.arange(len(values))[:, None])
-            )
+            opened = [_open(source) for source in self.listed["source"]]
+            self.routes = [resampled(route, self.velocity, self.batch_size) for route in opened]
+            size, parts = self._size, []
+            for route in self.routes:
+                parts.append(store(route, size))
+                self._check_length(route.name, len(parts[-1]))
+            places = torch.arange(sum(map(len, parts)))
+            self.sets["reference"] = StoredFrames(parts, as_ground_truth(places[:, None]))
         needed = {"fit": ("second", "validation"), "validate": ("validation",), "test": ("query",)}
         also = ("second",) if getattr(task, "made", False) else ()  # its map is made anew, whatever the stage
         for name in (*also, *needed.get(stage, ())):
@@ -188,31 +266,45 @@ class RouteData(LightningDataModule):
     def _size(self) -> tuple[int, int] | None:
         """(height, width) of stored frames; None is their own."""
         shape = self.reference.frame_shape
+        for route in self.routes[1:]:
+            other = route.frame_shape
+            if len(other) != len(shape) or other[0] != shape[0] or (other != shape and not self._wanted):
+                raise _other_frames(route.name, other, shape)
+            if other != shape:
+                return self._wanted
         smaller = self._wanted and len(shape) == 3 and math.prod(self._wanted) < math.prod(shape[1:])
         return self._wanted if smaller or self.resize is not None else None
 
     def _read(self, name: str) -> StoredFrames:
-        reference = self.sets["reference"].values
-        step = self.reference.step if isinstance(self.reference, ResampledTraverse) else None
-        traverse = resampled(_open(self.sources[name]), self.velocity, self.batch_size, step)
+        if len(self.routes) == 1:
+            values, known = self._read_one(name, 0)
+            return StoredFrames([values], known)
+        given = [i for i, source in enumerate(self.listed[name]) if source is not None]
+        parts, truths = zip(*(self._read_one(name, i) for i in given), strict=True)
+        known_places = [truth.positives.masked_fill(~truth.judged[:, None], -1) for truth in truths]
+        starts = [sum(self.lengths[:i]) for i in given]
+        moved = [torch.where(p >= 0, p + start, -1) for p, start in zip(known_places, starts, strict=True)]
+        return StoredFrames([*parts], _joined(moved))
+
+    def _read_one(self, name: str, i: int) -> tuple[Tensor, GroundTruth]:
+        """Another traverse of route i, and the places of that route that it shows."""
+        route, reference = self.routes[i], self.sets["reference"].parts[i]
+        step = route.step if isinstance(route, ResampledTraverse) else None
+        traverse = resampled(_open(self.listed[name][i]), self.velocity, self.batch_size, step)
         values = store(traverse, self._size)
         self._check_length(traverse.name, len(values))
         if values.shape[1:] != reference.shape[1:]:
-            raise InputError(
-                f"{traverse.name} has frames of {tuple(values.shape[1:])}, the reference of "
-                f"{tuple(reference.shape[1:])}; expected the same channels, and one size, as data.resize "
-                "makes"
-            )
-        known = ground_truth_of(self.truths[name], self.reference, traverse, len(reference), len(values))
+            raise _other_frames(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
+        known = ground_truth_of(self.truths[name][i], route, traverse, len(reference), len(values))
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
             raise InputError(
                 f"there is no ground truth for {traverse.name}: it has {len(values)} frames, the reference "
                 f"{len(reference)} places; expected {option}"
             )
-        if isinstance(self.reference, ResampledTraverse):
-            known = ground_truth_in_places(known, partial(place_of, self.reference.positions))
-        return StoredFrames([values], known)
+        if isinstance(route, ResampledTraverse):
+            known = ground_truth_in_places(known, partial(place_of, route.positions))
+        return values, known
 
     def _check_length(self, name: str, frames: int) -> None:
         if frames <= max(1, self.tolerance):
@@ -224,14 +316,11 @@ class RouteData(LightningDataModule):
     def train_dataloader(self) -> DataLoader[Batch]:
         """Frames of the reference and of the second traverse, as they are stored."""
         sets = [self.sets[name] for name in ("reference", "second") if name in self.sets]
-        lengths = [len(part) for part in sets]
+        parts = [part for one in sets for part in one.parts]
+        lengths = [len(part) for part in parts]
         if max(lengths) < self.clip:
             raise InputError(f"clip is {self.clip} and the route has {max(lengths)} frames; expected fewer")
-        positives = [part.truth.positives for part in sets]
-        width = max(part.shape[1] for part in positives)
-        pad = torch.nn.functional.pad
-        joined = torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives])
-        frames = StoredFrames([part.values for part in sets], as_ground_truth(joined))
+        frames = StoredFrames(parts, _joined([one.truth.positives for one in sets]))
         return _loader(frames, Clips(lengths, self.batch_size, self.clip))
 
     def val_dataloader(self) -> DataLoader[Batch]:
@@ -292,6 +381,20 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
 def as_frames(values: Tensor) -> Tensor:
     """Bytes as frames in [0, 1]; features as they are."""
     return values.float() / 255 if values.dtype == torch.uint8 else values
+
+
+def _joined(positives: list[Tensor]) -> GroundTruth:
+    """The truth of several traverses, one behind the other."""
+    width = max(part.shape[1] for part in positives)
+    pad = torch.nn.functional.pad
+    return as_ground_truth(torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives]))
+
+
+def _other_frames(name: str, seen: tuple[int, ...], reference: tuple[int, ...]) -> InputError:
+    return InputError(
+        f"{name} has frames of {seen}, the reference of {reference}; expected the same channels, and one "
+        "size, as data.resize makes"
+    )
 
 
 def _open(source: str | Path | Traverse | Tensor) -> Traverse:

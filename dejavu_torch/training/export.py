@@ -13,6 +13,8 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError, Traverse
 
+DESCRIPTOR = "descriptor.safetensors"  # of several routes
+
 log = logging.getLogger("dejavu_torch")
 
 
@@ -20,8 +22,10 @@ class MapExport(Callback):
     """Writes the map when training ends or is interrupted: of the best checkpoint where one is watched for,
     else of the last step.
 
+    Of several routes it is their descriptor, without a map, in `descriptor.safetensors`.
+
     Args:
-        name: of the file, in the trainer's default_root_dir.
+        name: of the map file, in the trainer's default_root_dir.
     """
 
     def __init__(self, name: str = "map.safetensors") -> None:
@@ -66,11 +70,12 @@ class MapExport(Callback):
         except InputError as error:
             log.warning("no map is written: %s", error)
             return
-        if reference is not None:
+        if reference is not None and model.map.places:
             model.calibrate_if_possible(reference)
         folder.mkdir(parents=True, exist_ok=True)
-        model.save(folder / self.name)
-        self.written = (folder / self.name, model)
+        path = folder / (self.name if model.map.places else DESCRIPTOR)
+        model.save(path)
+        self.written = (path, model)
 
 
 class LastCheckpoint(Checkpoint):

@@ -66,16 +66,20 @@ class DescriptorStage(Stage):
     """The descriptor learns to tell stretches of the route apart.
 
     Place cross-entropy over the cosine distances of the descriptor to one proxy for each stretch, as long as
-    the tolerance. Where it is the last stage, the map is made of the descriptor in closed form.
+    the tolerance, and shorter at the end of a route. Where it is the last stage, the map is made of the
+    descriptor in closed form.
     """
 
     every: Tensor
+    stretch: Tensor
 
     def __init__(self, share: float = 0.0) -> None:
         super().__init__(share)
         self.proxies = nn.Parameter(torch.zeros(0, 0))
         self.log_temperature = nn.Parameter(torch.tensor(math.log(TEMPERATURE)))
         self.register_buffer("every", torch.tensor(1))  # places of a stretch
+        # of each place, as `RouteData.apart` numbers them; between two routes one behind the last
+        self.register_buffer("stretch", torch.zeros(0, dtype=torch.int64), persistent=False)
 
     def begin(self, task: PlaceRecognitionTask) -> None:
         if not _trainable(network_of(task.dejavu.features)):
@@ -85,7 +89,14 @@ class DescriptorStage(Stage):
             )
         reference = task.data.sets["reference"]
         every = int(self.every) if len(self.proxies) else max(1, task.data.tolerance)
-        count = -(-len(reference) // every)
+        counts = [-(-length // every) for length in task.data.lengths]
+        count = sum(counts)
+        ahead = [sum(counts[:i]) for i in range(len(counts))]
+        routes = zip(ahead, task.data.lengths, strict=True)
+        stretches = torch.cat([first + torch.arange(length) // every for first, length in routes])
+        numbers = task.data.apart(torch.arange(len(reference)))
+        between = torch.full((int(numbers[-1]) + 1,), count)
+        self.stretch = between.scatter(0, numbers, stretches).to(task.device)
         if not len(self.proxies):
             self.every.fill_(every)
             with torch.no_grad(), in_mode(task.dejavu.features, False):
@@ -96,7 +107,7 @@ class DescriptorStage(Stage):
         elif len(self.proxies) != count:
             raise InputError(
                 f"the descriptor was learned on {len(self.proxies)} stretches of {every} frames, "
-                f"{task.data.reference.name} has {count}; expected the route that it was learned on"
+                f"{task.data.route_name} has {count}; expected the route that it was learned on"
             )
 
     def make(self, stretches: int, dimension: int, task: PlaceRecognitionTask) -> None:
@@ -114,13 +125,14 @@ class DescriptorStage(Stage):
 
     def losses_to(self, proxies: Tensor, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         """The losses of a batch, to proxies (W,K)."""
-        frames, places = task.data.augmented(batch.frames, task.data.clip), len(task.data.sets["reference"])
+        frames = task.data.augmented(batch.frames, task.data.clip)
         descriptors = to_length(descriptor_of(task)(frames).float())
         noisy = descriptors + NOISE * torch.randn_like(descriptors)
         distances = phase_distances(noisy, proxies, "cosine")
-        stretch = torch.arange(places, device=distances.device) // self.every
-        scores, temperature = distances.index_select(1, stretch), self.log_temperature.exp()
-        found = place_cross_entropy(scores, batch.truth.positives, task.data.tolerance, temperature)
+        distances = nn.functional.pad(distances, (0, 1), value=math.inf)  # between two routes
+        scores, temperature = distances.index_select(1, self.stretch), self.log_temperature.exp()
+        places = task.data.apart(batch.truth.positives)
+        found = place_cross_entropy(scores, places, task.data.tolerance, temperature)
         return Losses(found.loss, {"descriptor": found.loss}, found.left_out)
 
     def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
@@ -315,7 +327,8 @@ def make_map(task: PlaceRecognitionTask) -> None:
             torch.manual_seed(whitening.seed)
             views = views_of(task, whitening.copies(*features.shape), whitening.most_views)
             whitening.learn(features, ((view, places[:, 0]) for view, places in views))
-        model.learn_features(model.whitened(features), task.data.reference)
+        alone = task.data.reference if len(task.data.routes) == 1 else None
+        model.learn_features(model.whitened(features), alone)
 
 
 @torch.no_grad()
@@ -334,17 +347,17 @@ def stored_features(
     Raises:
         InputError: a backbone that does not take the frames, or makes NaN.
     """
-    values = task.data.sets["reference"].values
-    order = torch.randperm(len(values)) if shuffled else torch.arange(len(values))
+    frames = task.data.sets["reference"]
+    order = torch.randperm(len(frames)) if shuffled else torch.arange(len(frames))
     count = min(-(-len(order) // task.dejavu.batch_size), len(order) // 2)  # none of a single frame
     features = torch.zeros(0, device=task.device)
     for batch in order.tensor_split(count):
-        part = described(task, values[batch], describe)
+        part = described(task, frames[batch.tolist()].frames, describe)
         if not len(features):
-            features = part.new_empty(len(values), part.shape[1])
+            features = part.new_empty(len(frames), part.shape[1])
         features[batch.to(task.device)] = part
     if not features.isfinite().all():
-        name, maker = task.data.reference.name, type(task.dejavu.features).__name__
+        name, maker = task.data.route_name, type(task.dejavu.features).__name__
         raise InputError(f"{maker} makes NaN or infinite features of {name}; expected finite numbers")
     return features
 

@@ -172,6 +172,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.metric: PlaceRecognition | None = None  # `setup` makes it
         self.steps = 0  # of the training that a checkpoint comes from
         self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
+        self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
         self._callbacks: list[pl.Callback] = []
 
     @property
@@ -226,6 +227,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
         self._check_route(self.dejavu.map.places)
+        self._check_routes()
         if reference.values.ndim == 2 and self.made:
             raise InputError(
                 f"{self.data.reference.name} holds ready features, and the map of a "
@@ -255,7 +257,7 @@ class PlaceRecognitionTask(pl.LightningModule):
                 make_map(self)
         else:
             self._start_templates()
-        if self.data.resize is not None:
+        if self.data.resize is not None and len(self.data.routes) == 1:
             self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
 
     def _start_templates(self) -> None:
@@ -293,6 +295,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         model = copy.deepcopy(self.dejavu).eval()
         if self.weight_bits == 8 and round_weights(model.features):
             model.weight_bits = 8
+        if self.made and len(self.data.routes) > 1:
+            model = model.without_map()
         if not self.made:
             route, mapper = cast(TemplateMap, model.map), cast(TemplateMapper, model.mapper)
             route.freeze()
@@ -417,8 +421,9 @@ class PlaceRecognitionTask(pl.LightningModule):
             frames = batch.frames if self.trainer.testing else self.data.validated(batch)
             with torch.autocast(self.device.type, enabled=False):
                 match = best_match(self(frames))
-            index = self.map.scored(match.index)
-            self.metric.update(match._replace(index=index), batch.truth)
+            index = self.data.apart(self.map.scored(match.index))
+            truth = batch.truth._replace(positives=self.data.apart(batch.truth.positives))
+            self.metric.update(match._replace(index=index), truth)
 
     def on_validation_epoch_end(self) -> None:
         """Log what `evaluate` says; the reference itself, under augmentation, is no validation traverse."""
@@ -458,6 +463,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Keep the stage, and what is trained; a map that is made is made anew."""
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
+        checkpoint["routes"] = self._routes()
         if self.made:
             checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
 
@@ -481,6 +487,8 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.resumed = checkpoint
             if self.trainer.state.fn != "fit":
                 checkpoint.pop("loops", None)  # nothing goes on
+        self.routes = checkpoint.get("routes", [])
+        self._check_routes()
         if not self.made:
             self._take_templates(checkpoint["state_dict"])
         self.index, self.began = checkpoint["stage"], checkpoint["began"]
@@ -516,6 +524,23 @@ class PlaceRecognitionTask(pl.LightningModule):
                 )
         route.trainable(True, self.feature_weights)
         self.dejavu.map = route.to(self.device)
+
+    def _routes(self) -> list[Any]:
+        """Names and lengths of several routes; nothing of one, which may be read from elsewhere."""
+        named = [[route.name, n] for route, n in zip(self.data.routes, self.data.lengths, strict=True)]
+        return named if len(named) > 1 else []
+
+    def _check_routes(self) -> None:
+        """Refuse a checkpoint of another list of routes than the data's."""
+        if self._trainer is None or self.routes is None:
+            return
+        if self.routes != self._routes():
+            seen = ", ".join(f"{name}" for name, _ in self.routes) or "one route"
+            raise InputError(
+                f"the checkpoint was trained on {seen:.300}, the data is {self.data.route_name}; expected "
+                "the same routes in the same order"
+            )
+        self.routes = None
 
     def _check_route(self, places: int) -> None:
         """Refuse a map of another route than the data's."""

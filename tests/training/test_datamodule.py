@@ -18,6 +18,7 @@ from torch import Tensor
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.training.datamodule import Batch, Clips, RouteData, StoredFrames, as_frames, store
 from dejavu_torch.types import GroundTruth
 
@@ -109,6 +110,17 @@ def test_parts_are_as_one_behind_the_other() -> None:
     features = [torch.randn(4, 3, dtype=torch.float64) for _ in range(2)]
     both = StoredFrames(features, as_ground_truth(torch.arange(8)[:, None]))
     assert torch.equal(both[[7, 0]].frames, torch.stack([features[1][3], features[0][0]]))
+
+
+def test_each_of_several_routes_has_even_steps_of_its_own() -> None:
+    routes = [ArrayTraverse(ground(start), name) for name, start in (("a", REFERENCE), ("b", QUERY))]
+    data = RouteData(routes, velocity=camera(step=None))
+    data.setup("fit")
+    first, second = data.routes
+    assert isinstance(first, ResampledTraverse)
+    assert isinstance(second, ResampledTraverse)
+    assert second.step > 1.1 * first.step
+    assert data.lengths == [first.length, second.length]
 
 
 @pytest.mark.parametrize("stage", ["fit", "test"])
@@ -252,10 +264,10 @@ def test_a_clip_longer_than_the_route_is_refused() -> None:
         route(clip=32, batch_size=32).train_dataloader()
 
 
-@pytest.mark.parametrize("given", [[1, 2], np.zeros((3, 4, 4)), 3.5], ids=["list", "array", "float"])
+@pytest.mark.parametrize("given", [[3], np.zeros((3, 4, 4)), 3.5], ids=["list", "array", "float"])
 @pytest.mark.parametrize("name", ["source", "second", "validation", "query"])
 def test_a_source_that_is_none_is_refused(name: str, given: object) -> None:
-    kind = type(given).__name__
+    kind = type(given[0] if isinstance(given, list) else given).__name__
     with refused(f"{name} is of type {kind}", "a path", "a Traverse, or a tensor of frames or features"):
         RouteData(**{"source": numbered(24)} | {name: given})  # type: ignore[arg-type]
 

@@ -100,7 +100,7 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
         ("validate", ["--trainer.default_root_dir", "never"], ["no checkpoint in never/checkpoints"]),
         ("fit", ["--data.source", "gone.npy"], ["gone.npy is not there", "expected a folder"]),
         ("fit", ["--data.source", "empty"], ["empty holds no images"]),
-        ("fit", ["--data.source", "[1,2]"], ["source is of type list", "expected a path"]),
+        ("fit", ["--data.source", "[1,2]"], ["source is of type int", "expected a path"]),
         ("fit", ["--data.source", "2021"], ["2021 is not there", "expected a folder"]),
         ("fit", ["--data.source", "single.npy"], ["single.npy has 1 frame and", "longer"]),
         ("fit", ["--data.source", "single.npy", "--data.tolerance", "0"], ["single.npy has 1 frame and"]),

@@ -1,0 +1,484 @@
+"""One descriptor for several routes."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, run, write_images
+from helpers import refused
+from small_training import Stop, backbone, data_of, fit, footage, mapper, recall, trainer
+from torch import Tensor, nn
+
+from dejavu_torch import DejaVu, RouteData, SpectralMapper, open_source
+from dejavu_torch.cli import main
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.source import routes_of
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.embedding import to_length
+from dejavu_torch.training.export import LastCheckpoint
+from dejavu_torch.training.stages import DescriptorStage
+from dejavu_torch.training.task import PlaceRecognitionTask
+
+LENGTHS = [40, 31, 23]
+WEIGHTS, LAST = "out/descriptor.safetensors", "out/checkpoints/last.ckpt"
+FIT, TEST, EXPORT = (
+    ["train", command, "--config", "train.yaml", "--data.source"] for command in ("fit", "test", "export")
+)
+
+
+def routes(sizes: tuple[int, ...] = (16, 16, 16)) -> list[ArrayTraverse]:
+    """Different routes; their names are their numbers."""
+    made = []
+    for i, (length, side) in enumerate(zip(LENGTHS, sizes, strict=True)):
+        frames = footage(frames=length, side=side)
+        made.append(ArrayTraverse(frames.flip(i % 2 + 1) if i else frames, str(i)))
+    return made
+
+
+def listed(source: object = None, **settings: Any) -> RouteData:
+    return RouteData(routes() if source is None else source, **{"tolerance": 2, "batch_size": 16} | settings)
+
+
+def task_of(**settings: Any) -> PlaceRecognitionTask:
+    return PlaceRecognitionTask(**{"backbone": backbone(), "mapper": SpectralMapper(20.0)} | settings)
+
+
+def train(folder: Path, data: RouteData | None = None, steps: int = 4, **settings: Any) -> DejaVu:
+    trainer(folder, max_steps=steps).fit(task_of(**settings), listed() if data is None else data)
+    return DejaVu.load(folder / "descriptor.safetensors")
+
+
+# what is trained on --------------------------------------------------------------------------------------
+
+
+def test_places_are_numbered_one_route_behind_the_other() -> None:
+    data = listed()
+    data.setup("fit")
+    frames, truth = data.sets["reference"][[0, 39, 40, 70, 71, 93]]
+    assert truth.positives[:, 0].tolist() == [0, 39, 40, 70, 71, 93]
+    expected = [
+        next(routes()[i].between(at, at + 1))[0]
+        for i, at in [(0, 0), (0, 39), (1, 0), (1, 30), (2, 0), (2, 22)]
+    ]
+    torch.testing.assert_close(frames, torch.stack(expected))
+
+
+def test_no_clip_crosses_from_one_route_to_the_next() -> None:
+    data = listed(clip=4)
+    data.setup("fit")
+    ends = torch.tensor(LENGTHS).cumsum(0)
+    for batch in data.train_dataloader():
+        clips = torch.bucketize(batch.truth.positives[:, 0], ends, right=True).view(-1, 4)
+        assert bool((clips == clips[:, :1]).all())
+
+
+def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tmp_path: Path) -> None:
+    """The loss is that of literal loops over places and proxies."""
+    data, task = listed(tolerance=3), task_of()
+    running = trainer(tmp_path, max_steps=1)
+    running.fit(task, data)
+    stage = task.stage
+    assert isinstance(stage, DescriptorStage)
+    stage.begin(task)
+    places = [(route, i) for route, length in enumerate(LENGTHS) for i in range(length)]
+    stretches = list(dict.fromkeys((route, i // 3) for route, i in places))
+    assert len(stage.proxies) == len(stretches)
+    shown = [0, 38, 39, 40, 41, 70, 71, 93]
+    batch = data.sets["reference"][shown]
+    data.augmented = lambda frames, clip: frames  # type: ignore[method-assign]
+    torch.manual_seed(1)
+    loss = stage.losses(task, batch).total
+    torch.manual_seed(1)
+    described = to_length(task.dejavu.describe(batch.frames).float())
+    noisy = described + 0.5 * torch.randn_like(described)
+    distance = 1 - nn.functional.cosine_similarity(noisy[:, None], stage.proxies[None], dim=2)
+    surprise = []
+    for row, place in zip(-distance / stage.log_temperature.exp(), shown, strict=True):
+        logits = torch.stack([row[stretches.index((route, i // 3))] for route, i in places])
+        here, at = places[place]
+        right = [k for k, (route, i) in enumerate(places) if route == here and abs(i - at) <= 3]
+        surprise.append(logits.logsumexp(0) - logits[right].logsumexp(0))
+    torch.testing.assert_close(loss, torch.stack(surprise).mean(), rtol=1e-4, atol=1e-4)
+    loss.backward()
+    assert all(bool(p.grad.isfinite().all()) for p in stage.parameters() if p.grad is not None)
+
+
+def test_an_answer_within_the_tolerance_behind_the_end_of_a_route_is_wrong(tmp_path: Path) -> None:
+    """Every answer is one place behind the right one."""
+    data, task = listed(tolerance=2), task_of()
+    every = {"val_check_interval": 1, "check_val_every_n_epoch": None, "num_sanity_val_steps": 0}
+    running = trainer(tmp_path, max_steps=1, **every)
+
+    def scores(frames: Tensor) -> Tensor:
+        first = scores.calls  # type: ignore[attr-defined]
+        scores.calls += len(frames)  # type: ignore[attr-defined]
+        answers = (torch.arange(first, first + len(frames)) + 1) % sum(LENGTHS)
+        return 1.0 - nn.functional.one_hot(answers, sum(LENGTHS)).float()
+
+    scores.calls = 0  # type: ignore[attr-defined]
+    task.forward = scores  # type: ignore[method-assign]
+    running.fit(task, data)
+    wrong = len(LENGTHS)  # at the end of each route
+    found = running.callback_metrics["val/recall_at_1_augmented"]
+    assert float(found) == pytest.approx(1 - wrong / sum(LENGTHS))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "resize", "stored"),
+    [
+        ((16, 16, 16), None, (16, 16)),
+        ((20, 16, 12), None, (16, 16)),  # the backbone's
+        ((12, 12, 12), None, (12, 12)),  # smaller than the backbone's: as they are
+        ((20, 16, 12), (8, 10), (8, 10)),
+    ],
+    ids=str,
+)
+def test_all_routes_are_of_one_size(
+    tmp_path: Path, sizes: tuple[int, ...], resize: tuple[int, int] | None, stored: tuple[int, int]
+) -> None:
+    data = listed(routes(sizes), resize=resize)
+    train(tmp_path, data, steps=1)
+    assert {tuple(part.shape[1:]) for part in data.sets["reference"].parts} == {(1, *stored)}
+
+
+def test_second_traverses_are_of_their_own_routes(tmp_path: Path) -> None:
+    second = [None, None, ArrayTraverse(footage(0.1, frames=20), "winter")]
+    data = listed(second=second, second_truth=[None, None, "3"])
+    train(tmp_path, data)
+    start = sum(LENGTHS[:2])
+    assert data.sets["second"].truth.positives[:, 0].tolist() == list(range(start + 3, start + 23))
+    assert len(data.train_dataloader().dataset) == sum(LENGTHS) + 20  # type: ignore[arg-type]
+
+
+# what it leaves ------------------------------------------------------------------------------------------
+
+
+def test_a_training_leaves_a_descriptor_with_which_another_route_is_learned(tmp_path: Path) -> None:
+    base = train(tmp_path, steps=30)
+    assert not (tmp_path / "map.safetensors").exists()
+    assert (base.map.places, base.velocity, base.frame_shape) == (0, None, None)
+    assert base.whitening is not None
+    assert base.whitening.learned
+    assert base.trained is not None
+    assert base.trained.steps == 30
+    other = footage(frames=60).flip(2)
+    model = DejaVu(mapper=SpectralMapper(20.0))
+    model.take_descriptor(base)
+    model.learn(ArrayTraverse(other))
+    assert model.whitening is not None
+    assert not torch.equal(model.whitening.scale[:2], base.whitening.scale[:2])  # of this route
+    assert recall(model, other) > 0.9
+    shared = DejaVu(mapper=SpectralMapper(20.0))
+    shared.take_whitening(DejaVu.load(tmp_path / "descriptor.safetensors"))
+    shared.learn(ArrayTraverse(other))
+    assert shared.whitening is not None
+    assert torch.equal(shared.whitening.projection, base.whitening.projection)
+
+
+def test_a_list_of_one_is_that_route(tmp_path: Path) -> None:
+    states = []
+    for name, source in (("one", routes()[0]), ("list", routes()[:1])):
+        torch.manual_seed(0)
+        states.append(fit(tmp_path / name, task_of(), listed(source)).state_dict())
+    assert all(
+        torch.equal(value, states[1][name]) for name, value in states[0].items() if isinstance(value, Tensor)
+    )
+
+
+def test_a_descriptor_without_whitening_and_of_a_foreign_network(tmp_path: Path) -> None:
+    network = nn.Sequential(nn.Flatten(), nn.Linear(256, 8))
+    task = task_of(backbone=network, whitening="none", weight_bits=32)
+    trainer(tmp_path).fit(task, listed())
+    base = DejaVu.load(tmp_path / "descriptor.safetensors", nn.Sequential(nn.Flatten(), nn.Linear(256, 8)))
+    assert base.whitening is None
+    assert all(
+        torch.equal(own, base.features.state_dict()[name]) for name, own in network.state_dict().items()
+    )
+
+
+def test_a_descriptor_finds_nothing_by_itself(tmp_path: Path) -> None:
+    base = train(tmp_path, steps=1)
+    with refused("descriptor without a map", "learn"):
+        base.localize(routes()[0])
+    base.save(tmp_path / "again.safetensors")
+    assert DejaVu.load(tmp_path / "again.safetensors").trained == base.trained
+    with refused("no map yet"):
+        DejaVu().save(tmp_path / "nothing.safetensors")
+
+
+# checkpoints ---------------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_run_resumes_with_the_same_list_and_no_other(tmp_path: Path) -> None:
+    part = tmp_path / "part.ckpt"
+    trainer(tmp_path, Stop(4, part), max_steps=8).fit(task_of(), listed())
+    on = trainer(tmp_path / "on", max_steps=8)
+    on.fit(task_of(), listed(), ckpt_path=part, weights_only=True)
+    assert on.global_step == 8
+    same_lengths = [ArrayTraverse(route.values, f"other {i}") for i, route in enumerate(routes())]
+    for other in (same_lengths, routes()[:2]):
+        with refused("trained on 0, 1, 2", "the same routes in the same order"):
+            trainer(tmp_path / "no").fit(task_of(), listed(other), ckpt_path=part, weights_only=True)
+    with refused("trained on 0, 1, 2", "the data is the array"):
+        trainer(tmp_path / "no").fit(task_of(), data_of(), ckpt_path=part, weights_only=True)
+    trainer(tmp_path / "alone", LastCheckpoint()).fit(task_of(), data_of())
+    with refused("trained on one route", "the data is 0 and 2 more"):
+        last = tmp_path / "alone" / "checkpoints" / "last.ckpt"
+        trainer(tmp_path / "no").fit(task_of(), listed(), ckpt_path=last, weights_only=True)
+
+
+# refusals ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "settings", "words"),
+    [
+        ([], {}, ("source is an empty list", "at least one traverse")),
+        (["a", None], {}, ("source is of type NoneType", "a path")),
+        (["sim:aerial", "sim:aerial"], {}, ("sim:aerial is given twice",)),
+        (None, {"second": routes()[0]}, ("second is of 1, the routes are 3", "null")),
+        (None, {"second": [None] * 4}, ("second is of 4, the routes are 3",)),
+        (None, {"second_truth": "3"}, ("second_truth is of 1, the routes are 3",)),
+        (None, {"query": [routes()[0]] * 3}, ("query is given", "3 routes", "--descriptor")),
+        (None, {"validation": [None, routes()[0], None]}, ("validation is given", "3 routes")),
+    ],
+    ids=["empty", "none", "twice", "one second", "many seconds", "one truth", "query", "validation"],
+)
+def test_lists_that_are_none_are_refused(
+    source: object, settings: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    with refused(*words):
+        listed(source, **settings)
+
+
+@pytest.mark.parametrize(
+    ("added", "words"),
+    [
+        (footage(frames=2), ("the array has 2 frames", "tolerance is 2", "longer")),
+        (footage(frames=1), ("the array has 1 frame and", "longer")),
+        (
+            footage()[..., None].expand(-1, -1, -1, 3),
+            ("the array", "(3, 16, 16)", "(1, 16, 16)", "same channels"),
+        ),
+        (torch.rand(40, 6), ("the array", "(6,)", "(1, 16, 16)")),
+        ("gone.npy", ("gone.npy is not there",)),
+    ],
+    ids=["short", "single", "colour", "features", "gone"],
+)
+def test_a_route_that_does_not_fit_is_named(tmp_path: Path, added: Any, words: tuple[str, ...]) -> None:
+    running = trainer(tmp_path)
+    with refused(*words):
+        running.fit(task_of(), listed([*routes()[:2], added]))
+    assert running.global_step == 0
+
+
+def test_mixed_sizes_that_nothing_brings_to_one_are_refused(tmp_path: Path) -> None:
+    pooled = nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16, 8))
+    with refused("1 has frames of (1, 20, 20)", "(1, 16, 16)", "data.resize"):
+        trainer(tmp_path).fit(task_of(backbone=pooled), listed(routes((16, 20, 16))))
+
+
+def test_templates_are_of_one_route(tmp_path: Path) -> None:
+    with refused("there are 3 routes", "SpectralMapper"):
+        trainer(tmp_path).fit(task_of(mapper=mapper()), listed(["gone", "lost", "away"]))
+
+
+# as a user of the commands meets it ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of two routes in `photos`, a third route in `third.npy`, and a training in `out`."""
+    folder = tmp_path_factory.mktemp("routes")
+    (folder / "photos").mkdir()
+    for i, route in enumerate(routes()[:2]):
+        write_images(folder / "photos" / f"day{9 + i}", np.asarray(route.values))
+    np.save(folder / "third.npy", np.asarray(routes()[2].values))
+    (folder / "train.yaml").write_text(CONFIG)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        main(["train", "fit", "--config", "train.yaml", "--data.source", "photos"])
+    return folder
+
+
+CONFIG = """
+model:
+  backbone:
+    class_path: dejavu_torch.features.cnn.SmallCNN
+    init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
+  mapper:
+    class_path: dejavu_torch.SpectralMapper
+    init_args: {route_bytes_per_place: 20}
+data: {batch_size: 20, tolerance: 2}
+trainer: {max_steps: 4, accelerator: cpu, enable_progress_bar: false, default_root_dir: out}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+
+
+def test_a_folder_of_folders_is_a_route_each(tmp_path: Path) -> None:
+    assert routes_of("photos") == ["photos/day9", "photos/day10"]
+    assert routes_of(Path("photos")) == ["photos/day9", "photos/day10"]
+    assert routes_of("photos?width=8") == ["photos/day9?width=8", "photos/day10?width=8"]
+    assert open_source(routes_of("photos?width=8")[1]).length == LENGTHS[1]
+    for whole in ("photos/day9", ".", "third.npy", "gone", "", "sim:aerial", str(tmp_path)):
+        assert routes_of(whole) == [whole]
+
+
+def test_what_is_printed_leads_to_a_map(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = str(tmp_path / "run")
+    main(
+        [
+            "train",
+            "fit",
+            "--config",
+            "train.yaml",
+            "--data.source",
+            "[photos/day9,third.npy]",
+            "--trainer.default_root_dir",
+            out,
+        ]
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert (
+        lines[-1]
+        == f"next: dejavu learn ROUTE --descriptor {out}/descriptor.safetensors --map route.safetensors"
+    )
+    words = shlex.split(lines[-1].removeprefix("next: dejavu "))
+    words = [
+        {"ROUTE": "photos/day10", "route.safetensors": str(tmp_path / "m.safetensors")}.get(w, w)
+        for w in words
+    ]
+    main([*words, "--mapper.route_bytes_per_place", "20"])
+    model = DejaVu.load(tmp_path / "m.safetensors")
+    own, base = model.features.state_dict(), DejaVu.load(Path(out) / "descriptor.safetensors").features
+    assert all(torch.equal(own[name], value) for name, value in base.state_dict().items())
+    assert model.map.places == LENGTHS[1]
+
+
+def test_a_checkpoint_gives_the_same_descriptor_again(tmp_path: Path) -> None:
+    options = [
+        "--config",
+        "train.yaml",
+        "--data.source",
+        "photos",
+        "--trainer.default_root_dir",
+        str(tmp_path),
+    ]
+    main(["train", "export", *options, "--ckpt_path", "out/checkpoints/last.ckpt"])
+    one, same = DejaVu.load(WEIGHTS), DejaVu.load(tmp_path / "descriptor.safetensors")
+    assert all(
+        torch.equal(value, same.state_dict()[name])
+        for name, value in one.state_dict().items()
+        if isinstance(value, Tensor)
+    )
+
+
+def test_info_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    run("info", WEIGHTS)
+    told = capsys.readouterr().out
+    assert "without a map" in told
+    assert "SmallCNN" in told
+    assert "trained for 4 steps" in told
+    assert f"next: dejavu learn ROUTE --descriptor {WEIGHTS}" in told
+
+
+def test_compare_learns_with_a_descriptor_of_a_map_as_well(tmp_path: Path) -> None:
+    bytes_ = ("--mapper.route_bytes_per_place", "20")
+    run("learn", "third.npy", "--map", tmp_path / "m.safetensors", "--descriptor", WEIGHTS, *bytes_)
+    for name, given in (("base", WEIGHTS), ("map", tmp_path / "m.safetensors")):
+        run("compare", "third.npy", "third.npy", "--descriptor", given, *bytes_, "--out", tmp_path / name)
+    states = [DejaVu.load(tmp_path / name / "map.safetensors").state_dict() for name in ("base", "map")]
+    assert all(torch.equal(v, states[1][n]) for n, v in states[0].items() if isinstance(v, Tensor))
+
+
+def test_a_training_starts_from_a_descriptor(tmp_path: Path) -> None:
+    task = task_of(start=WEIGHTS)
+    kept = DejaVu.load(WEIGHTS).features.state_dict()
+    assert all(torch.equal(kept[name], value) for name, value in task.dejavu.features.state_dict().items())
+    with refused("holds weights of", "the same SmallCNN"):
+        task_of(backbone=SmallCNN(9, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4), start=WEIGHTS)
+
+
+LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGHTS]
+
+
+@pytest.mark.parametrize(
+    ("words", "seen"),
+    [
+        (["localize", WEIGHTS, "third.npy", "--out", "m.csv"], ["without a map", f"--descriptor {WEIGHTS}"]),
+        (["live", WEIGHTS, "third.npy"], ["without a map", f"--descriptor {WEIGHTS}"]),
+        (["export", WEIGHTS, "--onnx", "m.onnx"], ["without a map"]),
+        (["compare", "third.npy", "third.npy", "--map", WEIGHTS, "--out", "o"], ["without a map"]),
+        ([*LEARN, "--features.cell", "4"], ["learned with", "SmallCNN"]),
+        ([*LEARN, "--preprocess.contrast", "patch"], ["--preprocess.contrast", "one or the other"]),
+        ([*LEARN, "--whitening", WEIGHTS], ["--whitening", "expected it or --descriptor"]),
+        ([*LEARN[:4], "--descriptor", "gone.safetensors"], ["gone.safetensors is not there"]),
+        ([*LEARN[:4], "--descriptor", "train.yaml"], ["train.yaml"]),
+        (["learn", "third.npy", "--map", WEIGHTS, "--descriptor", WEIGHTS], ["is what is read"]),
+        (
+            [
+                "compare",
+                "third.npy",
+                "third.npy",
+                "--map",
+                "m.safetensors",
+                "--descriptor",
+                WEIGHTS,
+                "--out",
+                "o",
+            ],
+            ["--descriptor", "--map has its own settings"],
+        ),
+        (["train", "fit", "--data.source", "photos"], ["2 routes", "SpectralMapper"]),
+        (["train", "fit", "--data.source", "[]"], ["empty list"]),
+        (
+            [*FIT, "[photos/day9,gone]"],
+            ["gone is not there"],
+        ),
+        (
+            [
+                *[
+                    "train",
+                    "test",
+                    "--config",
+                    "train.yaml",
+                    "--data.source",
+                    "photos",
+                    "--data.query",
+                    "third.npy",
+                ]
+            ],
+            ["query is of 1, the routes are 2"],
+        ),
+        (
+            [
+                *["train", "fit", "--config", "train.yaml", "--data.source", "[photos/day9,third.npy]"],
+                "--ckpt_path",
+                "out/checkpoints/last.ckpt",
+            ],
+            ["trained on photos/day9, photos/day10", "the same routes"],
+        ),
+        (
+            [
+                *["train", "export", "--config", "train.yaml", "--data.source", "[photos/day9,third.npy]"],
+                "--ckpt_path",
+                "out/checkpoints/last.ckpt",
+            ],
+            ["trained on photos/day9, photos/day10", "the same routes"],
+        ),
+    ],
+    ids=lambda given: " ".join(given)[:60],
+)
+def test_a_mistake_is_one_line(capsys: pytest.CaptureFixture[str], words: list[str], seen: list[str]) -> None:
+    error = fails(capsys, *words)
+    assert [word for word in seen if word not in error] == [], error
+    assert not Path("new.safetensors").exists()
