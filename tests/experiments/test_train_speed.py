@@ -43,7 +43,8 @@ def test_every_way_is_trained_with_every_seed(rows: list[TrainRow]) -> None:
     assert rows[0].auc != rows[1].auc
     header, *lines = train_table(rows)
     assert [line[0] for line in lines] == ["plain", "other"]
-    assert {len(line) for line in (header, *lines)} == {4}
+    assert {len(line) for line in (header, *lines)} == {5}
+    assert {line[4] for line in lines} == {"-"}  # too few bytes for so short a route
 
 
 def test_each_rung_of_the_ladder_changes_one_thing() -> None:
@@ -59,6 +60,7 @@ def test_each_rung_of_the_ladder_changes_one_thing() -> None:
             days[0] != days[1] or types[0] != types[1],
             before.precision != after.precision,
             before.lr != after.lr,
+            before.rate != after.rate,
         ]
         assert sum(changed) == 1
 
