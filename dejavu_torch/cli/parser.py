@@ -106,11 +106,14 @@ def with_made(words: Sequence[str]) -> list[str]:
         if option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS:
             path = value if equals else after
             makers[option] = path if _function_at(path) is not None else ""
+    default = not any(word.partition("=")[0] in ("--config", "-c") for word in words)
     spelt: list[str] = []
     skip = False
     for word in words:
         option, equals, _ = word.partition("=")
-        part, _, name = option.rpartition(".")
+        part = option.rpartition(".")[0]
+        if default and option in ("--features", "--model.backbone"):
+            spelt.append(f"{option}=null")  # or arguments of the default would be those of another class
         if makers.get(option):
             spelt += [f"{option}={__name__}.made", f"{option}.function={makers[option]}"]
             skip = not equals
