@@ -55,7 +55,13 @@ def features_of(*words: str) -> nn.Module:
 
 
 def test_a_function_is_called_with_what_is_typed() -> None:
-    own = ("--features.network.backbone", "R50", "--features.network.dim=3", "--features.network.out", "[2, 3]")
+    own = (
+        "--features.network.backbone",
+        "R50",
+        "--features.network.dim=3",
+        "--features.network.out",
+        "[2, 3]",
+    )
     net = features_of(*OWN, *HUB, *own, "--features.network.head=null", "--features.network.trust", "true")
     import zoo  # type: ignore[import-not-found]
 
@@ -88,9 +94,7 @@ def test_another_class_does_not_take_the_arguments_of_the_default() -> None:
     assert hog.cell == 4
 
 
-def test_the_next_line_brings_the_network_back(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("learn", ROUTE, "--map", "map.safetensors", *OWN, *HUB, "--features.layer", "0", "--features.mean=.5")
     before, _, told = capsys.readouterr().out.rpartition("next: dejavu ")
     assert "backbone 448" in before  # of 112 numbers: what lies behind the layer is not kept
@@ -134,7 +138,13 @@ def test_mistakes_are_one_line(
 def test_a_training_says_the_words_of_its_network(capsys: pytest.CaptureFixture[str]) -> None:
     made = [word.replace("--features", "--model.backbone") for word in (*OWN, *HUB)]
     made[2] = "--model.backbone.dimension=4"
-    steps = ("--trainer.max_steps", "1", "--model.mapper", "dejavu_torch.SpectralMapper", "--trainer.accelerator=cpu")
+    steps = (
+        "--trainer.max_steps",
+        "1",
+        "--model.mapper",
+        "dejavu_torch.SpectralMapper",
+        "--trainer.accelerator=cpu",
+    )
     run("train", "fit", "--data.source", ROUTE, *made, *steps, "--trainer.default_root_dir", "run")
     told = capsys.readouterr().out.splitlines()[-1]
     assert "--features zoo.load --features.repo=a/b --features.model m" in told
