@@ -75,7 +75,7 @@ def test_a_function_is_called_with_what_is_typed() -> None:
     [
         (("zoo.typed", "--features.network.width", "5"), 5),
         (("zoo.Net.pretrained", "--features.network.name", "x", "--features.network.depth=2"), 6),
-        (("torch.nn.Conv2d", *shlex.split("--features.network.in_channels 3 --features.network.out_channels 7"),
+        (("torch.nn.Conv2d", "--features.network.in_channels=3", "--features.network.out_channels", "7",
           "--features.network.kernel_size=3"), 7),
     ],
     ids=["typed", "method", "class"],

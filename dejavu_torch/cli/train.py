@@ -217,7 +217,7 @@ class TrainCLI(LightningCLI):
             trainer = super().instantiate_trainer(callbacks=own, **kwargs)
         except (ImportError, ValueError) as error:
             raise InputError(str(error)) from error
-        trainer.words = self.words
+        trainer.words = self.words  # type: ignore[attr-defined]  # a MapTrainer
         return trainer
 
     def before_fit(self) -> None:

@@ -37,10 +37,8 @@ def _traced_calls() -> OrderedDict[str, Any]:
     if torch.compiler.is_exporting() and not torch.compiler.is_dynamo_compiling():
         from torch.fx.experimental.proxy_tensor import get_proxy_mode
 
-        calls: OrderedDict[str, Any] = getattr(
-            getattr(get_proxy_mode(), "tracer", None), "module_stack", None
-        )
-        if calls is not None:
+        calls = getattr(getattr(get_proxy_mode(), "tracer", None), "module_stack", None)
+        if isinstance(calls, OrderedDict):
             return calls
     return OrderedDict()
 
