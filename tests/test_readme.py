@@ -26,6 +26,7 @@ SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
 REJECTION = (ROOT / "docs" / "rejection.md").read_text()
 STORAGE = (ROOT / "docs" / "storage.md").read_text()
 LIVE = (ROOT / "docs" / "live.md").read_text()
+PRETRAINED = (ROOT / "docs" / "pretrained.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 OPTIONS = [
     option
@@ -97,6 +98,19 @@ def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
     shown += [line for line in re.findall(r"`(dejavu [^`]+)`", text) if " -" in line and "--help" not in line]
     assert len(shown) >= 2
+    for line in shown:
+        understand(line)
+
+
+def test_every_command_on_pretrained_networks_is_understood() -> None:
+    """With the words that its shell puts in; what is loaded is not asked for here."""
+    pytest.importorskip("efficientnet_lite_pytorch")
+    text = PRETRAINED.replace("\\\n", " ").replace("$weights", "weights.pth")
+    (lite,) = re.findall(r'^lite="(.*)"$', text, re.MULTILINE)
+    (road,) = re.findall(r"^road=\((.*)\)$", text, re.MULTILINE)
+    text = text.replace("$lite", lite).replace('"${road[@]}"', road)
+    shown = re.findall(r"^dejavu .*$", text, re.MULTILINE)
+    assert len(shown) == 8
     for line in shown:
         understand(line)
 

@@ -17,7 +17,7 @@ from torch import nn
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
-from dejavu_torch.database.recipe import recipe_of
+from dejavu_torch.database.recipe import recipe_of, with_parts
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision, check_sizes
@@ -631,15 +631,33 @@ def _load_map(path: Path, features: nn.Module | None = None) -> DejaVu:
 
 
 def _features_of(model: DejaVu, command: str) -> list[str]:
-    """The options of a later command for features that are not this package's, with their own options in this
-    one."""
-    name = recipe_of(model.features, REGISTRY).class_path
+    """The options of a later command for features that are not this package's, or that have such parts."""
+    return features_words(model, shlex.split(command), "--features")
+
+
+def features_words(model: DejaVu, words: Sequence[str], option: str) -> list[str]:
+    """The options `--features ..` of a later command, where a map cannot bring its features back itself.
+
+    Args:
+        words: of this command, in which `option` says what the features are.
+    """
+    foreign = [one.class_path for one in with_parts(recipe_of(model.features, REGISTRY))]
+    foreign = [name for name in foreign if name not in REGISTRY]
+    if not foreign:
+        return []
     told = [
         word
-        for before, word in pairwise(shlex.split(command))
-        if word.startswith("--features.") or (before.startswith("--features.") and "=" not in before)
+        for before, word in pairwise(["", *words])
+        if _of(word, option) or (_of(before, option) and "=" not in before)
     ]
-    return [] if name in REGISTRY else ["--features", name, *told]
+    named = any(word.partition("=")[0] == option for word in told)
+    told = [f"--features{word.removeprefix(option)}" if _of(word, option) else word for word in told]
+    return told if named else ["--features", foreign[0], *told]  # a config file has named it
+
+
+def _of(word: str, option: str) -> bool:
+    """Whether a word is this option, or of its part."""
+    return f"{word}.".startswith((f"{option}.", f"{option}="))
 
 
 def _check_report_folder(

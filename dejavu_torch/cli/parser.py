@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pydoc
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
+from torch import nn
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
@@ -36,6 +38,7 @@ HINT = (
     "`dejavu train` makes of several routes."
 )
 MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
+NETWORKS = ("features", "backbone", "network")  # options that name a class, or a function that makes one
 LONGEST = 300  # characters of a message that is told whole
 
 
@@ -68,6 +71,62 @@ def whole_numbers(value: object) -> Iterator[int]:
             yield from whole_numbers(part)
 
 
+def made(function: str, **arguments: Any) -> nn.Module:
+    """What a function makes, such as torch.hub.load, of any signature: `Parser` writes a command line so.
+
+    Args:
+        function: its import path, as the user typed it; no map or checkpoint gets here.
+    """
+    maker = _function_at(function)
+    if maker is None:
+        raise InputError(f"{function} is no function that can be imported; expected one, or a class")
+    network = maker(**arguments)
+    if not isinstance(network, nn.Module):
+        raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
+    return network
+
+
+def _function_at(path: str) -> Callable[..., Any] | None:
+    """The function or method of such a name; None where there is none."""
+    try:
+        found = pydoc.locate(path) if "." in path else None
+    except pydoc.ErrorDuringImport:  # the parser says so
+        return None
+    return found if inspect.isroutine(found) else None
+
+
+def with_made(words: Sequence[str]) -> list[str]:
+    """The command line with what `made` makes where it names a function in place of a class.
+
+    `--features timm.create_model --features.model_name NAME` is the name's call; jsonargparse itself takes
+    functions only whose return value and arguments are annotated.
+    """
+    makers = {}
+    for word, after in pairwise([*words, ""]):
+        option, equals, value = word.partition("=")
+        if option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS:
+            path = value if equals else after
+            makers[option] = path if _function_at(path) is not None else ""
+    default = not any(word.partition("=")[0] in ("--config", "-c") for word in words)
+    spelt: list[str] = []
+    skip = False
+    for word in words:
+        option, equals, _ = word.partition("=")
+        part = option.rpartition(".")[0]
+        if default and option in ("--features", "--model.backbone"):
+            spelt.append(f"{option}=null")  # or arguments of the default would be those of another class
+        if makers.get(option):
+            spelt += [f"{option}={__name__}.made", f"{option}.function={makers[option]}"]
+            skip = not equals
+        elif skip:
+            skip = False
+        elif makers.get(part):
+            spelt.append(f"{part}.dict_kwargs.{word.removeprefix(part + '.')}")
+        else:
+            spelt.append(word)
+    return spelt
+
+
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
     """Help without the list of every class that is installed."""
 
@@ -87,7 +146,7 @@ class Parser(jsonargparse.ArgumentParser):
         self, args: Sequence[str] | None = None, *rest: Any, **settings: Any
     ) -> Any:
         # a null for a part of a part is handed to the parser of that part as None
-        words = args and [f"{word[:-4]}null" if word.endswith("=None") else word for word in args]
+        words = args and with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args])
         parsed = super().parse_args(words, *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
             if any(abs(number) > LARGEST for number in whole_numbers(value)):

@@ -19,10 +19,12 @@ from pytorch_lightning import LightningModule, Trainer
 from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
-from dejavu_torch.cli.commands import print_map
+from dejavu_torch.cli.commands import features_words, print_map
 from dejavu_torch.cli.parser import Parser, refusal
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
+from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
@@ -78,6 +80,8 @@ log = logging.getLogger("dejavu_torch")
 class MapTrainer(Trainer):
     """Lightning's trainer, which also writes the map of a checkpoint."""
 
+    words: Sequence[str] = ()  # of the command line, for what to do next
+
     def export(
         self,
         model: PlaceRecognitionTask,
@@ -104,7 +108,7 @@ class MapTrainer(Trainer):
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
         export.write(model, folder, datamodule.reference if model.made else None)
-        print_written(export, datamodule)
+        print_written(export, datamodule, self.words)
 
 
 class TrainParser(Parser, LightningArgumentParser):
@@ -211,9 +215,11 @@ class TrainCLI(LightningCLI):
             )
             kwargs["precision"] = "32-true"
         try:
-            return super().instantiate_trainer(callbacks=own, **kwargs)
+            trainer = super().instantiate_trainer(callbacks=own, **kwargs)
         except (ImportError, ValueError) as error:
             raise InputError(str(error)) from error
+        trainer.words = self.words  # type: ignore[attr-defined]  # a MapTrainer
+        return trainer
 
     def before_fit(self) -> None:
         """Refuse ahead of the work what cannot work."""
@@ -247,7 +253,7 @@ class TrainCLI(LightningCLI):
         finally:
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, MapExport):
-                    print_written(callback, self.datamodule)
+                    print_written(callback, self.datamodule, self.words)
             last = self._last_checkpoint()
             if self.trainer.interrupted and last is not None and not refused:
                 print(f"to go on: {shlex.join(['dejavu', 'train', *self.words, '--ckpt_path', str(last)])}")
@@ -305,7 +311,7 @@ class TrainCLI(LightningCLI):
         written = Path(self.trainer.default_root_dir) / self._written
         print(f"figures of {checkpoint}")
         if written.is_file():
-            print_next(written, self.datamodule)
+            print_next(written, self.datamodule, self.model.dejavu, self.words)
         else:
             words = ["export", *self.words[1:], "--ckpt_path", checkpoint]
             print(f"next: {shlex.join(['dejavu', 'train', *words])}")
@@ -351,24 +357,33 @@ def _listed(given: Any) -> list[Any]:
     return [*given] if isinstance(given, list) else [] if given is None else [given]
 
 
-def print_written(export: MapExport, data: RouteData) -> None:
+def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> None:
     """What was written, and what to do next."""
     if export.written is not None:
         path, model = export.written
         print_map(model)
         worth = "; only a second traverse shows what it is worth:" if model.map.places else ""
         print(f"written to {path}{worth}")
-        print_next(path, data)
+        print_next(path, data, model, words)
 
 
-def print_next(path: Path, data: RouteData) -> None:
-    """How to see what a map is worth, or to make one with a descriptor."""
+def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str]) -> None:
+    """How to see what a map is worth, or to make one with a descriptor.
+
+    Args:
+        words: of the command line, which say where a backbone comes from that no map may name.
+    """
+    option = "--model.backbone"
+    if type(model.features) is Embedding:  # the map has its settings, all but those of the network
+        option += ".network"
+    features = shlex.join(["", *features_words(model, words, option)])[2:]
     if len(data.listed["source"]) > 1:
-        print(f"next: dejavu learn ROUTE --descriptor {shlex.quote(str(path))} --map route.safetensors")
+        made = f"--descriptor {shlex.quote(str(path))}{features} --map route.safetensors"
+        print(f"next: dejavu learn ROUTE {made}")
         return
     known = [data.sources[name] for name in ("validation", "query") if data.sources[name]]
     reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], [*known, "SECOND"][0]))
-    print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))} --out report")
+    print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))}{features} --out report")
 
 
 def run_train(arguments: Sequence[str]) -> None:

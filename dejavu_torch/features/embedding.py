@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
 from dejavu_torch.features.extract import in_mode
+from dejavu_torch.features.layer import run, up_to
 from dejavu_torch.features.preprocess import select_channel
 from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.resize import check_size, resize_frames
@@ -104,7 +105,8 @@ class Embedding(nn.Module):
 
     Args:
         network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K) or vectors (B,K), such as
-            `kornia.feature.HardNet()`, which takes 1 channel of 32 x 32.
+            `kornia.feature.HardNet()`, which takes 1 channel of 32 x 32. Of a list, tuple or dict of such
+            the last counts.
         dimension: D, number of features; None gives the pooled output itself.
         channels: that the network takes, 3 or 1; grey frames are repeated, colours become luminance.
         resize: (height, width) in pixels that frames are brought to, antialiased.
@@ -112,21 +114,33 @@ class Embedding(nn.Module):
         cell: of `local_contrast` ahead of the network, pixels; 0 leaves the contrast as it is.
         hidden: width of the hidden layer of a `Coder`, which replaces the linear layer; 0 has none.
         noise, kept: of the `Coder`.
+        layer: name of the submodule of the network, as in `named_modules`, whose output is taken for that of
+            the network; what lies behind it is neither computed nor kept, see `up_to`. None is all of it.
+        mean, std: of each channel, or one number for all, subtracted from the frames in [0, 1] and divided
+            out last ahead of the network; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet
+            trained. None is 0, and 1.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
     Convention: tokens (B,T,K), as transformers give, are averaged. The network's output shape is found by
-        running it once on a black frame, in eval mode.
+        running it once on a frame, in eval mode.
 
     Raises:
-        InputError: settings out of range, a network that cannot take such frames or gives neither maps
-            nor vectors; forward: frames that are neither grey nor colour.
+        InputError: settings out of range, a network that cannot take such frames, has no such layer or gives
+            neither maps nor vectors; forward: frames that are neither grey nor colour, a network that gives
+            another number of channels than before.
 
     Example:
         >>> net = Embedding(nn.Conv2d(1, 4, 3), dimension=8, channels=1, resize=(16, 16), grid=2)
         >>> net(torch.rand(2, 3, 32, 32)).shape
         torch.Size([2, 8])
+        >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
+        >>> Embedding(blocks, dimension=None, layer="0", mean=0.5, std=0.5)(torch.rand(2, 1, 32, 32)).shape
+        torch.Size([2, 4])
     """
+
+    offset: Tensor
+    factor: Tensor
 
     def __init__(
         self,
@@ -139,8 +153,13 @@ class Embedding(nn.Module):
         hidden: int = 0,
         noise: float = 1.0,
         kept: int = 128,
+        layer: str | None = None,
+        mean: float | list[float] | None = None,
+        std: float | list[float] | None = None,
     ) -> None:
         super().__init__()
+        if not isinstance(network, nn.Module):
+            raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
         check_size(resize, 1, "Embedding got resize")
         least = min(grid, 1 if dimension is None else dimension)
         if least < 1 or grid > WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
@@ -151,7 +170,6 @@ class Embedding(nn.Module):
             )
         if dimension is None and hidden:
             raise InputError(f"Embedding got hidden={hidden}, but no dimension; expected both, or neither")
-        self.network = network
         self.dimension = dimension
         self.channels = channels
         self.resize = (int(resize[0]), int(resize[1]))  # a map gives a list
@@ -160,16 +178,23 @@ class Embedding(nn.Module):
         self.hidden = hidden
         self.noise = noise
         self.kept = kept
-        black = torch.zeros(1, channels, *self.resize)
+        self.layer, self.mean, self.std = layer, mean, std
+        # the settings say the same
+        self.register_buffer("offset", _of_channels("mean", mean, channels, 0.0), persistent=False)
+        self.register_buffer("factor", 1 / _of_channels("std", std, channels, 1.0), persistent=False)
+        size = (1, channels, *self.resize)
+        frame = torch.linspace(0, 1, math.prod(size)).view(size)
         try:
-            with torch.no_grad(), in_mode(network, False):
-                output = network(black)
+            self.network = network if layer is None else up_to(network, layer, frame)
+            with torch.no_grad(), in_mode(self.network, False):
+                output = run(self.network, frame)
+        except InputError:
+            raise
         except Exception as error:  # a network may raise anything
             raise InputError(
-                f"{type(network).__name__} does not take frames {tuple(black.shape)}: "
-                f"{' '.join(str(error).split())}"
+                f"{type(network).__name__} does not take frames {size}: {' '.join(str(error).split())}"
             ) from error
-        inputs = self._pooled(output).shape[1]
+        self.inputs = inputs = self._pooled(output).shape[1]
         self.linear: nn.Module = nn.Identity()
         self.standardise: nn.Module = nn.Identity()
         if dimension is not None:
@@ -179,6 +204,8 @@ class Embedding(nn.Module):
 
     def _pooled(self, output: object) -> Tensor:
         """The network's output, one row per frame."""
+        while isinstance(output, (list, tuple, dict)) and output:
+            output = [*(output.values() if isinstance(output, dict) else output)][-1]
         if isinstance(output, Tensor) and output.ndim == 4:
             return nn.functional.adaptive_avg_pool2d(output, self.grid).flatten(1)
         if isinstance(output, Tensor) and output.ndim == 3:
@@ -197,7 +224,8 @@ class Embedding(nn.Module):
 
     def without_code(self) -> Embedding:
         """An Embedding of the same network that gives the descriptor itself."""
-        return Embedding(self.network, None, self.channels, self.resize, self.grid, self.cell)
+        settings = {name: getattr(self, name) for name in ("layer", "mean", "std")}
+        return Embedding(self.network, None, self.channels, self.resize, self.grid, self.cell, **settings)
 
     def describe(self, frames: Tensor) -> Tensor:
         """Descriptors, the pooled output of the network: (B,C,H,W) -> (B,K)."""
@@ -211,7 +239,15 @@ class Embedding(nn.Module):
         frames = frames.to(weight.dtype) if weight.is_floating_point() else frames
         if self.cell:
             frames = local_contrast(frames, self.cell)
-        return self._pooled(self.network(frames))
+        if self.mean is not None or self.std is not None:
+            frames = (frames - self.offset.to(frames)) * self.factor.to(frames)
+        descriptors = self._pooled(run(self.network, frames))
+        if descriptors.shape[1] != self.inputs:
+            raise InputError(
+                f"{type(self.network).__name__} made {descriptors.shape[1]} numbers of each of "
+                f"{len(frames)} frames; expected {self.inputs}, as of the frame that it was tried out with"
+            )
+        return descriptors
 
     def code(self, descriptors: Tensor) -> Tensor:
         """Features of descriptors: (B,K) -> (B,D)."""
@@ -225,5 +261,17 @@ class Embedding(nn.Module):
     def extra_repr(self) -> str:
         return (
             f"dimension={self.dimension}, channels={self.channels}, resize={self.resize}, grid={self.grid}, "
-            f"cell={self.cell}, hidden={self.hidden}"
+            f"cell={self.cell}, hidden={self.hidden}, layer={self.layer}, mean={self.mean}, std={self.std}"
         )
+
+
+def _of_channels(name: str, given: float | list[float] | None, channels: int, default: float) -> Tensor:
+    """(channels,1,1), of numbers, or one number for all."""
+    numbers = [default if given is None else given] if not isinstance(given, (list, tuple)) else [*given]
+    least = -math.inf if name == "mean" else 0.0
+    if len(numbers) not in (1, channels) or not all(least < number < math.inf for number in numbers):
+        raise InputError(
+            f"Embedding got {name}={given}; expected a number for each of {channels} channels, or one for "
+            f"all{', above 0' if name == 'std' else ''}"
+        )
+    return torch.tensor(numbers).float().expand(channels).clone().view(channels, 1, 1)

@@ -181,11 +181,9 @@ class WhiteningStage(Stage):
     """The descriptor is whitened by what the augmentation and a second traverse change in it; no steps."""
 
     def end(self, task: PlaceRecognitionTask) -> None:
-        embedding = embedding_of(task)
         task.views = describe_views(task)
-        with in_mode(embedding, False):
-            places = stored_features(task, descriptor_of(task))
-        _coder(embedding).whiten(task.views.descriptors, places[task.views.positives[:, 0]])
+        shown = place_descriptors(task)[task.views.positives[:, 0]]
+        _coder(embedding_of(task)).whiten(task.views.descriptors, shown)
 
 
 class CodeStage(Stage):
@@ -314,6 +312,14 @@ def _check_map(task: PlaceRecognitionTask, places: int, dimension: int) -> None:
     task.dejavu.mapper(torch.randn(places, numbers, generator=torch.Generator().manual_seed(0)))
 
 
+def place_descriptors(task: PlaceRecognitionTask) -> Tensor:
+    """Descriptors of the stored reference frames, (N,K), of a network that is trained no more: made once."""
+    if task.places is None:
+        with in_mode(embedding_of(task), False):
+            task.places = stored_features(task, descriptor_of(task))
+    return task.places
+
+
 def make_map(task: PlaceRecognitionTask) -> None:
     """Learn the whitening and the map of the present descriptors, in closed form.
 
@@ -331,30 +337,55 @@ def make_map(task: PlaceRecognitionTask) -> None:
         model.learn_features(model.whitened(features), alone)
 
 
-@torch.no_grad()
 def stored_features(
     task: PlaceRecognitionTask, describe: Callable[[Tensor], Tensor], shuffled: bool = False
 ) -> Tensor:
-    """Features of the stored reference frames, in 32 bits and in their order.
+    """Features of the stored reference frames, as of `in_batches`.
 
     Args:
         describe: makes features of frames.
-        shuffled: whether batches hold frames from all over the route, as those of training do, so that
-            running statistics can be gathered from them.
-
-    Shape: -> (N,D).
 
     Raises:
         InputError: a backbone that does not take the frames, or makes NaN.
     """
     frames = task.data.sets["reference"]
-    order = torch.randperm(len(frames)) if shuffled else torch.arange(len(frames))
-    count = min(-(-len(order) // task.dejavu.batch_size), len(order) // 2)  # none of a single frame
+
+    def make(index: Tensor) -> Tensor:
+        return described(task, frames[index.tolist()].frames, describe)
+
+    return in_batches(task, len(frames), make, shuffled)
+
+
+def coded_places(task: PlaceRecognitionTask, shuffled: bool) -> Tensor:
+    """The same of the descriptors that are kept: the code alone is run."""
+    code, places = embedding_of(task).code, place_descriptors(task)
+    with torch.autocast(task.device.type, enabled=False):
+        return in_batches(task, len(places), lambda index: code(places[index.to(places.device)]), shuffled)
+
+
+@torch.no_grad()
+def in_batches(
+    task: PlaceRecognitionTask, count: int, make: Callable[[Tensor], Tensor], shuffled: bool
+) -> Tensor:
+    """What is made of so many places, batch by batch, in 32 bits and in their order.
+
+    Args:
+        make: of some of the places, (B,) int64 -> (B,D).
+        shuffled: whether batches hold places from all over the route, as those of training do, so that
+            running statistics can be gathered from them.
+
+    Shape: -> (count,D).
+
+    Raises:
+        InputError: NaN.
+    """
+    order = torch.randperm(count) if shuffled else torch.arange(count)
+    batches = min(-(-count // task.dejavu.batch_size), count // 2)  # none of a single frame
     features = torch.zeros(0, device=task.device)
-    for batch in order.tensor_split(count):
-        part = described(task, frames[batch.tolist()].frames, describe)
+    for batch in order.tensor_split(batches):
+        part = make(batch)
         if not len(features):
-            features = part.new_empty(len(frames), part.shape[1])
+            features = part.new_empty(count, part.shape[1])
         features[batch.to(task.device)] = part
     if not features.isfinite().all():
         name, maker = task.data.route_name, type(task.dejavu.features).__name__

@@ -37,6 +37,7 @@ from dejavu_torch.training.stages import (
     CodeStage,
     Stage,
     Views,
+    coded_places,
     has_descriptor,
     make_map,
     stages_of,
@@ -169,6 +170,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.index = 0  # of the stage
         self.began = 0  # the step at which it began
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
+        self.places: Tensor | None = None  # its descriptors of the reference
         self.metric: PlaceRecognition | None = None  # `setup` makes it
         self.steps = 0  # of the training that a checkpoint comes from
         self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
@@ -243,7 +245,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             log.warning("these are ready features: the backbone is left out")
             self.dejavu.features = HOG()  # has nothing to store
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
-        self.began, self.views = 0, None  # a further training describes its own frames
+        self.began, self.views, self.places = 0, None, None  # a further training describes its own frames
 
     # the map
 
@@ -263,7 +265,10 @@ class PlaceRecognitionTask(pl.LightningModule):
     def _start_templates(self) -> None:
         first, weights = not self.route.places, self.route.weights
         with in_mode(self, first):
-            features = stored_features(self, self.dejavu.describe, shuffled=first)
+            if has_descriptor(self.dejavu.features):
+                features = coded_places(self, shuffled=first)
+            else:
+                features = stored_features(self, self.dejavu.describe, shuffled=first)
         self.dejavu.learn_features(features, self.data.reference)
         if not self.route.plan:
             raise InputError(

@@ -194,8 +194,8 @@ def test_of_tokens_the_mean_counts() -> None:
     [
         (lambda frames: frames[..., None], "(1, 3, 96, 96, 1)"),
         (lambda frames: frames.mean(), "()"),
-        (lambda frames: [frames], "list"),
-        (lambda frames: {"maps": frames}, "dict"),
+        (lambda frames: [], "list"),
+        (lambda frames: {"maps": frames, "sizes": "96"}, "str"),
     ],
 )
 def test_a_network_that_makes_neither_maps_nor_vectors_is_refused(
@@ -203,6 +203,62 @@ def test_a_network_that_makes_neither_maps_nor_vectors_is_refused(
 ) -> None:
     with refused(f"Maker made {seen}", "expected maps (B,K,h,w) or vectors (B,K)"):
         Embedding(Maker(make))
+
+
+@pytest.mark.parametrize(
+    "make", [lambda maps: [maps[0], maps[1]], tuple, lambda maps: {"fine": maps[0], "coarse": (maps[1],)}]
+)
+def test_of_several_outputs_the_last_counts(make: Callable[[list[Tensor]], Any]) -> None:
+    def maps(frames: Tensor) -> list[Tensor]:
+        return [frames, 2 * frames[:, :2, ::2, ::2]]
+
+    frames = torch.rand(4, 3, 96, 96)
+    several = Embedding(Maker(lambda f: make(maps(f))), dimension=None)
+    torch.testing.assert_close(several(frames), maps(frames)[1].mean((2, 3)))
+
+
+def test_a_network_that_changes_its_output_size_is_refused() -> None:
+    network = Maker(lambda frames: frames[:, :2].mean((2, 3)))
+    net = Embedding(network, dimension=None)
+    network.make = lambda frames: frames.mean((2, 3))
+    with refused("Maker made 3 numbers", "expected 2"):
+        net(torch.rand(4, 3, 96, 96))
+
+
+def test_mean_and_deviation_are_taken_out_last() -> None:
+    frames = torch.rand(2, 3, 12, 16)
+    net = plain(mean=[0.1, 0.2, 0.3], std=0.5, cell=4).eval()
+    assert set(net.state_dict()) == set(plain().state_dict())
+    other = plain(cell=4).eval()
+    other.load_state_dict(net.state_dict())
+    mean = torch.tensor([0.1, 0.2, 0.3])[:, None, None]
+    other.cell = 0
+    expected = other((local_contrast(frames, 4) - mean) / 0.5)
+    torch.testing.assert_close(net(frames), expected)
+
+
+@pytest.mark.parametrize("settings", [{"mean": [0.5, 0.5]}, {"std": 0.0}, {"std": [1.0, 1.0, -1.0]}], ids=str)
+def test_a_mean_of_other_channels_is_refused(settings: dict[str, Any]) -> None:
+    name, value = next(iter(settings.items()))
+    with refused(f"{name}={value}", "3 channels"):
+        plain(**settings)
+
+
+def test_what_is_no_network_is_refused() -> None:
+    with refused("function", "nn.Module"):
+        Embedding(nn.functional.relu)  # type: ignore[arg-type]
+
+
+def test_a_map_brings_a_layer_back(tmp_path: Path) -> None:
+    def network() -> SmallCNN:
+        return SmallCNN(dimension=7, resize=(16, 16), widths=(4, 8))
+
+    frames = torch.rand(20, 3, 24, 24)
+    net = Embedding(network(), None, layer="convolutions.0", mean=0.4, std=[0.2, 0.3, 0.4])
+    model = DejaVu(net).learn(frames)
+    model.save(tmp_path / "map.safetensors")
+    again = DejaVu.load(tmp_path / "map.safetensors")
+    assert torch.equal(again(frames), model(frames))
 
 
 @pytest.mark.parametrize("shape", [(2, 2, 8, 8), (2, 4, 8, 8), (3, 8, 8)])

