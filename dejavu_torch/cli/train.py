@@ -31,6 +31,7 @@ from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport
 from dejavu_torch.training.precision import has_bf16
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
+from dejavu_torch.training.worth import better
 from dejavu_torch.types import InputError
 
 RANGES = {  # of numbers that Lightning takes as they are, and fails on later
@@ -358,13 +359,32 @@ def _listed(given: Any) -> list[Any]:
 
 
 def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> None:
-    """What was written, and what to do next."""
-    if export.written is not None:
-        path, model = export.written
-        print_map(model)
-        worth = "; only a second traverse shows what it is worth:" if model.map.places else ""
-        print(f"written to {path}{worth}")
-        print_next(path, data, model, words)
+    """What was written, what it is worth where that is known, and what to do next."""
+    if export.written is None:
+        return
+    path, model = export.written
+    print_map(model)
+    if export.scores:
+        print(f"written to {path}; on {unseen_of(data)}, within {data.tolerance}:")
+        for name, one in export.scores.items():
+            print(f"  {name:20} AUC {one.auc:.3f}, recall@1 {one.recall_at_1:.3f}")
+        if beaten := better(export.scores):
+            source = shlex.quote(str(data.sources["source"]))
+            told = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
+            log.warning(told, " and ".join(beaten), source)
+    elif model.map.places:
+        print(
+            f"written to {path}; trained on changed copies of its own frames, which no other day is: only a "
+            "second traverse shows what it is worth:"
+        )
+    else:
+        print(f"written to {path}")
+    print_next(path, data, model, words)
+
+
+def unseen_of(data: RouteData) -> Any:
+    """The traverse to validate on, else the one to test on, as it was given; None where there is neither."""
+    return data.sources["validation"] or data.sources["query"]
 
 
 def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str]) -> None:
@@ -381,8 +401,7 @@ def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str])
         made = f"--descriptor {shlex.quote(str(path))}{features} --map route.safetensors"
         print(f"next: dejavu learn ROUTE {made}")
         return
-    known = [data.sources[name] for name in ("validation", "query") if data.sources[name]]
-    reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], [*known, "SECOND"][0]))
+    reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], unseen_of(data) or "SECOND"))
     print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))}{features} --out report")
 
 

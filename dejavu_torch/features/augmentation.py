@@ -14,6 +14,7 @@ LARGEST: dict[str, tuple[float, ...]] = {
     "rotation": (180,),
     "shift": (1, 1),
     "scale": (0.9,),
+    "perspective": (45,),
     "exposure": (1, 1),
     "gamma": (10,),
     "illumination": (1,),
@@ -30,7 +31,7 @@ class Augmentation(nn.Module):
 
     Every argument is the largest strength of one kind of change; what happens to a clip is drawn
     uniformly up to it, and 0 switches the kind off. They act in this order; warp stands for rotation,
-    shift and scale together.
+    shift, scale and perspective together.
 
     Args:
         colour: per channel, (gain, offset): x * (1 +- gain) +- offset, both at most 1. A grey frame
@@ -40,6 +41,8 @@ class Augmentation(nn.Module):
         shift: (horizontal, vertical), fractions of the width and of the height, at most 1: lateral
             displacement; small yaw and pitch of a camera that looks ahead.
         scale: fraction, 1 +- scale, at most 0.9: height above the ground, focal length.
+        perspective: degrees, at most 45, about the vertical and about the horizontal axis: the middle of the
+            frame is seen from another side, as from a camera in the hand; see `seen_aslant`.
         exposure: all channels alike, (gain, offset): (x +- offset) * (1 +- gain), both at most 1, clamped
             to [0, 1] after each step. Always acts.
         gamma: x ** g with g from 1 / (1 + gamma) to 1 + gamma. Acts on 7 clips of 10.
@@ -82,6 +85,7 @@ class Augmentation(nn.Module):
         blur: float = 1.2,
         occlusion: float = 0.4,
         noise: float = 0.03,
+        perspective: float = 0.0,
     ) -> None:
         super().__init__()
         given = locals()
@@ -130,13 +134,16 @@ class Augmentation(nn.Module):
             return torch.rand(count, device=device) < chance
 
         (across, along), (gain, offset) = self.strengths["shift"], self.strengths["exposure"]
-        turn, zoom, gamma = (self._of(name) for name in ("rotation", "scale", "gamma"))
-        if turn or across or along or zoom:
+        turn, zoom, gamma, slant = (self._of(name) for name in ("rotation", "scale", "gamma", "perspective"))
+        if turn or across or along or zoom or slant:
             angle = drawn(-turn, turn).deg2rad()
             moved = torch.stack([drawn(-across, across), drawn(-along, along)], 1)
+            chosen, scale = happens(WARPED), drawn(1 - zoom, 1 + zoom)
+            # drawn where there is any, so that the others stay as they are without
+            slants = torch.stack([drawn(-slant, slant), drawn(-slant, slant)], 1) if slant else None
             clips = torch.where(
-                _each(happens(WARPED)),
-                warped(clips, angle, moved, drawn(1 - zoom, 1 + zoom)),
+                _each(chosen),
+                warped(clips, angle, moved, scale, None if slants is None else slants.deg2rad()),
                 clips,
             )
         if offset:
@@ -194,20 +201,41 @@ def _checked(name: str, value: object) -> tuple[float, ...]:
     return numbers
 
 
-def warped(clips: Tensor, angle: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
-    """Clips (B,T,C,H,W) turned by `angle` (B,) radians, enlarged by `scale` (B,), and shifted by `shift`
-    (B,2), fractions of width and height; the border is repeated."""
-    images, aspect = clips.flatten(1, 2), clips.shape[-2] / clips.shape[-1]
+def warped(
+    clips: Tensor, angle: Tensor, shift: Tensor, scale: Tensor, slants: Tensor | None = None
+) -> Tensor:
+    """Clips (B,T,C,H,W) turned by `angle` (B,) radians, enlarged by `scale` (B,), shifted by `shift` (B,2),
+    fractions of width and height, and `seen_aslant` by `slants` (B,2); the border is repeated."""
+    images, (height, width) = clips.flatten(1, 2), clips.shape[-2:]
+    aspect = height / width
     # of the middle of each pixel, the frame being -1..1
-    y, x = (torch.arange(1 - n, n, 2, dtype=clips.dtype, device=clips.device) / n for n in clips.shape[-2:])
-    x = (x - 2 * shift[:, :1])[:, None, :, None]
-    y = (y - 2 * shift[:, 1:])[:, :, None, None]
+    y, x = (torch.arange(1 - n, n, 2, dtype=clips.dtype, device=clips.device) / n for n in (height, width))
+    x, y = x[None, None, :, None], y[None, :, None, None]
+    if slants is not None:
+        x, y = seen_aslant(x, y, slants[:, :, None, None, None], height, width)
+    x = x - 2 * shift[:, :1, None, None]
+    y = y - 2 * shift[:, 1:, None, None]
     cos, sin = angle.cos() / scale, angle.sin() / scale
     along_x = torch.stack([cos, sin / aspect], 1)[:, None, None]
     along_y = torch.stack([-aspect * sin, cos], 1)[:, None, None]
     grid = (x * along_x).add(y * along_y)
     sampled = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
     return sampled.view(clips.shape)
+
+
+def seen_aslant(x: Tensor, y: Tensor, slants: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Where points of a frame lie in another that shows the same plane from straight ahead.
+
+    The plane is turned by `slants` (B,2,...), radians about its vertical and its horizontal axis, at a
+    distance of the longer side of the frame, which is the focal length too: 53 degrees across that side.
+    x, y: with the frame being -1..1.
+    """
+    longest = max(height, width)
+    u, v = x * (width / longest / 2), y * (height / longest / 2)
+    (cos_u, cos_v), (sin_u, sin_v) = slants.cos().unbind(1), slants.sin().unbind(1)
+    depth = 1 + v * (sin_v * cos_u) - u * sin_u  # above 0 up to 45 degrees
+    across, along = (u * cos_u + v * (sin_v * sin_u)) / depth, v * cos_v / depth
+    return across * (2 * longest / width), along * (2 * longest / height)
 
 
 def blurred(clips: Tensor, sigma: Tensor, radius: int) -> Tensor:

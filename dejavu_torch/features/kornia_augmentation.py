@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from kornia.augmentation import (
     RandomAffine,
     RandomBrightness,
@@ -13,9 +14,10 @@ from kornia.augmentation import (
     RandomLinearIllumination,
     VideoSequential,
 )
+from kornia.geometry.transform import warp_perspective
 from torch import Tensor, nn
 
-from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.features.augmentation import WARPED, Augmentation
 
 
 class KorniaAugmentation(Augmentation):
@@ -54,5 +56,23 @@ class KorniaAugmentation(Augmentation):
 
     def _as_on_another_day(self, clips: Tensor) -> Tensor:
         (steps,) = self._steps
+        slant = self._of("perspective")
+        if slant:
+            drawn = (2 * torch.rand(len(clips), 2, device=clips.device) - 1) * slant
+            chosen = torch.rand(len(clips), 1, device=clips.device) < WARPED
+            clips = slanted(clips, (drawn * chosen).deg2rad())
         changed: Tensor = steps(clips)
         return changed
+
+
+def slanted(clips: Tensor, slants: Tensor) -> Tensor:
+    """Clips (B,T,C,H,W) seen aslant by (B,2) radians, as in `Augmentation`, by kornia."""
+    height, width = clips.shape[-2:]
+    (cos_u, cos_v), (sin_u, sin_v) = slants.cos().unbind(1), slants.sin().unbind(1)
+    none, one, away = torch.zeros_like(cos_u), torch.ones_like(cos_u), float(max(height, width))
+    to_middle = clips.new_tensor([[1, 0, (width - 1) / 2], [0, 1, (height - 1) / 2], [0, 0, 1]])
+    plane = [cos_u, sin_v * sin_u, none, none, cos_v, none, -sin_u / away, sin_v * cos_u / away, one]
+    seen = to_middle @ torch.stack(plane, 1).view(-1, 3, 3) @ to_middle.inverse()  # of each pixel: its source
+    images, size = clips.flatten(1, 2), (height, width)
+    warped = warp_perspective(images, seen.inverse(), size, padding_mode="border", align_corners=True)
+    return warped.view(clips.shape)

@@ -275,6 +275,21 @@ class RouteData(LightningDataModule):
         smaller = self._wanted and len(shape) == 3 and math.prod(self._wanted) < math.prod(shape[1:])
         return self._wanted if smaller or self.resize is not None else None
 
+    def unseen(self) -> tuple[Traverse, GroundTruth] | None:
+        """The traverse to validate on, else the one to test on, and its places; None without either."""
+        name = next((name for name in ("validation", "query") if self.sources[name] is not None), None)
+        if name is None:
+            return None
+        if name not in self.sets:
+            self.sets[name] = self._read(name)
+        return self._opened(name), self.sets[name].truth
+
+    def _opened(self, name: str, i: int = 0) -> Traverse:
+        """Another traverse of route i, at its steps."""
+        route = self.routes[i]
+        step = route.step if isinstance(route, ResampledTraverse) else None
+        return resampled(_open(self.listed[name][i]), self.velocity, self.batch_size, step)
+
     def _read(self, name: str) -> StoredFrames:
         if len(self.routes) == 1:
             values, known = self._read_one(name, 0)
@@ -289,8 +304,7 @@ class RouteData(LightningDataModule):
     def _read_one(self, name: str, i: int) -> tuple[Tensor, GroundTruth]:
         """Another traverse of route i, and the places of that route that it shows."""
         route, reference = self.routes[i], self.sets["reference"].parts[i]
-        step = route.step if isinstance(route, ResampledTraverse) else None
-        traverse = resampled(_open(self.listed[name][i]), self.velocity, self.batch_size, step)
+        traverse = self._opened(name, i)
         values = store(traverse, self._size)
         self._check_length(traverse.name, len(values))
         if values.shape[1:] != reference.shape[1:]:

@@ -9,8 +9,10 @@ from typing import Any
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
+from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.model import DejaVu
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
+from dejavu_torch.training.worth import beside_untrained
 from dejavu_torch.types import InputError, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
@@ -24,6 +26,9 @@ class MapExport(Callback):
 
     Of several routes it is their descriptor, without a map, in `descriptor.safetensors`.
 
+    Where training has ended and there is a traverse to validate or to test on, `scores` are what the map is
+    worth on it, see `beside_untrained`; they are logged too.
+
     Args:
         name: of the map file, in the trainer's default_root_dir.
     """
@@ -32,10 +37,11 @@ class MapExport(Callback):
         self.name = name
         self.began: int | None = None
         self.written: tuple[Path, DejaVu] | None = None
+        self.scores: dict[str, Scores] = {}
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Note the step that a checkpoint brought."""
-        self.began = trainer.global_step
+        self.began, self.written, self.scores = trainer.global_step, None, {}
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Load the best weights, and write."""
@@ -52,13 +58,22 @@ class MapExport(Callback):
             log.warning("%s is gone: the map is of the last step", best)
         elif best is not None:
             load_weights(pl_module, best)
-        self.write(pl_module, Path(trainer.default_root_dir), pl_module.data.reference)
+        data = pl_module.data
+        self.write(pl_module, Path(trainer.default_root_dir), data.reference)
+        unseen = data.unseen()
+        if self.written is None or unseen is None:
+            return
+        self.scores = beside_untrained(self.written[1], data.reference, *unseen, data.tolerance)
+        figures = {f"unseen/auc of {name}": one.auc for name, one in self.scores.items()}
+        for logger in trainer.loggers:
+            logger.log_metrics({name.replace(" ", "_"): auc for name, auc in figures.items()}, step)
 
     def on_exception(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
     ) -> None:
         """Write the map of the last step where the user interrupts."""
-        if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit" and trainer.global_step:
+        interrupted = isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit"
+        if interrupted and trainer.global_step and self.written is None:
             assert isinstance(pl_module, PlaceRecognitionTask)
             self.write(pl_module, Path(trainer.default_root_dir))
 

@@ -16,10 +16,11 @@ from kornia.geometry.transform import get_affine_matrix2d, warp_affine
 from torch import Tensor
 
 from dejavu_torch.features.augmentation import LARGEST, Augmentation, blurred, warped
-from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
+from dejavu_torch.features.kornia_augmentation import KorniaAugmentation, slanted
 
 OFF: dict[str, Any] = {name: 0.0 if len(most) == 1 else (0.0, 0.0) for name, most in LARGEST.items()}
 DEFAULTS = {name: argument.default for name, argument in signature(Augmentation).parameters.items()}
+DEFAULTS["perspective"] = 10.0  # which is off unless it is asked for
 EACH = pytest.mark.parametrize("name", DEFAULTS)
 
 
@@ -70,7 +71,7 @@ def test_eval_gives_the_input_itself_and_training_leaves_it_alone() -> None:
 def test_each_alone_acts_on_some_or_all_clips(name: str) -> None:
     frames = torch.rand(300, 1, 16, 16) * 0.5 + 0.25
     share = changed(frames, only(**{name: DEFAULTS[name]})(frames)).float().mean().item()
-    half, most = ("illumination", "blur"), ("rotation", "shift", "scale")
+    half, most = ("illumination", "blur"), ("rotation", "shift", "scale", "perspective")
     often = ("gamma", "occlusion", "noise")
     chance = 0.5 if name in half else 0.9 if name in most else 0.7 if name in often else 1.0
     assert share == pytest.approx(chance, abs=0.1)
@@ -274,6 +275,29 @@ def test_warps_are_those_of_kornia() -> None:
     expected = warp_affine(clips.flatten(1, 2), matrix, (20, 30), **settings)
     found = warped(clips, -turns.deg2rad(), shift, scale)  # kornia turns the other way
     torch.testing.assert_close(found.flatten(1, 2), expected, rtol=0, atol=1e-4)
+
+
+def test_slants_are_those_of_kornia_and_none_is_none() -> None:
+    clips = torch.rand(5, 2, 3, 20, 30)
+    slants = torch.tensor([[0.0, 0.0], [20.0, 0.0], [0.0, -30.0], [45.0, 45.0], [-9.0, 4.0]]).deg2rad()
+    still, same = (torch.zeros(5), torch.zeros(5, 2), torch.ones(5)), {"rtol": 0, "atol": 1e-4}
+    found = warped(clips, *still, slants)
+    torch.testing.assert_close(found, slanted(clips, slants), **same)
+    torch.testing.assert_close(found[0], clips[0], **same)
+    assert (found[1:] - clips[1:]).abs().flatten(1).amax(1).min() > 0.1
+
+
+def test_perspective_keeps_the_middle_and_makes_one_side_larger() -> None:
+    frames = torch.zeros(200, 1, 61, 61)
+    frames[:, :, 30, 30] = 1
+    x, y = centre_of(only(perspective=20.0)(frames))
+    assert max((x - 30).abs().max(), (y - 30).abs().max()) < 0.1
+    frames = torch.zeros(200, 1, 61, 61)
+    frames[:, :, 20:41, 15] = frames[:, :, 20:41, 45] = 1
+    after = only(perspective=20.0)(frames)[:, 0]
+    ratio = (after[..., :30].sum((1, 2)) / after[..., 31:].sum((1, 2))).log()
+    assert 0.15 < ratio.max() < 0.6
+    assert -0.6 < ratio.min() < -0.15
 
 
 @pytest.mark.parametrize("radius", [1, 3])

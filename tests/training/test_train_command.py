@@ -337,6 +337,36 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
     assert [str(w.message) for w in recwarn if not issubclass(w.category, DeprecationWarning)] == []
 
 
+@pytest.mark.parametrize("option", ["--data.validation", "--data.query"])
+def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
+    folder: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+    option: str,
+) -> None:
+    """Two steps of a tiny rate teach nothing, so that HOG is better, and is said to be."""
+    np.save(tmp_path / "first.npy", footage(side=32).numpy())
+    np.save(tmp_path / "second.npy", footage(0.1, side=32).numpy())
+    options = ["--data.source", tmp_path / "first.npy", option, tmp_path / "second.npy"]
+    options += ["--model.lr", 1e-6, "--trainer.max_steps", 2, "--trainer.default_root_dir", tmp_path / "run"]
+    train("fit", *options)
+    rows = {
+        line[:20].strip(): line[20:] for line in capsys.readouterr().out.splitlines() if "recall@1" in line
+    }
+    assert list(rows) == ["the trained map", "HOG of all frames", "the untrained map"]
+    auc = {name: float(row.split()[1].rstrip(",")) for name, row in rows.items()}
+    query, truth = ArrayTraverse(footage(0.1, side=32)), torch.arange(FRAMES)[:, None]
+    trained = DejaVu.load(tmp_path / "run" / "map.safetensors")
+    untrained = DejaVu().learn(ArrayTraverse(footage(side=32)))
+    for model, name in ((trained, "the trained map"), (untrained, "the untrained map")):
+        assert auc[name] == pytest.approx(evaluate(model.localize(query), truth, tolerance=2).auc, abs=6e-4)
+    assert auc["HOG of all frames"] > auc["the trained map"]
+    assert [line for line in warned(caplog) if "worse than" in line and "HOG of all frames" in line]
+    seen = figures(tmp_path / "run" / "lightning_logs" / "version_0" / "metrics.csv")
+    assert seen["unseen/auc_of_HOG_of_all_frames"][-1] == pytest.approx(auc["HOG of all frames"], abs=6e-4)
+
+
 def test_a_trial_run_leaves_an_earlier_run_as_it_is(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,72 @@
+"""What a trained map is worth on a second traverse, beside what needs no training."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Mapping
+
+from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.evaluation.baselines import hog_baselines
+from dejavu_torch.evaluation.contenders import contend
+from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.evaluation.rejection import Fitted
+from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.matching import SINGLE
+from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+
+log = logging.getLogger("dejavu_torch")
+
+TRAINED, HOG, UNTRAINED = "the trained map", "HOG of all frames", "the untrained map"
+
+
+def beside_untrained(
+    model: DejaVu, reference: Traverse, query: Traverse, truth: GroundTruth, tolerance: int
+) -> dict[str, Scores]:
+    """Scores of a trained map, of HOG of all frames, and of the spectral map of whitened HOG.
+
+    The untrained map is that of `DejaVu()`, by the model's own mapper where this is not of templates: of as
+    many route bytes. What cannot be made of these frames is left out.
+
+    Args:
+        model: with its map, on any device. reference, query: resampled where the model is.
+        truth: the places of the queries. tolerance: places within which one is right.
+
+    Returns:
+        By name, the trained map first; nothing where no query has a known place.
+    """
+    if len(query.frame_shape) == 3:
+        query = _fitted(query, reference.frame_shape)
+    trained = _fitted(query, model.frame_shape or ()) if len(query.frame_shape) == 3 else query
+    found = {TRAINED: _match(model, trained)}
+    hog = hog_baselines(reference, query, model.batch_size, tolerance)
+    found |= {HOG: hog["hog"].found.match()} if hog else {}
+    mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
+    try:
+        untrained = DejaVu(mapper=mapper, batch_size=model.batch_size).learn(reference)
+        found[UNTRAINED] = _match(untrained, query)
+    except InputError as error:
+        log.info("no untrained map to compare with: %s", error)
+    scores = {name: contend(name, match, truth, tolerance).scores for name, match in found.items()}
+    return {name: one for name, one in scores.items() if one is not None}
+
+
+def better(scores: Mapping[str, Scores]) -> list[str]:
+    """Names of what has a larger AUC than the first of them.
+
+    Example:
+        >>> from types import SimpleNamespace as S
+        >>> better({"the trained map": S(auc=0.5), "HOG": S(auc=0.7), "the untrained map": S(auc=0.4)})
+        ['HOG']
+    """
+    (_, first), *others = scores.items()
+    return [name for name, one in others if one.auc > first.auc]
+
+
+def _fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
+    return traverse if tuple(traverse.frame_shape) == tuple(shape) else Fitted(traverse, shape)
+
+
+def _match(model: DejaVu, query: Traverse) -> Match:
+    found = model.found(model.extract_all(query), SINGLE).moved(model.map.scored)
+    return Match(*(None if part is None else part.cpu() for part in found.match()))
