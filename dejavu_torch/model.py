@@ -309,6 +309,7 @@ class DejaVu(nn.Module):
             16
         """
         self.preprocess, self.features = other.preprocess, other.features
+        self.weight_bits = other.weight_bits
 
     def without_map(self) -> DejaVu:
         """What makes the descriptors, by itself: it serves any route, at its own steps."""
