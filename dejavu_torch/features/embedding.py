@@ -272,7 +272,7 @@ def _of_channels(name: str, given: float | list[float] | None, channels: int, de
     least, most = (-1e38, 1e38) if name == "mean" else (1e-37, 1e37)
     if len(numbers) not in (1, channels) or not all(least <= number <= most for number in numbers):
         raise InputError(
-            f"Embedding got {name}={f'{given}':.80}; expected a number for each of {channels} channels, or one for "
-            f"all{', above 0' if name == 'std' else ''}"
+            f"Embedding got {name}={f'{given}':.80}; expected a number for each of {channels} channels, or "
+            f"one for all{', above 0' if name == 'std' else ''}"
         )
     return torch.tensor(numbers).float().expand(channels).clone().view(channels, 1, 1)
