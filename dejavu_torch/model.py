@@ -309,6 +309,7 @@ class DejaVu(nn.Module):
             16
         """
         self.preprocess, self.features = other.preprocess, other.features
+        self.weight_bits = other.weight_bits
 
     def without_map(self) -> DejaVu:
         """What makes the descriptors, by itself: it serves any route, at its own steps."""
@@ -684,7 +685,7 @@ class DejaVu(nn.Module):
             else:
                 checked(header.map, model.map.state, "its map")
                 model.map.set_extra_state(header.map)
-            _check_types(weights, model.features)
+            check_types(weights, model.features)
             loaded = model.load_state_dict(weights, strict=False)
             missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
             if missing or loaded.unexpected_keys:
@@ -924,7 +925,7 @@ def _check_weights(header: Header, tensors: dict[str, Tensor], given: nn.Module 
             raise InputError(f"it does not fit: features.{name} is {seen}; expected {tuple(own.shape)}")
 
 
-def _check_types(tensors: dict[str, Tensor], features: nn.Module) -> None:
+def check_types(tensors: dict[str, Tensor], features: nn.Module) -> None:
     """Refuse whole numbers for weights that are none, such as those of 8 bits without their scales."""
     for name, own in features.state_dict().items():
         stored = tensors.get(f"features.{name}")

@@ -246,6 +246,10 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
                 one = next((one for one in named if one in lost), "whitening" if whitening else "config")
                 raise UsageError(f"--{one}: a --map has its own settings; expected one or the other")
         arguments.pop("config")
+        if whitening:
+            _check_own(whitening, told, "whitening")
+        if arguments.get("descriptor"):
+            _check_own(arguments["descriptor"], told, "descriptor")
         model = arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
         if whitening:
             written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"
@@ -298,16 +302,20 @@ def without_whitening_map(words: Sequence[str]) -> tuple[list[str], Path | None]
     return kept, whitening
 
 
+def _check_own(path: Path, told: Sequence[str], what: Literal["whitening", "descriptor"]) -> None:
+    """Refuse options of what a file brings."""
+    of_file = ("preprocess", "weight_bits", *["whitening."] * (what == "whitening"))
+    other = [one for one in told if one.startswith(of_file)]
+    if other:
+        raise UsageError(f"--{other[0]}: the {what} of {path} has its own; expected one or the other")
+
+
 def _take(model: DejaVu, path: Path, told: Sequence[str], what: Literal["whitening", "descriptor"]) -> None:
     """Give a model the whitening or the descriptor of a file; features of our own come from there as well.
 
     Args:
         told: the options of the command line.
     """
-    of_file = ("preprocess", "whitening.") if what == "whitening" else ("preprocess",)
-    other = [one for one in told if one.startswith(of_file)]
-    if other:
-        raise UsageError(f"--{other[0]}: the {what} of {path} has its own; expected one or the other")
     named = any(one.startswith("features") for one in told)
     known = DejaVu.load(path, model.features if named or not isinstance(model.features, HOG) else None)
     if what == "descriptor":

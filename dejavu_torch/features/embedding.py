@@ -268,10 +268,11 @@ class Embedding(nn.Module):
 def _of_channels(name: str, given: float | list[float] | None, channels: int, default: float) -> Tensor:
     """(channels,1,1), of numbers, or one number for all."""
     numbers = [default if given is None else given] if not isinstance(given, (list, tuple)) else [*given]
-    least = -math.inf if name == "mean" else 0.0
-    if len(numbers) not in (1, channels) or not all(least < number < math.inf for number in numbers):
+    # numbers that float32 holds, and their inverse
+    least, most = (-1e38, 1e38) if name == "mean" else (1e-37, 1e37)
+    if len(numbers) not in (1, channels) or not all(least <= number <= most for number in numbers):
         raise InputError(
-            f"Embedding got {name}={given}; expected a number for each of {channels} channels, or one for "
-            f"all{', above 0' if name == 'std' else ''}"
+            f"Embedding got {name}={f'{given}':.80}; expected a number for each of {channels} channels, or "
+            f"one for all{', above 0' if name == 'std' else ''}"
         )
     return torch.tensor(numbers).float().expand(channels).clone().view(channels, 1, 1)

@@ -182,6 +182,11 @@ class RouteData(LightningDataModule):
         count = len(self.listed["source"])
         each = list(given) if isinstance(given, (list, tuple)) else [given]
         each = [None] * count if given is None else each
+        if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
+            raise InputError(
+                f"{name} is given, and there are {count} routes, which make no map; expected none, and "
+                "`dejavu compare A B --descriptor FILE` for a route"
+            )
         if len(each) != count:
             raise InputError(
                 f"{name} is of {len(each)}, the routes are {count}; expected one of each route, null for "
@@ -194,13 +199,7 @@ class RouteData(LightningDataModule):
         if not routes:
             raise InputError("source is an empty list; expected at least one traverse")
         for name, given in self.listed.items():
-            needless = len(routes) > 1 and name in ("validation", "query")
             for one in given:
-                if one is not None and needless:
-                    raise InputError(
-                        f"{name} is given, and there are {len(routes)} routes, which make no map; expected "
-                        "none, and `dejavu compare A B --descriptor FILE` for a route"
-                    )
                 missing = one is None and name == "source"
                 if missing or (one is not None and not isinstance(one, (str, Path, Traverse, Tensor))):
                     raise InputError(

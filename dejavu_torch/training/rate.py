@@ -14,7 +14,7 @@ from dejavu_torch.types import InputError
 
 STEP = 0.5  # of the lines' RMS, at the start
 PER_OCTAVE = 2  # bands of frequency that have a width of their own
-LEAST = 1e-12  # of the lines' RMS
+LEAST = 1e-24  # of the lines' mean square: the root of 0 has no gradient
 
 
 class Coded(NamedTuple):
@@ -76,7 +76,7 @@ def coded_proxies(
     expected = (int(band.max()) + 1) * lines.shape[1]
     if tuple(log_widths.shape) != (expected,):
         raise InputError(f"the widths are {tuple(log_widths.shape)}; expected ({expected},)")
-    wanted = lines / lines.square().mean().sqrt().clamp(min=LEAST) / log_step.exp()
+    wanted = lines / lines.square().mean().clamp(min=LEAST).sqrt() / log_step.exp()
     levels = wanted + (quantise(wanted.detach(), 1.0) - wanted).detach()
     noisy = wanted + torch.rand_like(wanted) - 0.5 if noise else wanted
     widths = log_widths.exp().unflatten(0, (-1, lines.shape[1]))[band]

@@ -26,7 +26,7 @@ from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
-from dejavu_torch.model import DejaVu, opened
+from dejavu_torch.model import DejaVu, check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.checkpoint import CheckpointFiles, check_resumable, read_checkpoint, taking_over
@@ -588,6 +588,7 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
     prefix = "features."
     with opened(Path(path)) as (tensors, header):
         stored = unpacked(tensors, prefix)
+        check_types(stored, backbone)
     weights = {name.removeprefix(prefix): t for name, t in stored.items() if name.startswith(prefix)}
     own = backbone.state_dict()
     code = CODE if bool(weights.get("linear.whitened", False)) else ()

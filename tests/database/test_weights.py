@@ -135,10 +135,11 @@ def test_the_bytes_are_a_quarter() -> None:
     assert 0.25 < sizes[1] / sizes[0] < 0.32
 
 
-def test_a_whitening_of_another_map_brings_its_weights(tmp_path: Path) -> None:
+@pytest.mark.parametrize("take", [DejaVu.take_whitening, DejaVu.take_descriptor])
+def test_what_another_map_brings_stays_in_8_bits(tmp_path: Path, take: Any) -> None:
     DejaVu(small(), weight_bits=8).learn(frames()).save(path := tmp_path / "map.safetensors")
     model = DejaVu()
-    model.take_whitening(DejaVu.load(path))
+    take(model, DejaVu.load(path))
     model.learn(frames()).save(tmp_path / "other.safetensors")
     assert DejaVu.load(tmp_path / "other.safetensors").weight_bits == 8
 

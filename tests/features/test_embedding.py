@@ -237,7 +237,11 @@ def test_mean_and_deviation_are_taken_out_last() -> None:
     torch.testing.assert_close(net(frames), expected)
 
 
-@pytest.mark.parametrize("settings", [{"mean": [0.5, 0.5]}, {"std": 0.0}, {"std": [1.0, 1.0, -1.0]}], ids=str)
+@pytest.mark.parametrize(
+    "settings",
+    [{"mean": [0.5, 0.5]}, {"std": 0.0}, {"std": [1.0, 1.0, -1.0]}, {"std": 1e-39}, {"mean": 1e39}],
+    ids=str,
+)
 def test_a_mean_of_other_channels_is_refused(settings: dict[str, Any]) -> None:
     name, value = next(iter(settings.items()))
     with refused(f"{name}={value}", "3 channels"):
@@ -249,13 +253,14 @@ def test_what_is_no_network_is_refused() -> None:
         Embedding(nn.functional.relu)  # type: ignore[arg-type]
 
 
-def test_a_map_brings_a_layer_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("layer", ["convolutions.0", "linear"])  # what is behind the latter is left out
+def test_a_map_brings_a_layer_back(tmp_path: Path, layer: str) -> None:
     def network() -> SmallCNN:
         return SmallCNN(dimension=7, resize=(16, 16), widths=(4, 8))
 
     frames = torch.rand(20, 3, 24, 24)
-    net = Embedding(network(), None, layer="convolutions.0", mean=0.4, std=[0.2, 0.3, 0.4])
-    model = DejaVu(net).learn(frames)
+    net = Embedding(network(), None, layer=layer, mean=0.4, std=[0.2, 0.3, 0.4])
+    model = DejaVu(net).learn(frames).eval()
     model.save(tmp_path / "map.safetensors")
     again = DejaVu.load(tmp_path / "map.safetensors")
     assert torch.equal(again(frames), model(frames))

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.layer import run, up_to
+from dejavu_torch.types import InputError
 
 FRAMES = torch.rand(2, 3, 12, 16)
 
@@ -107,6 +108,12 @@ def test_ended_again_it_is_the_same() -> None:
 def test_an_unknown_layer_is_refused(layer: str) -> None:
     with refused(f"Net has no layer {layer!r}", "blocks.0", "head"):
         Embedding(Net(), None, resize=(12, 16), layer=layer)
+
+
+def test_the_name_of_an_unknown_layer_is_not_told_whole() -> None:
+    with pytest.raises(InputError) as caught:
+        Embedding(Net(), None, resize=(12, 16), layer="x" * 10**5)
+    assert len(str(caught.value)) < 300
 
 
 def test_a_layer_that_does_not_run_is_refused() -> None:

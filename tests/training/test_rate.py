@@ -133,6 +133,14 @@ def test_steps_and_widths_learn_to_save_bits() -> None:
     assert step.exp() > 0.5
 
 
+def test_nothing_to_code_has_a_gradient() -> None:
+    lines = torch.zeros(5, 3, requires_grad=True)
+    widths = torch.zeros(3 * (int(bands_of(5).max()) + 1))
+    coded_proxies(lines, torch.tensor(0.0), widths).bits.backward()
+    assert lines.grad is not None
+    assert bool(lines.grad.isfinite().all())
+
+
 def test_gradients_of_the_code() -> None:
     """Straight through the rounding to the lines; of bits to all three."""
     lines = noise(12, 3).double().requires_grad_()

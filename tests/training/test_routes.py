@@ -420,6 +420,7 @@ LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGH
         (["compare", "third.npy", "third.npy", "--map", WEIGHTS, "--out", "o"], ["without a map"]),
         ([*LEARN, "--features.cell", "4"], ["learned with", "SmallCNN"]),
         ([*LEARN, "--preprocess.contrast", "patch"], ["--preprocess.contrast", "one or the other"]),
+        ([*LEARN, "--weight_bits", "8"], ["--weight_bits", "one or the other"]),
         ([*LEARN, "--whitening", WEIGHTS], ["--whitening", "expected it or --descriptor"]),
         ([*LEARN[:4], "--descriptor", "gone.safetensors"], ["gone.safetensors is not there"]),
         ([*LEARN[:4], "--descriptor", "train.yaml"], ["train.yaml"]),
@@ -457,7 +458,7 @@ LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGH
                     "third.npy",
                 ]
             ],
-            ["query is of 1, the routes are 2"],
+            ["query is given", "2 routes", "--descriptor FILE"],
         ),
         (
             [

@@ -88,3 +88,7 @@ def test_a_training_starts_from_8_bits_and_refuses_damaged_ones(tmp_path: Path) 
     write_map(path, tensors | {"features.linear.weight.scale": torch.zeros(3)}, header)
     with refused(str(path), "features.linear.weight", "bfloat16"):
         start_from(again, path)
+    without = {name: tensor for name, tensor in tensors.items() if not name.endswith(".scale")}
+    write_map(path, without, header)
+    with refused(str(path), "of int8", "expected float numbers"):
+        start_from(again, path)
