@@ -35,6 +35,7 @@ from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.stages import (
     CodeStage,
+    RateStage,
     Stage,
     Views,
     coded_places,
@@ -234,6 +235,11 @@ class PlaceRecognitionTask(pl.LightningModule):
             raise InputError(
                 f"{self.data.reference.name} holds ready features, and the map of a "
                 f"{type(self.dejavu.mapper).__name__} is not trained; expected frames, or `dejavu learn`"
+            )
+        if isinstance(self.stage, RateStage) and len(self.data.routes) > 1:
+            raise InputError(
+                f"model.rate is {self.stage.rate} and there are {len(self.data.routes)} routes: its bits are "
+                "those of the map of one route; expected model.rate 0, or one route"
             )
         still = not self.data.augmentation.acts and self.data.sources["second"] is None
         if self.made and self.dejavu.whitening is not None and still:

@@ -16,7 +16,8 @@ from small_training import FRAMES, Stop, data_of, fit, footage, mapper, new_task
 from test_stages import coded
 from torch import Tensor
 
-from dejavu_torch import DejaVu, SpectralMapper, Whitening
+from dejavu_torch import DejaVu, RouteData, SpectralMapper, Whitening
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import quantise
 from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.training.losses import laplace_bits
@@ -267,6 +268,12 @@ def test_a_nan_of_the_entropy_model_is_told(tmp_path: Path) -> None:
 def test_a_rate_out_of_range(rate: float) -> None:
     with refused(f"rate is {rate}", "0 or more"):
         rated(rate)
+
+
+def test_a_rate_is_of_one_route(tmp_path: Path) -> None:
+    several = [ArrayTraverse(footage(0.1 * k, FRAMES), f"route {k}") for k in range(2)]
+    with refused("model.rate is 1.0 and there are 2 routes", "model.rate 0"):
+        trainer(tmp_path).fit(rated(), RouteData(several, tolerance=2))
 
 
 def test_templates_have_no_rate() -> None:
