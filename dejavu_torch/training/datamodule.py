@@ -76,12 +76,27 @@ class Clips(Sampler[list[int]]):
 
     def __init__(self, lengths: list[int], batch_size: int, clip: int) -> None:
         self.lengths, self.clip = lengths, clip
+        self.drawn_at: Tensor | None = None  # the state of the random numbers ahead of the present order
+        self.drawn_to: Tensor | None = None  # and behind it
+        self.replayed: tuple[Tensor, int] | None = None  # such a state, and batches of it that are done
         self.clips = min(batch_size // clip, sum(length // clip for length in lengths))
 
     def __len__(self) -> int:
         return sum(length // self.clip for length in self.lengths) // self.clips
 
     def __iter__(self) -> Iterator[list[int]]:
+        if self.replayed is None:
+            self.drawn_at = torch.get_rng_state()
+            yield from self._drawn()
+            return
+        self.drawn_at, done = self.replayed
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self.drawn_at)
+            batches = self._drawn()
+            self.drawn_to = torch.get_rng_state()
+        yield from batches[done:]
+
+    def _drawn(self) -> list[list[int]]:
         starts, first = [], 0
         for length in self.lengths:
             left_over = int(torch.randint(length % self.clip + 1, ()))
@@ -90,8 +105,8 @@ class Clips(Sampler[list[int]]):
         order = torch.cat(starts)
         order = order[torch.randperm(len(order))]
         frames = order[:, None] + torch.arange(self.clip)
-        for batch in frames.split(self.clips)[: len(self)]:  # an incomplete batch is left out
-            yield batch.flatten().tolist()
+        batches = frames.split(self.clips)[: len(self)]  # an incomplete one is left out
+        return [batch.flatten().tolist() for batch in batches]
 
 
 class RouteData(LightningDataModule):
@@ -175,6 +190,7 @@ class RouteData(LightningDataModule):
         self.velocity = velocity
         self.routes: list[Traverse] = []  # at even steps, where there is `velocity`
         self.sets: dict[str, StoredFrames] = {}
+        self.replayed: tuple[Tensor, int] | None = None  # of the next `train_dataloader`, see `Clips`
         self._wanted: tuple[int, int] | None = None  # size of the stored frames, where it makes them smaller
 
     def _one_each(self, name: str, given: Any) -> list[Any]:
@@ -334,7 +350,9 @@ class RouteData(LightningDataModule):
         if max(lengths) < self.clip:
             raise InputError(f"clip is {self.clip} and the route has {max(lengths)} frames; expected fewer")
         frames = StoredFrames(parts, _joined([one.truth.positives for one in sets]))
-        return _loader(frames, Clips(lengths, self.batch_size, self.clip))
+        clips = Clips(lengths, self.batch_size, self.clip)
+        clips.replayed, self.replayed = self.replayed, None
+        return _loader(frames, clips)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """The validation traverse, or the reference."""

@@ -16,13 +16,13 @@ from small_training import FRAMES, Stop, data_of, fit, footage, mapper, new_task
 from test_stages import coded
 from torch import Tensor
 
-from dejavu_torch import DejaVu, RouteData, SpectralMapper, Whitening
+from dejavu_torch import RouteData, SpectralMapper, Whitening
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.spectral import quantise
 from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.training.losses import laplace_bits
 from dejavu_torch.training.rate import bands_of, coded_proxies
-from dejavu_torch.training.stages import DescriptorStage, RateStage
+from dejavu_torch.training.stages import DescriptorStage
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 
@@ -224,24 +224,6 @@ def test_bits_are_saved_where_they_count(tmp_path: Path) -> None:
         bits.append(float(task.trainer.callback_metrics["train/bits"]))
         assert recall(model, footage()) > 0.9
     assert bits[1] < 0.7 * bits[0]
-
-
-def test_a_resumed_run_ends_as_one_that_was_not_interrupted(tmp_path: Path) -> None:
-    whole = fit(tmp_path / "whole", rated(), data_of(), max_steps=6)
-    settings = {"enable_checkpointing": True, "max_steps": 6}
-    torch.manual_seed(0)
-    first = trainer(tmp_path / "part", Stop(3), **settings)
-    first.fit(rated(), data_of())
-    path = tmp_path / "part.ckpt"
-    first.save_checkpoint(path)
-    again = rated()
-    trainer(tmp_path / "again", **settings).fit(again, data_of(), ckpt_path=path, weights_only=True)
-    assert again.global_step == 6
-    stage = again.stages[0]
-    assert isinstance(stage, RateStage)
-    assert len(stage.proxies) == FRAMES // 2
-    assert recall(DejaVu.load(tmp_path / "again" / "map.safetensors"), footage()) > 0.9
-    assert whole.map.places == FRAMES
 
 
 @pytest.mark.parametrize("rates", [(1.0, 0.0), (0.0, 1.0)])

@@ -1,0 +1,108 @@
+"""A run that is interrupted and resumed ends in the map of one that was not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from small_training import Stop, backbone, data_of, mapper, new_task, trainer
+from test_stages import coded
+from torch import Tensor
+
+from dejavu_torch import DejaVu, RouteData, SpectralMapper
+from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.training.task import PlaceRecognitionTask
+
+STEPS = 12
+
+
+def spectral(rate: float) -> PlaceRecognitionTask:
+    return new_task(backbone=coded(), mapper=SpectralMapper(20.0), rate=rate)
+
+
+def code() -> PlaceRecognitionTask:
+    return new_task(backbone=coded(), mapper=mapper(), descriptor=0.25)
+
+
+def templates() -> PlaceRecognitionTask:
+    return new_task(backbone=backbone(), mapper=mapper())
+
+
+def data() -> RouteData:
+    return data_of(augmentation=Augmentation(noise=0.1), batch_size=8)  # 5 batches an epoch
+
+
+def run(folder: Path, make: Callable[[], PlaceRecognitionTask], start: Path | None, *callbacks: Any) -> Path:
+    torch.manual_seed(3 if start is None else 4)
+    task, every = make(), {"val_check_interval": 4, "check_val_every_n_epoch": None}
+    settings = {"max_steps": STEPS, "enable_checkpointing": True} | every
+    trainer(folder, *callbacks, **settings).fit(task, data(), ckpt_path=start, weights_only=True)
+    return folder / "map.safetensors"
+
+
+def tensors(path: Path) -> dict[str, Tensor]:
+    return {n: t for n, t in DejaVu.load(path).state_dict().items() if isinstance(t, Tensor)}
+
+
+class Break(Stop):
+    """Ends the training in the midst of a step, whose random numbers are drawn."""
+
+    def on_before_optimizer_step(self, trainer: Any, *_: Any) -> None:
+        if trainer.global_step == self.steps:
+            assert self.path is not None
+            trainer.save_checkpoint(self.path)
+            raise RuntimeError("power cut")
+
+    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    "make",
+    [lambda: spectral(0.0), lambda: spectral(1.0), code, templates],
+    ids=["spectral", "rate", "code", "plain"],
+)
+@pytest.mark.parametrize("step", [3, 5, 7], ids=["in the first epoch", "between", "in the second"])
+def test_it_ends_in_the_same_map(tmp_path: Path, make: Callable[[], Any], step: int) -> None:
+    whole = tensors(run(tmp_path / "whole", make, None))
+    part = tmp_path / "part.ckpt"
+    run(tmp_path / "first", make, None, Stop(step, part))
+    again = tensors(run(tmp_path / "again", make, part))
+    assert whole.keys() == again.keys()
+    for name, value in whole.items():
+        assert torch.allclose(again[name].double(), value.double(), rtol=1e-4, atol=1e-5), name
+
+
+def test_a_step_that_was_broken_off_is_taken_again(tmp_path: Path) -> None:
+    whole = tensors(run(tmp_path / "whole", lambda: spectral(1.0), None))
+    part = tmp_path / "part.ckpt"
+    with pytest.raises(RuntimeError, match="power cut"):
+        run(tmp_path / "first", lambda: spectral(1.0), None, Break(6, part))
+    again = tensors(run(tmp_path / "again", lambda: spectral(1.0), part))
+    for name, value in whole.items():
+        assert torch.allclose(again[name].double(), value.double(), rtol=1e-4, atol=1e-5), name
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda random: random.pop("now"),
+        lambda random: random.update(done=-1),
+        lambda random: random.update(done=True),
+        lambda random: random.update(order=torch.zeros(3)),
+        lambda random: random.update(order=None),
+        lambda random: random.update(views=torch.zeros(7, dtype=torch.uint8)),
+    ],
+)
+def test_damaged_random_numbers_are_refused(tmp_path: Path, change: Callable[[Any], Any]) -> None:
+    part = tmp_path / "part.ckpt"
+    run(tmp_path / "first", lambda: spectral(0.0), None, Stop(3, part))
+    checkpoint = torch.load(part, weights_only=True)
+    change(checkpoint["random"])
+    torch.save(checkpoint, part)
+    with refused("its random numbers are no state of torch's"):
+        run(tmp_path / "again", lambda: spectral(0.0), part)
