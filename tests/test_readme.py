@@ -52,14 +52,25 @@ def test_python_is_twelve_lines_at_most() -> None:
 
 
 def test_every_linked_file_is_there() -> None:
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
-    assert links
-    headings = {
-        line.lstrip("# ").lower().replace(" ", "-") for line in README.splitlines() if line[:1] == "#"
-    }
-    files, anchors = ([link for link in links if link.startswith("#") == anchor] for anchor in (False, True))
-    assert [link for link in files if not (ROOT / link).exists()] == []
-    assert [link for link in anchors if link[1:] not in headings] == []
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    lost = []
+    for page in pages:
+        links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
+        assert links
+        for link in links:
+            file, _, anchor = link.partition("#")
+            target = page.parent / file if file else page
+            known = link.startswith("http") or (
+                target.exists() and (not anchor or anchor in anchors_of(target))
+            )
+            lost += [] if known else [f"{page.name}: {link}"]
+    assert lost == []
+
+
+def anchors_of(page: Path) -> set[str]:
+    """Of the headings of a page."""
+    headings = [line.lstrip("# ").lower() for line in page.read_text().splitlines() if line[:1] == "#"]
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in headings}
 
 
 class Understood(Exception):
