@@ -374,8 +374,8 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
             log.warning(told, " and ".join(beaten), source)
     elif model.map.places:
         print(
-            f"written to {path}; trained on changed copies of its own frames, which no other day is: only a "
-            "second traverse shows what it is worth:"
+            f"written to {path}; it has seen changed copies of its own frames alone: only a second traverse "
+            "shows what it is worth:"
         )
     else:
         print(f"written to {path}")
