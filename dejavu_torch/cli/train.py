@@ -373,10 +373,10 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
             told = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
             log.warning(told, " and ".join(beaten), source)
     elif model.map.places:
-        print(
-            f"written to {path}; it has seen changed copies of its own frames alone: only a second traverse "
-            "shows what it is worth:"
-        )
+        seen, another = "changed copies of its own frames", "a second"
+        if data.sources["second"]:
+            seen, another = "both its traverses, changed,", "a third"
+        print(f"written to {path}; it has seen {seen} alone: only {another} traverse shows what it is worth:")
     else:
         print(f"written to {path}")
     print_next(path, data, model, words)
