@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 from command_line import fails, run
+from helpers import refused
 from torch import nn
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.cli.commands import run_learn
-from dejavu_torch.cli.parser import parse
+from dejavu_torch.cli.parser import made, parse
 from dejavu_torch.features.embedding import Embedding
 
 ZOO = """
@@ -151,3 +152,8 @@ def test_a_training_says_the_words_of_its_network(capsys: pytest.CaptureFixture[
     words = shlex.split(told.removeprefix("next: dejavu "))
     assert words[words.index("--map") + 1] == "run/map.safetensors"
     DejaVu.load("run/map.safetensors", features_of(*words[words.index("--features") :][:5]))
+
+
+def test_a_function_that_ends_the_program_is_refused() -> None:
+    with refused("sys.exit ends the program", "expected what makes a network"):
+        made("sys.exit")

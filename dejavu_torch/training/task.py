@@ -528,6 +528,10 @@ class PlaceRecognitionTask(pl.LightningModule):
                 check_random(checkpoint[RANDOM])
                 self.views_drawn_at = checkpoint[RANDOM]["views"]
         self.routes = checkpoint.get("routes", [])
+        if not isinstance(self.routes, list) or not all(isinstance(one, list) for one in self.routes):
+            raise InputError(
+                f"routes of the checkpoint are {str(self.routes)[:40]}; expected a list of names and lengths"
+            )
         self._check_routes()
         if not self.made:
             self._take_templates(checkpoint["state_dict"])

@@ -106,3 +106,13 @@ def test_damaged_random_numbers_are_refused(tmp_path: Path, change: Callable[[An
     torch.save(checkpoint, part)
     with refused("its random numbers are no state of torch's"):
         run(tmp_path / "again", lambda: spectral(0.0), part)
+
+
+@pytest.mark.parametrize("routes", [7, None, ["a"], "one"])
+def test_damaged_routes_are_refused(tmp_path: Path, routes: Any) -> None:
+    part = tmp_path / "part.ckpt"
+    run(tmp_path / "first", lambda: spectral(0.0), None, Stop(3, part))
+    checkpoint = torch.load(part, weights_only=True)
+    torch.save(checkpoint | {"routes": routes}, part)
+    with refused(f"routes of the checkpoint are {routes}", "names and lengths"):
+        run(tmp_path / "again", lambda: spectral(0.0), part)
