@@ -5,14 +5,23 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.codec import Stream, check_claim, coded_bytes, decode, encode, from_int8, to_int8
+from dejavu_torch.database.codec import (
+    ESCAPE,
+    Stream,
+    check_claim,
+    coded_bytes,
+    decode,
+    encode,
+    from_int8,
+    to_int8,
+)
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.spectrum import Transform, from_spectrum, period_of, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
@@ -61,6 +70,38 @@ def dead_zone(lines: Tensor, lengths: list[int], resolution: float, transform: T
     halves = [torch.arange(n) if transform == "dct" else (torch.arange(n) + 1) // 2 * 2 for n in lengths]
     inverse = torch.cat([r / (2 * n) for r, n in zip(halves, lengths, strict=True)]).to(lines)
     return (1 + (resolution * inverse).square())[:, None]
+
+
+class CodedChunk(NamedTuple):
+    """What a file holds of a chunk.
+
+    places: W. step: of its lines. stream: of its levels. escapes: (E,) int32, those that int8 does not hold.
+    """
+
+    places: int
+    step: float
+    stream: Stream
+    escapes: Tensor
+
+
+def code_chunk(
+    descriptors: Tensor, mean: Tensor, step: float, transform: Transform = "dft", resolution: float = 0.0
+) -> CodedChunk:
+    """The lines of one chunk, coded: what `SpectralMap.of_chunks` puts together, here or on any machine.
+
+    Args:
+        mean: (K,) of the route's descriptors. step: of the lines. transform, resolution: of the map.
+
+    Shape: descriptors (W,K).
+
+    Raises:
+        InputError: descriptors that are not finite floats (W,K).
+    """
+    check_descriptors(descriptors, len(mean))
+    lengths = [len(descriptors)]
+    lines = _lines(descriptors - mean.float(), lengths, transform)
+    small, escapes = to_int8(quantise(lines, step, dead_zone(lines, lengths, resolution, transform)))
+    return CodedChunk(len(descriptors), step, encode(small), escapes.cpu())
 
 
 class SpectralState(NamedTuple):
@@ -125,6 +166,7 @@ class SpectralMap(PlaceMap):
     norms: Tensor
     per_norm: Tensor
     needed: float | None = None
+    _streams: list[Stream] | None = None
 
     def __init__(
         self,
@@ -156,6 +198,59 @@ class SpectralMap(PlaceMap):
         self.loaded()
         self.check()
 
+    @classmethod
+    def of_chunks(
+        cls,
+        chunks: Sequence[CodedChunk],
+        mean: Tensor,
+        metric: SpectralMetric = "cosine",
+        transform: Transform = "dft",
+        chunk: int | Literal["route"] = "route",
+        resolution: float = 0.0,
+    ) -> SpectralMap:
+        """The map of chunks, one behind the other, as `code_chunk` makes them with these settings.
+
+        Raises:
+            InputError: no chunks, or a stream that is altered.
+
+        Example:
+            >>> wave = torch.sin(torch.arange(500.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
+            >>> mean = wave.mean(0).bfloat16()
+            >>> parts = [code_chunk(part, mean, step=0.05) for part in wave.split(250)]
+            >>> SpectralMap.of_chunks(parts, mean, chunk=250).scores(wave[20:21]).argmin()
+            tensor(20)
+        """
+        if not chunks:
+            raise InputError("there are no chunks; expected at least one")
+        levels = [decode(part.stream, part.places, len(mean)) for part in chunks]
+        route = cls(
+            torch.cat(levels),
+            torch.cat([part.escapes for part in chunks]),
+            torch.tensor([part.places for part in chunks]),
+            torch.tensor([part.step for part in chunks]),
+            mean,
+            metric,
+            transform,
+            chunk,
+            resolution,
+        )
+        route._streams = [part.stream for part in chunks]
+        return route
+
+    def coded(self) -> list[CodedChunk]:
+        """The chunks as the file holds them: what `of_chunks` makes the same map of."""
+        if self._streams is None:
+            self._streams = [encode(self.levels[start:stop]) for start, stop in self.chunks]
+        marks = [int((self.levels[start:stop] == ESCAPE).sum()) for start, stop in self.chunks]
+        parts = zip(
+            self.lengths.tolist(),
+            self.steps.tolist(),
+            self._streams,
+            self.escapes.cpu().split(marks),
+            strict=True,
+        )
+        return [CodedChunk(*part) for part in parts]
+
     def settings(self) -> dict[str, Any]:
         names = ("metric", "transform", "chunk", "resolution")
         return {name: getattr(self, name) for name in names}
@@ -165,7 +260,7 @@ class SpectralMap(PlaceMap):
         problem = self.disagreement()
         if problem:
             raise InputError(f"the map does not fit together: {problem}")
-        self._streams: list[Stream] | None = None  # coded when they are asked for
+        self._streams = None  # coded when they are asked for
         self.chunks: list[tuple[int, int]] = []
         for length in self.lengths.tolist():
             start = self.chunks[-1][1] if self.chunks else 0
@@ -275,9 +370,7 @@ class SpectralMap(PlaceMap):
 
     def packed(self) -> dict[str, Tensor]:
         """As `PlaceMap.packed`: the levels of each chunk compressed, with a table of the chunks."""
-        if self._streams is None:
-            self._streams = [encode(self.levels[start:stop]) for start, stop in self.chunks]
-        streams, tensors = self._streams, super().packed()
+        streams, tensors = [part.stream for part in self.coded()], super().packed()
         del tensors["levels"]
         sizes = torch.tensor([[len(stream.bytes), stream.checksum] for stream in streams], dtype=torch.int64)
         return tensors | {"streams": torch.cat([stream.bytes for stream in streams]), "stream_table": sizes}
@@ -331,7 +424,7 @@ class SpectralMap(PlaceMap):
             return f"steps {self.steps.tolist()}; expected {len(self.lengths)} finite numbers above 0"
         if tuple(self.mean.shape) != (self.dimension,) or not self.mean.isfinite().all():
             return f"a mean {tuple(self.mean.shape)}; expected ({self.dimension},) finite numbers"
-        marks = int((self.levels == -128).sum())
+        marks = int((self.levels == ESCAPE).sum())
         return "" if marks == len(self.escapes) else f"{len(self.escapes)} escapes; expected {marks}"
 
     def summary(self) -> MapSummary:
@@ -447,6 +540,7 @@ class SpectralMapper(Mapper):
         overhead += self._within(len(features), overhead)
         width = dead_zone(lines, lengths, self.resolution, self.transform)
         step = self._step(lines, width, lengths, overhead) if self.step is None else self.step
+        step = float(torch.tensor(step))  # as the file holds it
         small, escapes = to_int8(quantise(lines, step, width))
         steps = features.new_full((len(lengths),), step)
         route = SpectralMap(

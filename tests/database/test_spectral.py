@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, dead_zone, quantise
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, code_chunk, dead_zone, quantise
 from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer
 
@@ -429,3 +429,22 @@ def test_a_damaged_map_is_refused(change: str) -> None:
 def test_queries_of_another_dimension_are_refused() -> None:
     with refused("(3, 5)", "(Q, 12)"):
         SpectralMapper()(route()).scores(torch.rand(3, 5))
+
+
+@pytest.mark.parametrize("settings", [("cosine", "dft", 64, 0.0), ("l2", "dct", 64, 8.0)])
+def test_a_map_is_that_of_its_chunks_coded_one_by_one(settings: tuple[Any, ...]) -> None:
+    features = route(200) * torch.tensor([50.0, *[1.0] * 11])
+    metric, transform, chunk, resolution = settings
+    learned = SpectralMapper(None, 0.002, chunk, transform, metric, resolution)(features)
+    step = float(learned.steps[0])
+    alone = [code_chunk(part, learned.mean, step, transform, resolution) for part in features.split(64)]
+    for made in (
+        SpectralMap.of_chunks(alone, learned.mean, *settings),
+        SpectralMap.of_chunks(learned.coded(), learned.mean, *settings),
+    ):
+        for name, tensor in learned.packed().items():
+            assert torch.equal(made.packed()[name], tensor)
+        assert torch.equal(made.scores(features[:5]), learned.scores(features[:5]))
+    assert len(learned.packed()["escapes"]) > 0
+    with refused("no chunks", "at least one"):
+        SpectralMap.of_chunks([], learned.mean)
