@@ -21,6 +21,7 @@ ORDER = [
     {"database"},
     {"recognition"},
     {"motion"},
+    {"streaming"},
     {"model"},
     {"live"},
     {"evaluation"},
@@ -41,14 +42,15 @@ ARROWS = {
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "data memory types",
-    "model": "types text data features periods database recognition motion",
+    "streaming": "types data features database",
+    "model": "types text data features periods database recognition motion streaming",
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model live evaluation "
     "training",
-    "cli": "types text data features periods database recognition motion model live evaluation training "
-    "experiments",
+    "cli": "types text data features periods database recognition motion streaming model live evaluation "
+    "training experiments",
 }
 
 

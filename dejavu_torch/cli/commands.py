@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from torch import nn
 
 from dejavu_torch.cli.device import device_of
+from dejavu_torch.data.chain import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of, with_parts
@@ -27,6 +28,7 @@ from dejavu_torch.recognition.calibration import NEVER
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.streaming.work import remove_work, work_folder_of
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
@@ -81,7 +83,7 @@ def run_demo(
 
 
 def run_learn(
-    source: str,
+    sources: Sequence[str],
     *,
     map: Path,
     seed: int = 0,
@@ -97,8 +99,8 @@ def run_learn(
     """Learn a map; print its plan, its summary and the bytes per place.
 
     Args:
-        source: folder of images, video (clip.mp4?width=160), .npy of frames or features,
-            sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
+        sources: folder of images, video (clip.mp4?width=160), .npy of frames or features,
+            sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96; several are one route, one behind the other
         map: map file to write (.safetensors)
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
@@ -114,22 +116,24 @@ def run_learn(
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
     check_output_file(map)
-    check_not_read(map, source, second, second_truth, descriptor, calibration, calibration_truth)
+    check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
     if calibration == NO_CALIBRATION and model.precision is not None:
         raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
     _set_seed(model, seed)
-    traverse = model.resample(open_source(source), progress=True)
+    traverse = model.resample(chained([open_source(source) for source in sources]), progress=True)
     _print_steps(traverse)
     traverse, views = _with_second(model, traverse, second, second_truth)
     if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
-        seen = f"--precision {model.precision}: {source} has no frames to calibrate by"
+        seen = f"--precision {model.precision}: {traverse.name} has no frames to calibrate by"
         raise InputError(f"{seen}; expected --calibration SOURCE")
     traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
-    model.learn(traverse, progress=True, second=views)
+    work = work_folder_of(map)
+    model.learn(traverse, progress=True, second=views, work=work)
     if calibration != NO_CALIBRATION:
         model.calibrate_if_possible(traverse, known)
     model.check_precision(None)
     model.save(map)
+    remove_work(work)
     print_map(model)
     if model.map.summary().covered:
         _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
