@@ -20,7 +20,7 @@ from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
-from dejavu_torch.data.selection import Selection
+from dejavu_torch.data.selection import Selection, runs
 from dejavu_torch.database.mapfile import HEADER, checksums, map_size, read_map, write_map
 from dejavu_torch.database.place_map import EXTRA, Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
@@ -49,7 +49,7 @@ from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.streaming import sample as streaming
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread
 from dejavu_torch.streaming.sample import sample_of
-from dejavu_torch.streaming.work import Fit, WorkFolder
+from dejavu_torch.streaming.work import Fit, WorkFolder, all_chunks
 from dejavu_torch.text import one_line
 from dejavu_torch.types import (
     BATCH_NUMBERS,
@@ -268,22 +268,7 @@ class DejaVu(nn.Module):
             mapper.transform,
             mapper.resolution,
         )
-        shards = coder.shards()
-        found = {} if folder is None else {shard: folder.finished(shard) for shard in shards}
-        made = {shard: chunks for shard, chunks in found.items() if chunks is not None}
-        try:
-            for shard, chunks in make(coder, traverse, [one for one in shards if one not in made], progress):
-                made[shard] = chunks
-                if folder is not None:
-                    folder.keep(shard, chunks)
-        except InputError as error:
-            kept = sum(one.places for chunks in made.values() for one in chunks)
-            if folder is None or not kept:
-                raise
-            raise InputError(
-                f"{error}; {kept} of {frames} places are kept in {work} for the next run"
-            ) from error
-        chunks = [one for shard in shards for one in made[shard]]
+        chunks = all_chunks(coder, traverse, folder, make, progress)
         settings = mapper.metric, mapper.transform, size, mapper.resolution
         route = SpectralMap.of_chunks(chunks, fit.mean, *settings).to(self.map.positions.device)
         route.needed = fit.needed
@@ -324,12 +309,16 @@ class DejaVu(nn.Module):
 
     def _run(self, traverse: Traverse, frames: int, second: Views | None) -> dict[str, str]:
         """What chunks are made of, as digests: see `WorkFolder`."""
+        mapper = self._chunked
+        assert mapper is not None
         header: dict[str, Any] = {
             name: part and recipe_of(part, REGISTRY)._asdict()
             for name, part in ((name, getattr(self, name)) for name in PARTS)
         }
         header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE, "torch": torch.__version__}
-        sources: dict[str, Any] = {"source": [traverse.identity(), frames]}
+        sampled = runs(sample_of(frames, int(mapper.chunk)).frame)
+        states = [traverse.state(run.start, run.stop) for run in sampled]
+        sources: dict[str, Any] = {"source": [traverse.identity(), frames, states]}
         if second is not None:
             sources["second"] = [second.traverse.identity(), second.places.tolist()]
         weights = self._weights("features")

@@ -103,8 +103,13 @@ class Traverse(ABC):
         return math.nan
 
     def identity(self) -> str:
-        """What tells these frames from others as far as can be told without reading them."""
+        """What tells these frames from others, as far as the way they are asked for does."""
         return f"{self.name} {self.length}"
+
+    def state(self, start: int, stop: int) -> str:
+        """What tells whether the frames [start, stop) were changed, as far as can be told without reading
+        them; such as the times of their files."""
+        return ""
 
     def count(self) -> int:
         """Number of frames, read through where the traverse does not know its length."""

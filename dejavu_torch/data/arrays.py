@@ -20,7 +20,6 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
 UNNAMED = "the array"
-AT_ONCE = 4096  # rows digested at a time
 HEADER = 2**14  # bytes; numpy parses no longer header
 EXPECTED = (
     "frames (N,H,W) or (N,H,W,3) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) float"
@@ -73,15 +72,12 @@ class ArrayTraverse(IndexedTraverse):
             batch.clamp_(0, 1)
         return batch
 
-    def identity(self) -> str:
+    def state(self, start: int, stop: int) -> str:
         file = getattr(self.values, "filename", None)
         if file is not None:
-            return f"{super().identity()} {state_of(Path(file))}"
-        digest = blake2b(digest_size=8)
-        for start in range(0, self.length, AT_ONCE):
-            part = torch.as_tensor(self.values[start : start + AT_ONCE]).detach().cpu().contiguous()
-            digest.update(part.view(-1).view(torch.uint8).numpy().data)
-        return f"{super().identity()} {tuple(self.values.shape)} {digest.hexdigest()}"
+            return state_of(Path(file))
+        part = torch.as_tensor(self.values[start:stop]).detach().cpu().contiguous()
+        return blake2b(part.view(-1).view(torch.uint8).numpy().data, digest_size=8).hexdigest()
 
     def __reduce__(self) -> Any:
         # a file is opened where the traverse goes; its numbers do not go along

@@ -63,9 +63,8 @@ class Chain(Traverse):
             yield from traverse.batches(size)
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        for traverse, first, end in zip(self.traverses, self.starts, self.starts[1:], strict=False):
-            if start < end and stop > first:
-                yield from traverse.between(max(0, start - first), min(stop, end) - first)
+        for traverse, first, last in self._within(start, stop):
+            yield from traverse.between(first, last)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
@@ -73,6 +72,9 @@ class Chain(Traverse):
 
     def identity(self) -> str:
         return " + ".join(one.identity() for one in self.traverses)
+
+    def state(self, start: int, stop: int) -> str:
+        return " + ".join(traverse.state(first, last) for traverse, first, last in self._within(start, stop))
 
     def frame_name(self, i: int) -> str:
         traverse, i = self._at(i)
@@ -82,6 +84,12 @@ class Chain(Traverse):
     def frame_time(self, i: int) -> float:
         traverse, i = self._at(i)
         return traverse.frame_time(i)
+
+    def _within(self, start: int, stop: int) -> Iterator[tuple[Traverse, int, int]]:
+        """Which frames of which traverses the frames [start, stop) are."""
+        for traverse, first, end in zip(self.traverses, self.starts, self.starts[1:], strict=False):
+            if max(start, first) < min(stop, end):
+                yield traverse, max(0, start - first), min(stop, end) - first
 
     def _at(self, i: int) -> tuple[Traverse, int]:
         """The traverse that frame i is of, and its number there."""

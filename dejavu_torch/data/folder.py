@@ -78,7 +78,10 @@ class ImageFolder(IndexedTraverse):
         return self.files[i].name
 
     def identity(self) -> str:
-        return f"{super().identity()} {self.width} x {self.height} {state_of(*self.files)}"
+        return f"{super().identity()} {self.width} x {self.height}"
+
+    def state(self, start: int, stop: int) -> str:
+        return state_of(*self.files[start:stop])
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file)

@@ -100,6 +100,10 @@ class FrameRange(Traverse):
     def identity(self) -> str:
         return f"{self.frames} of {self.traverse.identity()}"
 
+    def state(self, start: int, stop: int) -> str:
+        part = self.frames[start:stop]
+        return self.traverse.state(part[0], part[-1] + 1) if part else ""
+
     def frame_name(self, i: int) -> str:
         return self.traverse.frame_name(self.frames[i])
 

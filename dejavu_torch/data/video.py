@@ -102,7 +102,10 @@ class Video(Traverse):
             yield _as_tensor(batch)
 
     def identity(self) -> str:
-        return f"{self.name} {self.width} x {self.height} {state_of(self.path)}"
+        return f"{self.name} {self.width} x {self.height}"
+
+    def state(self, start: int, stop: int) -> str:
+        return state_of(self.path)
 
     def frame_name(self, i: int) -> str:
         """The time of frame i, such as 0:01:23.480; "" where the file has none."""

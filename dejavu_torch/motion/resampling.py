@@ -83,6 +83,10 @@ class ResampledTraverse(Traverse):
         digest = blake2b(self.positions.numpy().tobytes(), digest_size=8).hexdigest()
         return f"{self.traverse.identity()} at steps {digest}"
 
+    def state(self, start: int, stop: int) -> str:
+        frames = self.frame[start:stop]
+        return self.traverse.state(int(frames[0]), int(frames[-1]) + 1) if len(frames) else ""
+
     def frame_name(self, i: int) -> str:
         return self.traverse.frame_name(int(self.frame[i]))
 

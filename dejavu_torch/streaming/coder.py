@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import islice
+from itertools import chain, islice
 from typing import NamedTuple
 
 import torch
@@ -50,9 +50,7 @@ class ChunkCoder(NamedTuple):
         Raises:
             InputError: frames that cannot be read, or as of `feature_batches` and `code_chunk`.
         """
-        part = _Aligned(
-            traverse, wanted.start * self.chunk, min(wanted.stop * self.chunk, self.frames), self.chunk
-        )
+        part = _Aligned(traverse, *self.span(wanted), self.chunk)
         device = self.mean.device
         held: list[Tensor] = []
         left = part.length
@@ -65,6 +63,10 @@ class ChunkCoder(NamedTuple):
         if left:
             seen = f"{traverse.name} ended at frame {part.start + part.length - left}"
             raise InputError(f"{seen}; expected {self.frames} frames, as it had before")
+
+    def span(self, chunks: range) -> tuple[int, int]:
+        """The frames [start, stop) of chunks."""
+        return chunks.start * self.chunk, min(chunks.stop * self.chunk, self.frames)
 
     def shards(self) -> list[range]:
         """The numbers of all chunks, those that are made together in one range."""
@@ -88,7 +90,11 @@ class _Aligned(Traverse):
     def batches(self, size: int) -> Iterator[Tensor]:
         held: list[Tensor] = []
         done, wanted = 0, min(size, self.chunk, self.length)
-        for batch in self.traverse.select(range(self.start, self.start + self.length), size):
+        span = range(self.start, self.start + self.length)
+        # what cannot be read is then read with no chunk but its own
+        step = self.chunk if self.traverse.seeks else self.length
+        parts = (self.traverse.select(span[i : i + step], size) for i in range(0, self.length, step))
+        for batch in chain.from_iterable(parts):
             while len(batch):
                 part, batch = batch[:wanted], batch[wanted:]
                 held.append(part)
@@ -97,6 +103,8 @@ class _Aligned(Traverse):
                 if not wanted:
                     yield held[0] if len(held) == 1 else torch.cat(held)
                     held, wanted = [], min(size, self.chunk - done % self.chunk, self.length - done)
+        if held:  # the traverse ended early
+            yield torch.cat(held)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,8 @@ from dejavu_torch.data.output import make_output_folder, whole_file
 from dejavu_torch.database.codec import Stream
 from dejavu_torch.database.mapfile import read_map, write_map
 from dejavu_torch.database.spectral import CodedChunk
-from dejavu_torch.types import InputError
+from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here
+from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -82,10 +83,10 @@ class WorkFolder:
         tensors = {f"whitening.{name}": tensor for name, tensor in whitening.items()} | {"fit.mean": fit.mean}
         write_map(self.path / FIT, tensors, {"step": fit.step, "needed": fit.needed})
 
-    def finished(self, shard: range) -> list[CodedChunk] | None:
-        """The chunks of a shard, None if they are not there."""
+    def finished(self, shard: range, state: str) -> list[CodedChunk] | None:
+        """The chunks of a shard, None if they are not there, or of frames in another state."""
         read = self._read(_name(shard))
-        if read is None:
+        if read is None or read[1]["state"] != state:
             return None
         tensors, header = read
         places, sizes, sums, marks = tensors["shard.table"].unbind(1)
@@ -98,8 +99,8 @@ class WorkFolder:
             )
         ]
 
-    def keep(self, shard: range, chunks: list[CodedChunk]) -> None:
-        """Write the chunks of a shard.
+    def keep(self, shard: range, state: str, chunks: list[CodedChunk]) -> None:
+        """Write the chunks of a shard, made of frames in that state.
 
         Raises:
             InputError: the system refuses it; what was there before stays.
@@ -110,7 +111,7 @@ class WorkFolder:
             "shard.streams": torch.cat([one.stream.bytes for one in chunks]),
             "shard.escapes": torch.cat([one.escapes for one in chunks]),
         }
-        write_map(self.path / _name(shard), tensors, {"step": chunks[0].step})
+        write_map(self.path / _name(shard), tensors, {"step": chunks[0].step, "state": state})
 
     def _read(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
         if not (self.path / name).exists():
@@ -120,6 +121,43 @@ class WorkFolder:
         except InputError as error:
             log.warning("%s: it is made again", error)
             return None
+
+
+def all_chunks(
+    coder: ChunkCoder,
+    traverse: Traverse,
+    folder: WorkFolder | None = None,
+    make: Callable[..., Made] = code_here,
+    progress: str | None = None,
+) -> list[CodedChunk]:
+    """The chunks of a route: those that a folder has, and the others, made and kept there.
+
+    Args:
+        make: as `code_here`.
+
+    Raises:
+        InputError: frames that cannot be read, or a full disk; what is finished is kept.
+    """
+    shards, states = coder.shards(), {}
+    made: dict[range, list[CodedChunk]] = {}
+    for shard in shards if folder is not None else ():
+        assert folder is not None
+        states[shard] = traverse.state(*coder.span(shard))
+        found = folder.finished(shard, states[shard])
+        if found is not None:
+            made[shard] = found
+    try:
+        for shard, chunks in make(coder, traverse, [one for one in shards if one not in made], progress):
+            if folder is not None:
+                folder.keep(shard, states[shard], chunks)
+            made[shard] = chunks
+    except InputError as error:
+        kept = sum(one.places for chunks in made.values() for one in chunks)
+        if folder is None or not kept:
+            raise
+        told = f"{kept} of {coder.frames} places are kept in {folder.path} for the next run"
+        raise InputError(f"{error}; {told}") from error
+    return [one for shard in shards for one in made[shard]]
 
 
 def work_folder_of(path: Path) -> Path:

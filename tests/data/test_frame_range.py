@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
-from helpers import all_of, refused
+from helpers import Stream, all_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import types
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
-from dejavu_torch.types import Traverse
-
-
-class Stream(Traverse):
-    """Frames that can only be read from the beginning, of unknown length, in batches of odd sizes."""
-
-    def __init__(self, values: Tensor) -> None:
-        self.values = values
-
-    def batches(self, size: int) -> Iterator[Tensor]:
-        if len(self.values):
-            yield from self.values.split(min(size, 7))
-
 
 VALUES = torch.arange(40.0)[:, None]
 PARTS = st.tuples(st.integers(0, 39), st.integers(0, 40), st.integers(1, 45)).filter(

@@ -1,0 +1,125 @@
+"""Several traverses as one route."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from command_line import frames, write_images
+from helpers import Stream, all_of, refused
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.chain import Chain, chained
+from dejavu_torch.data.selection import Selection, runs
+from dejavu_torch.data.source import open_source
+from dejavu_torch.types import Traverse
+
+VALUES = torch.arange(40.0)[:, None]
+
+
+def parts(cuts: list[int], streams: bool) -> list[Traverse]:
+    bounds = [0, *sorted(cuts), len(VALUES)]
+    pieces = [VALUES[a:b] for a, b in pairwise(bounds) if b > a]
+    return [Stream(piece) if streams else ArrayTraverse(piece) for piece in pieces]
+
+
+@given(
+    st.lists(st.integers(0, 40), max_size=4),
+    st.booleans(),
+    st.integers(1, 50),
+    st.integers(0, 40),
+    st.integers(0, 45),
+)
+def test_a_chain_reads_as_one_traverse(
+    cuts: list[int], streams: bool, size: int, start: int, stop: int
+) -> None:
+    chain = Chain(parts(cuts, streams))
+    assert torch.equal(all_of(chain, size), VALUES)
+    assert chain.length == (None if streams else 40)
+    assert chain.count() == 40
+    between = [VALUES[:0], *chain.between(start, stop)]
+    assert torch.equal(torch.cat(between), VALUES[start:stop])
+    selected = [VALUES[:0], *chain.select(range(start, stop, 3), size)]
+    assert torch.equal(torch.cat(selected), VALUES[start:stop:3])
+
+
+@given(st.sets(st.integers(0, 39)), st.booleans(), st.integers(1, 50))
+def test_a_selection_has_the_frames_with_these_numbers(numbers: set[int], streams: bool, size: int) -> None:
+    frame = torch.tensor(sorted(numbers), dtype=torch.int64)
+    traverse = Stream(VALUES) if streams else ArrayTraverse(VALUES)
+    some = Selection(traverse, frame)
+    assert some.length == len(frame)
+    assert torch.equal(torch.cat([VALUES[:0], *some.batches(size)]), VALUES[frame])
+    assert [i for run in runs(frame) for i in run] == sorted(numbers)
+
+
+def test_frames_keep_their_names_behind_that_of_their_traverse(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    folders = [write_images(tmp_path / name, frames(count, size=16)) for name, count in (("a", 3), ("b", 2))]
+    chain = chained([open_source(folder) for folder in folders])
+    assert [chain.frame_name(i) for i in range(5)] == ["a/0.png", "a/1.png", "a/2.png", "b/0.png", "b/1.png"]
+    assert math.isnan(chain.frame_time(4))
+    assert chain.seeks
+    assert not Chain([Stream(VALUES), open_source(folders[0])][:1]).seeks
+    alone = open_source(folders[0])
+    assert chained([alone]) is alone
+
+
+def test_frames_of_other_sizes_are_refused() -> None:
+    pair = [ArrayTraverse(torch.zeros(3, 4), "left"), ArrayTraverse(torch.zeros(3, 5), "right")]
+    with refused("right", "5", "4", "left"):
+        Chain(pair)
+    with refused("no traverses"):
+        Chain([])
+
+
+@pytest.mark.parametrize("source", ["aerial", "outdoor", "underground"])
+def test_a_simulated_route_goes_elsewhere_without_its_drawings(source: str) -> None:
+    route = open_source(f"sim:{source}?frames=8&seed=3")
+    first = next(route.batches(2))
+    packed = pickle.dumps(route)
+    assert len(packed) < 1000
+    assert torch.equal(next(pickle.loads(packed).batches(2)), first)
+
+
+def test_an_array_goes_elsewhere_as_its_file(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    np.save(tmp_path / "route.npy", np.random.default_rng(0).random((5000, 8), np.float32))
+    route = open_source(tmp_path / "route.npy")
+    packed = pickle.dumps(route)
+    assert len(packed) < 1000
+    assert torch.equal(all_of(pickle.loads(packed)), all_of(route))
+
+
+def test_identities_tell_sources_apart(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    folder = write_images(tmp_path / "a", frames(3, size=16))
+    np.save(tmp_path / "b.npy", np.zeros((4, 8), np.float32))
+    sources = [folder, f"{folder}?width=8", f"{folder}?start=1", tmp_path / "b.npy", "sim:aerial?frames=9"]
+    sources.append("sim:aerial?frames=9&seed=1")
+    opened = [open_source(source) for source in sources]
+    opened += [ArrayTraverse(VALUES), ArrayTraverse(VALUES + 1), ArrayTraverse(VALUES.to(torch.bfloat16))]
+    opened.append(Chain([opened[0], opened[0]]))
+    identities = [one.identity() for one in opened]
+    assert len({*identities[:6], identities[-1]}) == 7
+    assert identities[:5] == [open_source(source).identity() for source in sources[:5]]
+    assert len({one.state(0, 3) for one in opened[6:9]}) == 3
+    assert ArrayTraverse(VALUES.clone()).state(0, 40) == opened[6].state(0, 40)
+    array, images, chain = (one.state(0, 3) for one in (opened[3], opened[0], opened[-1]))
+    later = opened[0].state(1, 3), opened[2].state(0, 2), opened[-1].state(1, 3), opened[-1].state(4, 6)
+    np.save(tmp_path / "b.npy", np.zeros((5, 8), np.float32))
+    (folder / "0.png").write_bytes((folder / "1.png").read_bytes() + b"\0")
+    assert open_source(tmp_path / "b.npy").state(0, 3) != array
+    assert opened[0].state(0, 3) != images
+    assert opened[-1].state(0, 3) != chain
+    # what was changed is no other frame's
+    assert later == (
+        *(opened[0].state(1, 3), opened[2].state(0, 2)),
+        *(opened[-1].state(1, 3), opened[-1].state(4, 6)),
+    )
+    (folder / "0.png").unlink()
+    with refused("0.png"):
+        opened[0].state(0, 1)

@@ -1,0 +1,296 @@
+"""A long route, learned chunk by chunk: the same bytes however it is read, interrupted or divided."""
+
+from __future__ import annotations
+
+import errno
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from command_line import frames, write_images
+from helpers import Stream, refused
+from torch import Tensor
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.chain import Chain
+from dejavu_torch.data.source import open_source
+from dejavu_torch.database.spectral import SpectralMapper, code_chunk
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.views import Views
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.model import DejaVu
+from dejavu_torch.streaming import coder, sample
+from dejavu_torch.streaming.coder import ChunkCoder, code_here, joined
+from dejavu_torch.streaming.sample import sample_of
+from dejavu_torch.streaming.work import all_chunks, remove_work, work_folder_of
+from dejavu_torch.types import Traverse
+
+CHUNK, PLACES = 50, 1030
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sample, "SAMPLE", 400)
+    monkeypatch.setattr(coder, "SHARD", 100)  # 11 shards of two chunks
+
+
+def route(places: int = PLACES, numbers: int = 12) -> Tensor:
+    noise = torch.randn(places + 9, 1, numbers, generator=torch.Generator().manual_seed(1))
+    return 4 * torch.nn.functional.avg_pool1d(noise.permute(2, 1, 0), 10, 1)[:, 0].T.contiguous()
+
+
+def learned(traverse: Traverse | Tensor, bytes_: float = 3.0, **settings: object) -> DejaVu:
+    return DejaVu(mapper=SpectralMapper(bytes_, chunk=CHUNK)).learn(traverse, **settings)  # type: ignore[arg-type]
+
+
+def file_of(model: DejaVu, folder: Path) -> bytes:
+    model.save(folder / "map.safetensors")
+    return (folder / "map.safetensors").read_bytes()
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The places of each chunk that is coded."""
+    seen: list[int] = []
+
+    def counted(descriptors: Tensor, *rest: object) -> object:
+        seen.append(len(descriptors))
+        return code_chunk(descriptors, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(coder, "code_chunk", counted)
+    return seen
+
+
+def test_chunks_are_those_of_their_own_descriptors() -> None:
+    model = learned(route())
+    whitening, mapper = model.whitening, model.mapper
+    assert whitening is not None
+    coded = model.map.coded()
+    for part, own in zip(route().split(CHUNK), coded, strict=True):
+        descriptors = torch.cat([whitening(batch) for batch in part.split(model.batch_size)])
+        expected = code_chunk(descriptors, model.map.mean, own.step, mapper.transform, mapper.resolution)
+        assert torch.equal(own.stream.bytes, expected.stream.bytes)
+        assert own.places == len(part)
+    found = model.localize(route()[::7])
+    assert (found.index == torch.arange(0, PLACES, 7)).float().mean() > 0.95
+
+
+def test_a_short_route_is_learned_from_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sample, "SAMPLE", PLACES)
+    model = DejaVu(mapper=SpectralMapper(3.0, chunk=CHUNK))
+    whole = model.learn_features(model.describe_reference(ArrayTraverse(route())), ArrayTraverse(route()))
+    assert file_of(learned(route(), work=tmp_path / "work"), tmp_path) == file_of(whole, tmp_path)
+    assert not (tmp_path / "work").exists()
+
+
+def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path: Path) -> None:
+    whole = file_of(learned(route()), tmp_path)
+    parts = route().split([333, 1, 696])
+    assert file_of(learned(Stream(route())), tmp_path) == whole  # of unknown length, in odd batches
+    assert file_of(learned(Chain([ArrayTraverse(part) for part in parts])), tmp_path) == whole
+    assert file_of(learned(Chain([Stream(part) for part in parts])), tmp_path) == whole
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert file_of(learned(route()), tmp_path) == whole
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_bytes_do_not_hang_on_the_order_of_shards(tmp_path: Path) -> None:
+    def shuffled(*work: object) -> Iterator[object]:
+        model, traverse, shards, text = work
+        for shard in sorted(shards, key=lambda shard: shard.start * 7 % 11):  # type: ignore[call-overload]
+            yield from code_here(model, traverse, [shard], text)  # type: ignore[arg-type]
+
+    assert file_of(learned(route(), make=shuffled), tmp_path) == file_of(learned(route()), tmp_path)
+
+
+def test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks() -> None:
+    found = sample_of(PLACES, CHUNK)
+    starts = found.frame[:: found.stretch]
+    assert found.stretch == CHUNK
+    assert len(found.frame) == 400
+    assert set((starts % CHUNK).tolist()) == {0}
+    assert starts[0] == 0
+    assert starts[-1] == PLACES // CHUNK * CHUNK - CHUNK
+    assert int(starts.diff().max() - starts.diff().min()) <= CHUNK
+    # long chunks leave room for several stretches
+    found = sample_of(PLACES, 500)
+    assert found.stretch == 100
+    assert len(found.frame) == 400
+    assert int(found.frame.max()) < PLACES
+
+
+def test_the_budget_is_met_as_far_as_the_sample_tells(caplog: pytest.LogCaptureFixture) -> None:
+    def size(model: DejaVu) -> float:
+        return model.summary().route_bytes / PLACES
+
+    with caplog.at_level(logging.WARNING):
+        assert abs(size(learned(route(), 4.0)) / 4 - 1) < 0.05
+        caplog.clear()
+        louder = route()
+        louder[:CHUNK] *= 0.1  # the sample has all of it, and less of what follows
+        louder[CHUNK : 2 * CHUNK] *= 9
+        model = learned(louder, 4.0)
+    assert abs(size(model) / 4 - 1) > 0.02
+    assert [text for text in caplog.messages if f"{size(model):.3g}" in text and "400 of its 1030" in text]
+
+
+def test_names_count_in_the_budget(tmp_path: Path) -> None:
+    class Named(ArrayTraverse):
+        def frame_name(self, i: int) -> str:
+            return f"{i * i % 10007}"
+
+    model = learned(Named(route()), 12.0)
+    names = model.summary().route["names"] / PLACES
+    assert 1 < names < 6
+    assert abs(model.summary().route_bytes / PLACES / 12 - 1) < 0.05
+    assert model.frame_names[3] == "9"
+
+
+def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
+    torch.manual_seed(0)
+    noisy = route() + 0.2 * torch.randn(PLACES, 12)
+    views = Views(ArrayTraverse(noisy), torch.arange(PLACES))
+    assert len(sample_of(PLACES, CHUNK).views(views).places) == 400
+    shown = sample_of(PLACES, CHUNK).views(Views(views.traverse, torch.arange(PLACES) - 30))
+    assert torch.equal(sample_of(PLACES, CHUNK).frame[shown.places] + 30, shown.traverse.frame)  # type: ignore[attr-defined]
+    model = DejaVu(whitening=Whitening(numbers=8), mapper=SpectralMapper(8.0, chunk=CHUNK))
+    model.learn(route(), second=views)
+    assert (model.localize(noisy[::7]).index == torch.arange(0, PLACES, 7)).float().mean() > 0.9
+
+
+def test_finished_chunks_are_not_made_again(tmp_path: Path, made: list[int]) -> None:
+    whole = file_of(learned(route()), tmp_path)
+    assert sum(made) == PLACES
+    made.clear()
+
+    def killed(*work: object) -> Iterator[object]:
+        for done, part in enumerate(code_here(*work)):  # type: ignore[arg-type]
+            if done == 4:
+                raise KeyboardInterrupt
+            yield part
+
+    with pytest.raises(KeyboardInterrupt):
+        learned(route(), work=tmp_path / "work", make=killed)
+    assert len(made) >= 8
+    made.clear()
+    again = learned(route(), work=tmp_path / "work")
+    assert sum(made) == PLACES - 8 * CHUNK
+    assert file_of(again, tmp_path) == whole
+    made.clear()
+    # one that is damaged, and one that is lost
+    files = sorted((tmp_path / "work").glob("chunks-*"))
+    files[2].write_bytes(files[2].read_bytes()[:-1])
+    files[5].unlink()
+    assert file_of(learned(route(), work=tmp_path / "work"), tmp_path) == whole
+    assert made == [CHUNK] * 4
+    remove_work(tmp_path / "work")
+    assert not (tmp_path / "work").exists()
+
+
+def test_chunks_of_another_run_are_refused(tmp_path: Path) -> None:
+    folder = work_folder_of(tmp_path / "map.safetensors")
+    assert folder.name == "map.safetensors.work"
+    learned(route(), work=folder)
+    kept = {file.name: file.read_bytes() for file in folder.iterdir()}
+    with refused(str(folder), "settings"):
+        learned(route(), bytes_=3.5, work=folder)
+    with refused(str(folder), "source"):
+        learned(route() + 1, work=folder)
+    with refused(str(folder), "source"):
+        learned(route(PLACES + 1), work=folder)
+    with refused(str(folder), "second"):
+        learned(route(), work=folder, second=Views(ArrayTraverse(route() + 0.1), torch.arange(PLACES)))
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == kept
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with refused("mine"):
+        learned(route(), work=tmp_path / "mine")
+    remove_work(tmp_path / "mine")
+    assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
+
+
+def test_a_full_disk_keeps_what_is_finished(
+    tmp_path: Path, made: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = file_of(learned(route()), tmp_path)
+    save, room = safetensors.torch.save_file, iter(range(4))  # the fit, and three shards
+
+    def full(*file: object) -> None:
+        if next(room, None) is None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(*file)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(safetensors.torch, "save_file", full)
+        with refused("No space left", "300 of 1030", "work"):
+            learned(route(), work=tmp_path / "work")
+    made.clear()
+    assert file_of(learned(route(), work=tmp_path / "work"), tmp_path) == whole
+    assert sum(made) == PLACES - 300
+
+
+def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path: Path, made: list[int]) -> None:
+    folder = write_images(tmp_path / "route", frames(520, size=16))
+    good = (folder / "434.png").read_bytes()
+    settings = {"features": HOG(cell=8), "whitening": "none"}
+
+    def model() -> DejaVu:
+        return DejaVu(**settings, mapper=SpectralMapper(8.0, chunk=CHUNK))  # type: ignore[arg-type]
+
+    assert 434 not in sample_of(520, CHUNK).frame
+    whole = file_of(model().learn(open_source(folder)), tmp_path)
+    (folder / "434.png").write_bytes(b"no image")
+    with refused("434.png", "400 of 520", "work"):
+        model().learn(open_source(folder), work=tmp_path / "work")
+    (folder / "434.png").write_bytes(good)
+    made.clear()
+    assert file_of(model().learn(open_source(folder), work=tmp_path / "work"), tmp_path) == whole
+    assert sum(made) == 120
+    # what was changed since is made again, and nothing else
+    made.clear()
+    (folder / "434.png").write_bytes((folder / "435.png").read_bytes())
+    model().learn(open_source(folder), work=tmp_path / "work")
+    assert sum(made) == 100
+
+
+def test_a_route_that_ends_early_is_refused() -> None:
+    model = DejaVu(whitening="none", mapper=SpectralMapper(3.0, chunk=CHUNK))
+    settings = (model.pipeline, None, 64, PLACES + 60, CHUNK, route().mean(0).bfloat16(), 0.1, "dft", 0.0)
+    with refused("1030", "1090"):
+        all_chunks(ChunkCoder(*settings), ArrayTraverse(route()))  # type: ignore[arg-type]
+
+
+def test_shards_cover_all_chunks_once() -> None:
+    whole = ChunkCoder(None, None, 64, 1030, 30, torch.zeros(1), 1.0, "dft", 0.0)  # type: ignore[arg-type]
+    numbers = [chunk for shard in whole.shards() for chunk in shard]
+    assert numbers == list(range(35))
+    assert whole.span(whole.shards()[-1]) == (960, 1030)
+    assert [len(run) for run in joined([whole.shards()[i] for i in (0, 1, 3, 5, 6, 7)])] == [2, 1, 3]
+
+
+def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = route(PLACES, 40)
+    small = DejaVu().describe_reference(ArrayTraverse(values))
+    assert small.dtype == torch.float32
+    monkeypatch.setattr("dejavu_torch.model.IN_MEMORY", PLACES * 160 - 1)
+    monkeypatch.setattr("dejavu_torch.model.FEW_DESCRIPTORS", PLACES * 100)
+    model = DejaVu(whitening=Whitening(numbers=32))
+    found = model.describe_reference(ArrayTraverse(values))
+    assert found.dtype == torch.float16
+    assert found.shape == (PLACES, 33)
+    assert model.whitening is not None
+    other = DejaVu(whitening=Whitening(numbers=32))
+    other.describe_reference(ArrayTraverse(values[sample_of(PLACES, sample.SAMPLE).frame]))
+    for name, value in other.whitening.state_dict().items():  # type: ignore[union-attr]
+        assert torch.equal(value, model.whitening.state_dict()[name])
+    exact = model.whitening(values)
+    assert torch.allclose(found.float(), exact, rtol=1e-3, atol=1e-3)
+    learnt = DejaVu(whitening=Whitening(numbers=32)).learn(values)
+    assert (learnt.localize(values[::7]).index == torch.arange(0, PLACES, 7)).float().mean() > 0.95

@@ -1,0 +1,114 @@
+"""`dejavu learn` of long routes: what a kill leaves, and what comes of it."""
+
+from __future__ import annotations
+
+import errno
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, frames, run, write_images
+
+from dejavu_torch.cli import main
+from dejavu_torch.model import DejaVu
+
+# more than the sample, of which features are ready
+CHUNKED = ("--mapper.chunk", "250", "--mapper.route_bytes_per_place", "2")
+LONG, NUMBERS = 16_100, 8
+
+
+@pytest.fixture(scope="module")
+def route(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    noise = torch.randn(LONG + 19, NUMBERS, generator=torch.Generator().manual_seed(0))
+    smooth = 9 * torch.nn.functional.avg_pool1d(noise.T[:, None], 20, 1)[:, 0].T
+    path = tmp_path_factory.mktemp("route") / "route.npy"
+    np.save(path, smooth.numpy())
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(route: Path) -> Path:
+    """The map of a run that nothing disturbs."""
+    path = route.with_name("whole.safetensors")
+    main(["learn", str(route), "--map", str(path), *CHUNKED])
+    return path
+
+
+def test_a_killed_run_goes_on_where_it_was(route: Path, whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "route.safetensors"
+    command = [sys.executable, "-m", "dejavu_torch.cli", "learn", str(route), "--map", str(out), *CHUNKED]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    folder = tmp_path / "route.safetensors.work"
+    stop = time.monotonic() + 120
+    while len(list(folder.glob("chunks-*"))) < 3 and time.monotonic() < stop:
+        time.sleep(0.01)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert not out.exists()
+    kept = {file: file.stat().st_mtime_ns for file in folder.glob("chunks-*")}
+    assert 3 <= len(kept) < 13
+    # the state of each file when the map is about to be written
+    seen: dict[Path, int] = {}
+    save = DejaVu.save
+
+    def noted(self: DejaVu, path: str | Path) -> None:
+        seen.update({file: file.stat().st_mtime_ns for file in folder.glob("chunks-*")})
+        save(self, path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DejaVu, "save", noted)
+        run("learn", route, "--map", out, *CHUNKED)
+    assert len(seen) == 13
+    assert {file: seen[file] for file in kept} == kept
+    assert out.read_bytes() == whole.read_bytes()
+    assert sorted(file.name for file in tmp_path.iterdir()) == [out.name]
+
+
+def test_another_command_does_not_take_over_what_is_finished(
+    route: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "full")
+
+    out = tmp_path / "route.safetensors"
+    folder = tmp_path / "route.safetensors.work"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DejaVu, "save", full)
+        assert "full" in fails(capsys, "learn", route, "--map", out, *CHUNKED)
+    kept = sorted(folder.iterdir())
+    error = fails(capsys, "learn", route, "--map", out, *CHUNKED[:2], "--mapper.route_bytes_per_place", "3")
+    assert str(folder) in error
+    assert "settings" in error
+    assert "removed" in error
+    assert sorted(folder.iterdir()) == kept
+    run("learn", route, "--map", out, *CHUNKED)
+    assert out.read_bytes() == whole.read_bytes()
+
+
+def test_several_sources_are_one_route(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = frames(60, size=16)
+    every = write_images(tmp_path / "every", images)
+    parts = [
+        write_images(tmp_path / name, images[part]) for name, part in (("a", slice(25)), ("b", slice(25, 60)))
+    ]
+    settings = ("--whitening", "none", "--calibration", "none", "--mapper.route_bytes_per_place", "20")
+    run("learn", *parts, "--map", tmp_path / "parts.safetensors", *settings)
+    run("learn", every, "--map", tmp_path / "every.safetensors", *settings)
+    capsys.readouterr()
+    one, other = (DejaVu.load(tmp_path / f"{name}.safetensors") for name in ("parts", "every"))
+    assert one.frame_names[24:26] == ["a/24.png", "b/0.png"]
+    assert one.map.places == other.map.places == 60
+    queries = torch.rand(3, 1, 16, 16)
+    assert torch.allclose(one(queries), other(queries), atol=0.05)
+    wide = write_images(tmp_path / "wide", frames(5, size=24))
+    error = fails(capsys, "learn", parts[0], wide, "--map", tmp_path / "x.safetensors", *settings)
+    assert "24 x 24" in error
+    assert "wide" in error
+    assert "16 x 16" in error
+    error = fails(capsys, "learn", "--map", tmp_path / "x.safetensors")
+    assert "sources" in error
