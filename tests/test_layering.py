@@ -23,6 +23,7 @@ ORDER = [
     {"motion"},
     {"streaming"},
     {"model"},
+    {"cluster"},
     {"live"},
     {"evaluation"},
     {"training"},

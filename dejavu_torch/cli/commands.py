@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import shlex
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +30,7 @@ from dejavu_torch.recognition.calibration import NEVER
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.streaming.coder import Made, code_here
 from dejavu_torch.streaming.work import remove_work, work_folder_of
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
@@ -92,6 +95,7 @@ def run_learn(
     descriptor: Path | None = None,
     calibration: str | None = None,
     calibration_truth: str | None = None,
+    cluster: str | None = None,
     device: str = "cpu",
     model: DejaVu,
     command: str,
@@ -109,8 +113,12 @@ def run_learn(
         calibration: another traverse of the same places, which tells how probably answers are right; changed
             frames of the route itself if not given, none if "none"
         calibration_truth: which places it shows, as --truth
+        cluster: Ray workers that make the chunks of a long route: auto, one for each processor of this
+            machine, or the address of a cluster. Sources are read there, by the same paths
         device: what learns: cpu, cuda or cuda:1
     """
+    if cluster is not None:
+        _check_cluster(cluster, model, device)
     model.to(device_of(device, learns=True))
     if map.suffix != ".safetensors":
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
@@ -128,7 +136,8 @@ def run_learn(
         raise InputError(f"{seen}; expected --calibration SOURCE")
     traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
     work = work_folder_of(map)
-    model.learn(traverse, progress=True, second=views, work=work)
+    with _making(cluster) as make:
+        model.learn(traverse, progress=True, second=views, work=work, make=make)
     if calibration != NO_CALIBRATION:
         model.calibrate_if_possible(traverse, known)
     model.check_precision(None)
@@ -624,6 +633,31 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         _print_next(
             "learn", "ROUTE", "--descriptor", map, *_features_of(model, command), "--map", "route.safetensors"
         )
+
+
+def _check_cluster(cluster: str, model: DejaVu, device: str) -> None:
+    """Refuse early what no cluster does."""
+    from dejavu_torch.cluster.session import check_installed
+
+    if device != "cpu":
+        raise InputError(f"--cluster {cluster} and --device {device}; expected one of them")
+    if getattr(model.mapper, "chunk", "route") == "route":
+        seen = f"--cluster {cluster} makes chunks of a route, and this map's is one"
+        raise InputError(f"{seen}; expected --mapper.chunk with a number of places, such as 1000")
+    check_installed()
+
+
+@contextmanager
+def _making(cluster: str | None) -> Iterator[Callable[..., Made]]:
+    """What makes the chunks of a long route: this process, or a cluster, which is there within the block."""
+    if cluster is None:
+        yield code_here
+        return
+    from dejavu_torch.cluster.learning import code_on
+    from dejavu_torch.cluster.session import Cluster
+
+    with Cluster(cluster) as workers:
+        yield partial(code_on, workers)
 
 
 def _load_map(path: Path, features: nn.Module | None = None) -> DejaVu:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain, islice
 from typing import NamedTuple
@@ -111,7 +111,7 @@ class _Aligned(Traverse):
         return self.traverse.frame_shape
 
 
-Made = Iterator[tuple[range, list[CodedChunk]]]
+Made = Generator[tuple[range, list[CodedChunk]], None, None]
 
 
 def code_here(

@@ -6,6 +6,7 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -147,10 +148,12 @@ def all_chunks(
         if found is not None:
             made[shard] = found
     try:
-        for shard, chunks in make(coder, traverse, [one for one in shards if one not in made], progress):
-            if folder is not None:
-                folder.keep(shard, states[shard], chunks)
-            made[shard] = chunks
+        missing = [one for one in shards if one not in made]
+        with closing(make(coder, traverse, missing, progress)) as parts:
+            for shard, chunks in parts:
+                if folder is not None:
+                    folder.keep(shard, states[shard], chunks)
+                made[shard] = chunks
     except InputError as error:
         kept = sum(one.places for chunks in made.values() for one in chunks)
         if folder is None or not kept:

@@ -1,0 +1,1 @@
+"""Learning and localizing on many machines, by Ray."""

@@ -1,0 +1,203 @@
+"""A connection to Ray, which runs functions of ours on other processes and machines."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import signal
+import socket
+import sys
+import sysconfig
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from torch import nn
+
+from dejavu_torch.data.output import SIGNALS
+from dejavu_torch.text import one_line
+from dejavu_torch.types import InputError
+
+AUTO = "auto"
+RETRIES = 3  # of a task whose worker died
+AHEAD = 2  # tasks for each processor that are handed out at a time
+QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}  # no telemetry, no advice
+
+
+class Failure(NamedTuple):
+    """Why a task came to nothing, and on which host."""
+
+    why: str
+    host: str
+
+
+class Cluster:
+    """Workers that run tasks: those of a Ray cluster, or of one that is started on this machine.
+
+    Args:
+        address: "auto" starts one worker for each processor of this machine; else that of a cluster, such as
+            `10.0.0.1:6379`, or `ray://10.0.0.1:10001` from outside it.
+
+    Convention: what a task needs goes to the workers by value, code of the user included; this package has
+        to be installed there. Relative paths count from this process's folder, where a worker has one of
+        that name.
+
+    Raises:
+        InputError: Ray is not installed, or no cluster at that address.
+    """
+
+    def __init__(self, address: str = AUTO) -> None:
+        os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
+        self.address = address
+        self.ray: Any = _ray()
+        logging.getLogger("ray").setLevel(logging.ERROR)
+        quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
+        handlers = {number: signal.getsignal(number) for number in SIGNALS}
+        try:
+            if address == AUTO:
+                self.ray.init(num_cpus=processors(), include_dashboard=False, address="local", **quiet)
+            else:
+                self.ray.init(address=address, **quiet)
+        except Exception as error:  # of any type
+            raise InputError(
+                f"no Ray cluster at {address}: {one_line(error)[:200]}; expected `auto`, or the address that "
+                "`ray start --head` printed"
+            ) from error
+        finally:  # Ray takes them
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        self.workers = max(1, int(self.ray.cluster_resources().get("CPU", 1)))
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection, and the workers that `auto` started."""
+        self.ray.shutdown()
+
+    def put(self, *values: object) -> list[Any]:
+        """Values for all tasks, sent to a worker once: what `run` takes as `shared`."""
+        with _by_value(self.ray, values):
+            return [self.ray.put(values)]
+
+    def run(
+        self, function: Callable[..., Any], shared: list[Any], tasks: Sequence[Any]
+    ) -> Generator[tuple[Any, Any], None, None]:
+        """Run `function(task, *shared)` for all tasks: each with its result, as they are finished.
+
+        A task whose worker dies is run again, `RETRIES` times.
+
+        Returns:
+            What the function returned, or a `Failure`.
+        """
+        remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_run)
+        here, waiting = os.getcwd(), deque(tasks)
+        running: dict[Any, Any] = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < AHEAD * self.workers:
+                    task = waiting.popleft()
+                    running[remote.remote(function, shared, task, here)] = task
+                done, _ = self.ray.wait(list(running))
+                for one in done:
+                    yield running.pop(one), self._result(one)
+        finally:
+            for one in running:
+                with suppress(Exception):
+                    self.ray.cancel(one, force=True)
+
+    def _result(self, reference: Any) -> Any:
+        try:
+            return self.ray.get(reference)
+        except self.ray.exceptions.RayTaskError:  # an error of ours
+            raise
+        except self.ray.exceptions.RayError as error:
+            seen = f"its worker died, {RETRIES + 1} times ({one_line(error)[:100]})"
+            return Failure(f"{seen}; expected workers that live, and memory for them", self.address)
+
+
+def processors() -> int:
+    """Processors that this process may use."""
+    with suppress(AttributeError):  # of Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def check_installed() -> None:
+    """Refuse early to work without Ray.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    _ray()
+
+
+def _ray() -> Any:
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        raise InputError(
+            f"Ray is not there ({one_line(error)}); expected it: pip install 'dejavu_torch[cluster]'"
+        ) from error
+
+
+_shared: dict[str, Any] = {}  # of a worker process: what it was sent last
+
+
+def _run(function: Callable[..., Any], shared: list[Any], task: Any, folder: str) -> Any:
+    """A task, in a worker."""
+    import ray
+
+    with suppress(OSError):
+        os.chdir(folder)
+    key = shared[0].hex()
+    if key not in _shared:
+        _shared.clear()
+        _shared[key] = ray.get(shared[0])
+    try:
+        return function(task, *_shared[key])
+    except (InputError, OSError, RuntimeError, MemoryError) as error:
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        return Failure(kind + one_line(error), socket.gethostname())
+
+
+@contextmanager
+def _by_value(ray: Any, values: Iterable[object]) -> Iterator[None]:
+    """In the block, classes of the user's own files are sent as code: workers do not have these files."""
+    own = {module.__name__: module for value in values for module in _modules_of(value)}
+    for module in own.values():
+        ray.cloudpickle.register_pickle_by_value(module)
+    try:
+        yield
+    finally:
+        for module in own.values():
+            ray.cloudpickle.unregister_pickle_by_value(module)
+
+
+def _modules_of(value: object) -> Iterator[ModuleType]:
+    """The modules of the user's own files that the classes of a value, and of its parts, come from."""
+    parts: list[object] = [value]
+    if isinstance(value, tuple | list):
+        parts += [part for one in value for part in _modules_of(one)]
+    if isinstance(value, nn.Module):
+        parts += [*value.modules()]
+    for part in parts:
+        found = part if isinstance(part, ModuleType) else sys.modules.get(type(part).__module__)
+        if found is not None and _is_own(found):
+            yield found
+
+
+def _is_own(module: ModuleType) -> bool:
+    """Whether a module is a file of the user's, and not one that is installed."""
+    file = getattr(module, "__file__", None)
+    if file is None or module.__name__ == "__main__" or module.__name__.split(".")[0] == "dejavu_torch":
+        return False
+    installed = {Path(place).resolve() for place in sysconfig.get_paths().values()}
+    return not any(Path(file).resolve().is_relative_to(place) for place in installed)
