@@ -33,7 +33,7 @@ settings.load_profile("repeatable")
 
 # whole commands, trainings, real footage and notebooks: not in a developer's inner loop
 SLOW = (
-    *("training", "experiments", "motion", "fuzz", "test_cli", "test_faults", "test_readme"),
+    *("training", "experiments", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
     "test_real_routes",
     *(
         "test_periods_on_real_data",

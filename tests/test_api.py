@@ -15,7 +15,7 @@ import dejavu_torch
 
 PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
-HEAVY = ["pytorch_lightning", "lightning", "torchmetrics", "matplotlib", "av", "numba", "cv2"]
+HEAVY = ["pytorch_lightning", "lightning", "torchmetrics", "matplotlib", "av", "numba", "cv2", "ray"]
 
 
 def test_the_front_door_names_what_it_offers() -> None:

@@ -45,13 +45,14 @@ ARROWS = {
     "motion": "data memory types",
     "streaming": "types data features database",
     "model": "types text data features periods database recognition motion streaming",
+    "cluster": "types text data database streaming",
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model live evaluation "
     "training",
-    "cli": "types text data features periods database recognition motion streaming model live evaluation "
-    "training experiments",
+    "cli": "types text data features periods database recognition motion streaming model cluster live "
+    "evaluation training experiments",
 }
 
 

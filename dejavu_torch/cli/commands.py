@@ -642,8 +642,10 @@ def _check_cluster(cluster: str, model: DejaVu, device: str) -> None:
     if device != "cpu":
         raise InputError(f"--cluster {cluster} and --device {device}; expected one of them")
     if getattr(model.mapper, "chunk", "route") == "route":
-        seen = f"--cluster {cluster} makes chunks of a route, and this map's is one"
-        raise InputError(f"{seen}; expected --mapper.chunk with a number of places, such as 1000")
+        seen = (
+            f"--cluster {cluster} makes chunks, into which a {type(model.mapper).__name__} divides no route"
+        )
+        raise InputError(f"{seen}; expected a spectral map of --mapper.chunk places each, such as 1000")
     check_installed()
 
 

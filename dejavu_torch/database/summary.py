@@ -12,7 +12,7 @@ from dejavu_torch.periods.support import common_period, shared_factor
 from dejavu_torch.types import Plan
 
 LAYERS_SHOWN = 6
-CHUNKS_SHOWN = 32  # of a summary in lines
+CHUNKS_SHOWN = 12  # of a summary in lines
 LARGE = 10**9  # a common period beyond it is no figure that a person compares
 
 

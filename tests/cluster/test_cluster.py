@@ -1,0 +1,161 @@
+"""A route learned by two workers: the file of one process, whatever happens to them."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+import threading
+import time
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from command_line import fails, frames, write_images
+from helpers import Stream, refused
+from torch import Tensor, nn
+
+from dejavu_torch.cluster import session
+from dejavu_torch.cluster.learning import code_on
+from dejavu_torch.cluster.session import Cluster
+from dejavu_torch.data.source import open_source
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.model import DejaVu
+from dejavu_torch.streaming import coder, sample
+from dejavu_torch.types import Traverse
+
+CHUNK, PLACES = 50, 620
+FEATURES = """
+import os, time
+from pathlib import Path
+import torch
+
+class Watched(torch.nn.Module):
+    '''Means of blocks. A worker says its number and waits until it may go on; a white frame ends it.'''
+
+    def __init__(self, folder):
+        super().__init__()
+        self.folder, self.home = str(folder), os.getpid()
+
+    def forward(self, frames):
+        if os.getpid() != self.home:
+            here = Path(self.folder)
+            (here / f"{os.getpid()}.worker").touch()
+            while not (here / "go").exists():
+                time.sleep(0.01)
+            if (here / "deadly").exists() and (frames.flatten(1).amin(1) > 0.95).any():
+                os._exit(1)
+        return torch.nn.functional.avg_pool2d(frames, 4).flatten(1)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sample, "SAMPLE", 400)
+    monkeypatch.setattr(coder, "SHARD", 100)
+
+
+@pytest.fixture
+def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> nn.Module:
+    """Features of a user's own file, which is gone before any worker could read it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "features_of_mine.py").write_text(FEATURES)
+    module: ModuleType = importlib.import_module("features_of_mine")
+    (tmp_path / "features_of_mine.py").unlink()
+    monkeypatch.delitem(sys.modules, "features_of_mine", raising=False)
+    sys.modules["features_of_mine"] = module
+    features: nn.Module = module.Watched(tmp_path)
+    return features
+
+
+def route() -> Tensor:
+    noise = torch.randn(PLACES + 9, 1, 8, generator=torch.Generator().manual_seed(1))
+    return 4 * torch.nn.functional.avg_pool1d(noise.permute(2, 1, 0), 10, 1)[:, 0].T.contiguous()
+
+
+def learned(traverse: Traverse | Tensor, features: nn.Module | None = None, **settings: object) -> DejaVu:
+    model = DejaVu(features, "none", SpectralMapper(6.0, chunk=CHUNK))
+    return model.learn(traverse, **settings)  # type: ignore[arg-type]
+
+
+def file_of(model: DejaVu, folder: Path) -> bytes:
+    model.save(folder / "map.safetensors")
+    return (folder / "map.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["array", "stream"])
+def test_workers_write_the_file_of_one_process(kind: str, cluster: Cluster, tmp_path: Path) -> None:
+    traverse = route() if kind == "array" else Stream(route())
+    whitened = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK)).learn(traverse)  # type: ignore[arg-type]
+    other = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
+    other.learn(traverse, make=partial(code_on, cluster))  # type: ignore[arg-type]
+    assert file_of(other, tmp_path) == file_of(whitened, tmp_path)
+
+
+def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Module, tmp_path: Path) -> None:
+    images = write_images(tmp_path / "route", frames(PLACES, size=16))
+    whole = file_of(learned(open_source(images), watched), tmp_path)
+    killed: list[int] = []
+
+    def kill() -> None:
+        stop = time.monotonic() + 60
+        while not killed and time.monotonic() < stop:
+            for file in tmp_path.glob("*.worker"):
+                killed.append(int(file.stem))
+                os.kill(killed[0], signal.SIGKILL)
+                break
+            time.sleep(0.01)
+        (tmp_path / "go").touch()
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    model = learned(open_source(images), watched, work=tmp_path / "work", make=partial(code_on, cluster))
+    thread.join()
+    assert killed
+    assert killed[0] != os.getpid()
+    assert len(list(tmp_path.glob("*.worker"))) >= 2
+    assert file_of(model, tmp_path) == whole
+
+
+def test_what_cannot_be_made_is_named_and_only_that_is_made_again(
+    cluster: Cluster, watched: nn.Module, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "RETRIES", 0)
+    bright = frames(PLACES, size=16)
+    bright[444] = 255
+    assert not {110, 444} & set(sample.sample_of(PLACES, CHUNK).frame.tolist())
+    images = write_images(tmp_path / "route", bright)
+    good = (images / "110.png").read_bytes()
+    whole = file_of(learned(open_source(images), watched), tmp_path)
+    (images / "110.png").write_bytes(b"no image")
+    (tmp_path / "go").touch()
+    (tmp_path / "deadly").touch()
+    settings = {"work": tmp_path / "work", "make": partial(code_on, cluster)}
+    with refused("110.png", "read on", "1 more such part", "420 of 620"):
+        learned(open_source(images), watched, **settings)
+    (images / "110.png").write_bytes(good)
+    with refused("frames 400 to 499", "worker died", "520 of 620"):
+        learned(open_source(images), watched, **settings)
+    (tmp_path / "deadly").unlink()
+    dealt: list[range] = []
+
+    def noted(*work: object) -> object:
+        dealt.extend(work[2])  # type: ignore[call-overload]
+        return code_on(cluster, *work)  # type: ignore[arg-type]
+
+    settings["make"] = noted
+    assert file_of(learned(open_source(images), watched, **settings), tmp_path) == whole
+    assert dealt == [range(8, 10)]
+
+
+def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ("learn", "sim:aerial?frames=64", "--map", tmp_path / "map.safetensors")
+    chunked = (*command, "--mapper.chunk", "50")
+    assert "--mapper.chunk" in fails(capsys, *command, "--cluster", "auto")
+    assert "TemplateMapper" in fails(capsys, *command, "--config", "local_maxima", "--cluster", "auto")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "ray", None)
+        assert "pip install 'dejavu_torch[cluster]'" in fails(capsys, *chunked, "--cluster", "auto")
