@@ -20,7 +20,7 @@ from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.database.mapfile import map_size, read_map, write_map
-from dejavu_torch.database.place_map import EXTRA, Mapper, PlaceMap
+from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
 from dejavu_torch.database.schema import checked, checked_fields
 from dejavu_torch.database.spectral import SpectralMapper
@@ -681,7 +681,7 @@ class DejaVu(nn.Module):
                 setattr(model, name, getattr(header, name))
             own = {name: weights.pop(name) for name in tensors if name.startswith("map.")}
             if own or header.map.get("places") != 0:
-                model.map.load_state_dict(_map_state(model.map, own, header))
+                _load_map(model.map, own, header)
             else:
                 checked(header.map, model.map.state, "its map")
                 model.map.set_extra_state(header.map)
@@ -893,19 +893,14 @@ def read_place_map(path: Path) -> PlaceMap:
             raise InputError(NO_MAP)
         route = mapper.empty()
         own = {name: tensor for name, tensor in tensors.items() if name.startswith("map.")}
-        route.load_state_dict(_map_state(route, own, header))
+        _load_map(route, own, header)
     return route
 
 
-def _map_state(route: PlaceMap, tensors: dict[str, Tensor], header: Header) -> dict[str, Any]:
-    """The state of a map, from the tensors that a file holds of it."""
+def _load_map(route: PlaceMap, tensors: dict[str, Tensor], header: Header) -> None:
+    """Fill a map with what a file holds of it."""
     checked(header.map, route.state, "its map")
-    packed = {name.removeprefix("map."): tensor for name, tensor in tensors.items()}
-    state = {**route.unpacked(packed), EXTRA: header.map}
-    missing = route.state_dict().keys() - state.keys()
-    if missing:
-        raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
-    return state
+    route.load_packed({name.removeprefix("map."): tensor for name, tensor in tensors.items()}, header.map)
 
 
 def _check_weights(header: Header, tensors: dict[str, Tensor], given: nn.Module | None) -> None:
