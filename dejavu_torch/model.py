@@ -43,7 +43,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
-from dejavu_torch.recognition.matching import Found, Matching, joined
+from dejavu_torch.recognition.matching import Found, Matching, found_lowest, joined
 from dejavu_torch.text import one_line
 from dejavu_torch.types import (
     BATCH_NUMBERS,
@@ -60,7 +60,7 @@ log = logging.getLogger("dejavu_torch")
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
 TRIAL_SCORES = 2**22  # of the queries of a trial at all places
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
-ROWS = 4096  # descriptors whitened at a time
+ROWS = 4096  # descriptors on the device at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
 
 NO_MAP = "a descriptor without a map; expected a map, as `dejavu learn SOURCE --descriptor FILE` makes of it"
@@ -596,6 +596,8 @@ class DejaVu(nn.Module):
             matching.sequence.check(None, self.map.places)
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         device = self.map.positions.device  # many descriptors lie in a file
+        if matching.lowest and order is None:  # no score of another place is needed
+            return self._lowest(batches, at_once)
         parts = (part.to(device) for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence
         alone = not matching.lengths and matching.platt is None and order is None
@@ -606,6 +608,16 @@ class DejaVu(nn.Module):
             place = order.argsort()
             scores = (part[:, place.to(part.device)] for part in scores)
         return matching.stream(scores)
+
+    def _lowest(self, batches: Iterable[Tensor], at_once: int) -> Iterator[Found]:
+        """The best place of each query, by the map's own way or from `at_once` queries' scores at a time."""
+        for part in (part for descriptors in batches for part in descriptors.split(ROWS)):
+            queries = part.to(self.map.positions.device)
+            lowest = self.map.lowest(queries)
+            if lowest is None:
+                yield from Matching().stream(map(self.map.scores, queries.split(at_once)))
+            else:
+                yield found_lowest(*lowest)
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""

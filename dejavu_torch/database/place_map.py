@@ -81,6 +81,16 @@ class PlaceMap(nn.Module, ABC):
         """
         yield start, self.scores_between(queries, start, self.places if stop is None else stop)
 
+    def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
+        """The lowest score of each query and its place, where that takes less than the scores of all places.
+
+        Shape: (Q,D) -> (Q,) and (Q,) int64, -1 where no place has a finite score; None where the map has no
+            such way.
+
+        Convention: what the minimum of `scores` is, the lowest place of equal scores; no gradient.
+        """
+        return None
+
     def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """Scores of consecutive queries together, from batches (B,D) of them: (B,N) each.
 
