@@ -365,7 +365,7 @@ class AerialRoad(SimulatedRoute):
                 _sample(tile, at % period, column, row)
                 for tile, period in zip(self._tiles, TILES, strict=True)
             ]
-            seen = torch.where((row < HEIGHT / 2)[:, None], *halves)
+            seen = torch.where((row < HEIGHT / 2)[:, None], halves[0], halves[1])
         seen = F.avg_pool2d(seen, fine) * self._gain[at, :, None, None]
         seen = seen ** self._gamma[at, None, None, None]
         for frame, i in zip(seen, at.tolist(), strict=True):

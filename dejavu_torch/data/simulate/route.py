@@ -84,7 +84,7 @@ def _problem(key: str, value: object, default: object, allowed: Mapping[str, Any
         return "" if value in allowed["names"] else " or ".join(allowed["names"])
     low, high = allowed["span"]
     whole = isinstance(default, int)
-    if isinstance(value, Integral if whole else Real) and low <= value <= high:  # type: ignore[operator]
+    if isinstance(value, Integral if whole else Real) and low <= value <= high:
         return ""
     span = f"{low} <= {key} <= {high}" if high < math.inf else f"{key} >= {low}"
     return f"{span}, a whole number" if whole else span
