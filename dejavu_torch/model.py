@@ -361,7 +361,9 @@ class DejaVu(nn.Module):
         self.frame_shape, self.trained, self.calibration = shape or None, None, None
         return self
 
-    def calibrate(self, reference: Traverse | Tensor | None, views: Views | None = None) -> DejaVu:
+    def calibrate(
+        self, reference: Traverse | Tensor | None, views: Views | None = None, start: int = 0
+    ) -> DejaVu:
         """Find out how probably answers are right that stand out so much; `Match.probability` then tells it.
 
         Args:
@@ -370,6 +372,7 @@ class DejaVu(nn.Module):
                 whitening, which has seen the plain ones.
             views: frames of another traverse of the same places instead, which tell of its own changes;
                 those that show no place are left out.
+            start: the place that the reference's first frame is, as where it was appended to a map.
 
         Returns:
             self, with `self.calibration`.
@@ -391,8 +394,8 @@ class DejaVu(nn.Module):
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
-            stretches = Stretches(as_traverse(reference), self.map.places, strengths)
-            views, length = stretches.views, stretches.stretch
+            stretches = Stretches(as_traverse(reference), self.map.places - start, strengths)
+            views, length = Views(stretches, start + stretches.places), stretches.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
         name = views.traverse.name
@@ -410,14 +413,14 @@ class DejaVu(nn.Module):
             raise InputError(f"calibrating by {name}: {error}") from error
         return self
 
-    def calibrate_if_possible(self, reference: Traverse, views: Views | None = None) -> None:
+    def calibrate_if_possible(self, reference: Traverse, views: Views | None = None, start: int = 0) -> None:
         """As `calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
         reference."""
         if views is not None:
             self.calibrate(reference, views)
         elif self.calibration is None and len(reference.frame_shape) == 3 and self.map.summary().covered:
             try:
-                self.calibrate(reference)
+                self.calibrate(reference, start=start)
             except InputError as error:
                 log.warning("the map is not calibrated: %s", error)
 

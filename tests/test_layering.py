@@ -22,6 +22,7 @@ ORDER = [
     {"recognition"},
     {"motion"},
     {"model"},
+    {"growth"},
     {"live"},
     {"evaluation"},
     {"training"},
@@ -42,13 +43,14 @@ ARROWS = {
     "recognition": "types",
     "motion": "data memory types",
     "model": "types text data features periods database recognition motion",
+    "growth": "types data features database model motion",
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model live evaluation "
     "training",
-    "cli": "types text data features periods database recognition motion model live evaluation training "
-    "experiments",
+    "cli": "types text data features periods database recognition motion model growth live evaluation "
+    "training experiments",
 }
 
 

@@ -12,13 +12,16 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
 from torch import nn
 
+from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of, with_parts
 from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision, check_sizes
 from dejavu_torch.motion.ground_plane import check_corners
@@ -81,9 +84,10 @@ def run_demo(
 
 
 def run_learn(
-    source: str,
+    source: str | None = None,
     *,
-    map: Path,
+    map: Path | None = None,
+    append: Path | None = None,
     seed: int = 0,
     second: str | None = None,
     second_truth: str | None = None,
@@ -100,6 +104,8 @@ def run_learn(
         source: folder of images, video (clip.mp4?width=160), .npy of frames or features,
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
         map: map file to write (.safetensors)
+        append: map file behind whose places those of the source come; it is written again unless --map names
+            another file
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
@@ -109,7 +115,13 @@ def run_learn(
         calibration_truth: which places it shows, as --truth
         device: what learns: cpu, cuda or cuda:1
     """
-    model.to(device_of(device, learns=True))
+    where, map = device_of(device, learns=True), append if map is None else map
+    assert source is not None  # the parser has seen to both
+    assert map is not None
+    if append is None:
+        model.to(where)
+    else:
+        model = _map_to_append_to(append, model).to(where)
     if map.suffix != ".safetensors":
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
@@ -118,19 +130,26 @@ def run_learn(
     if calibration == NO_CALIBRATION and model.precision is not None:
         raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
     _set_seed(model, seed)
-    traverse = model.resample(open_source(source), progress=True)
+    traverse = model.resample(open_source(source), model.step, progress=True)
     _print_steps(traverse)
     traverse, views = _with_second(model, traverse, second, second_truth)
     if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
         seen = f"--precision {model.precision}: {source} has no frames to calibrate by"
         raise InputError(f"{seen}; expected --calibration SOURCE")
     traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
-    model.learn(traverse, progress=True, second=views)
+    start = model.map.places
+    if append is None:
+        model.learn(traverse, progress=True, second=views)
+    else:
+        growth.append(model, traverse, progress=True)
+        known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
     if calibration != NO_CALIBRATION:
-        model.calibrate_if_possible(traverse, known)
+        model.calibrate_if_possible(traverse, known, start)
     model.check_precision(None)
     model.save(map)
     print_map(model)
+    if append is not None:
+        _say(f"{model.map.places - start} places behind the {start} of {append}; written to {map}")
     if model.map.summary().covered:
         _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
     else:
@@ -328,7 +347,6 @@ def run_compare(
         device: as of `dejavu learn`
     """
     from dejavu_torch.experiments.compare import compare
-    from dejavu_torch.features.hog import HOG
 
     where = device_of(device, learns=map is None)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
@@ -620,6 +638,22 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         _print_next(
             "learn", "ROUTE", "--descriptor", map, *_features_of(model, command), "--map", "route.safetensors"
         )
+
+
+def _map_to_append_to(path: Path, given: DejaVu) -> DejaVu:
+    """The map of a file, which can grow, and accepts what the options say.
+
+    Args:
+        given: what the options say; of its features only what a file cannot bring counts.
+    """
+    default = recipe_of(given.features, REGISTRY) == recipe_of(HOG(), REGISTRY)
+    model = _load_map(path, None if default else given.features)
+    try:
+        growth.growing(model)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    _accept_by(model, given.threshold, given.precision)
+    return model
 
 
 def _load_map(path: Path, features: nn.Module | None = None) -> DejaVu:
