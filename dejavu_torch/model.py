@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import logging
 import math
@@ -19,11 +20,12 @@ from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
-from dejavu_torch.database.mapfile import map_size, read_map, write_map
+from dejavu_torch.data.selection import Selection
+from dejavu_torch.database.mapfile import HEADER, checksums, map_size, read_map, write_map
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
 from dejavu_torch.database.schema import checked, checked_fields
-from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.database.weights import BITS, is_rounded, packed, round_weights, unpacked
@@ -31,7 +33,7 @@ from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import check_queries, feature_batches, features_of
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.memory import concatenate
+from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import STRETCH, AugmentedTraverse, Stretches, Views
@@ -44,6 +46,10 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, found_lowest, joined
+from dejavu_torch.streaming import sample as streaming
+from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread
+from dejavu_torch.streaming.sample import sample_of
+from dejavu_torch.streaming.work import Fit, WorkFolder
 from dejavu_torch.text import one_line
 from dejavu_torch.types import (
     BATCH_NUMBERS,
@@ -61,6 +67,8 @@ SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
 TRIAL_SCORES = 2**22  # of the queries of a trial at all places
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors on the device at a time
+FEW_DESCRIPTORS = IN_MEMORY // 4  # bytes
+OFF = 0.02  # of the bytes per place asked for: worth a word
 MANY_FEATURES = 50_000  # per frame: worth a word
 
 NO_MAP = "a descriptor without a map; expected a map, as `dejavu learn SOURCE --descriptor FILE` makes of it"
@@ -184,7 +192,12 @@ class DejaVu(nn.Module):
         return own | {"whitening": self.whitening or "none"}
 
     def learn(
-        self, traverse: Traverse | Tensor, progress: bool = False, second: Views | None = None
+        self,
+        traverse: Traverse | Tensor,
+        progress: bool = False,
+        second: Views | None = None,
+        work: Path | None = None,
+        make: Callable[..., Made] = code_here,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
 
@@ -192,11 +205,18 @@ class DejaVu(nn.Module):
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
             second: see `describe_reference`; `views` makes it.
             progress: show a progress bar on a terminal.
+            work: folder where the finished chunks of a long route are kept, so that learning goes on from
+                there after a kill; it is the caller's to remove.
+            make: what makes the chunks of a long route: `code_here`, or a cluster.
 
         Returns:
             self, with the map in `self.map`. A route in which nothing repeats gives a template map without
             layers, on which every place scores +inf. Features beyond `concatenate`'s share of the memory
             spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
+
+        Convention: of a route of over `SAMPLE` frames a spectral map with an integer chunk learns whitening,
+            mean and step from a sample of them, see `sample_of`, and its chunks are made one by one. Memory
+            holds a chunk, the sample and the map, whatever the number of frames.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes.
@@ -205,11 +225,131 @@ class DejaVu(nn.Module):
         text = "learning" if progress else None
         before = None if self.whitening is None else self.whitening.state_dict()
         try:
+            frames = 0 if self._chunked is None else traverse.count()
+            if frames > streaming.SAMPLE:
+                return self._learn_chunks(traverse, frames, second, text, work, make)
             return self.learn_features(self.describe_reference(traverse, second, text), traverse)
         except InputError:  # the map that there was is of its own whitening
             if self.whitening is not None and before is not None:
                 self.whitening.load_state_dict(before)
             raise
+
+    @property
+    def _chunked(self) -> SpectralMapper | None:
+        """The mapper, where it codes chunk by chunk."""
+        mapper = self.mapper
+        return mapper if isinstance(mapper, SpectralMapper) and mapper.chunk != "route" else None
+
+    def _learn_chunks(
+        self,
+        traverse: Traverse,
+        frames: int,
+        second: Views | None,
+        progress: str | None,
+        work: Path | None,
+        make: Callable[..., Made],
+    ) -> DejaVu:
+        """As `learn`, of a route of over `SAMPLE` frames."""
+        mapper = self._chunked
+        assert mapper is not None
+        size = int(mapper.chunk)
+        names, positions = self._beside(traverse, frames)
+        taken = positions.nbytes + _bytes_of(names)
+        folder = None if work is None else WorkFolder(work, self._run(traverse, frames, second))
+        with in_one_thread():
+            fit = self._fit(traverse, frames, second, taken, progress, folder)
+        coder = ChunkCoder(
+            self.pipeline,
+            self.whitening,
+            self._at_once,
+            frames,
+            size,
+            *fit[:2],
+            mapper.transform,
+            mapper.resolution,
+        )
+        shards = coder.shards()
+        found = {} if folder is None else {shard: folder.finished(shard) for shard in shards}
+        made = {shard: chunks for shard, chunks in found.items() if chunks is not None}
+        try:
+            for shard, chunks in make(coder, traverse, [one for one in shards if one not in made], progress):
+                made[shard] = chunks
+                if folder is not None:
+                    folder.keep(shard, chunks)
+        except InputError as error:
+            kept = sum(one.places for chunks in made.values() for one in chunks)
+            if folder is None or not kept:
+                raise
+            raise InputError(
+                f"{error}; {kept} of {frames} places are kept in {work} for the next run"
+            ) from error
+        chunks = [one for shard in shards for one in made[shard]]
+        settings = mapper.metric, mapper.transform, size, mapper.resolution
+        route = SpectralMap.of_chunks(chunks, fit.mean, *settings).to(self.map.positions.device)
+        route.needed = fit.needed
+        self._say_reached(route, taken)
+        return self._take(route, traverse, names, positions)
+
+    def _fit(
+        self,
+        traverse: Traverse,
+        frames: int,
+        second: Views | None,
+        taken: int,
+        progress: str | None,
+        folder: WorkFolder | None,
+    ) -> Fit:
+        """Learn the whitening from a sample of a long route; mean and step of its chunks."""
+        found = None if folder is None else folder.fit()
+        if found is not None:
+            if self.whitening is not None:
+                self.whitening.load_state_dict(found[1])
+            return found[0]
+        mapper = self._chunked
+        assert mapper is not None
+        size = int(mapper.chunk)
+        sample = sample_of(frames, size)
+        part = Selection(traverse, sample.frame)
+        descriptors = self.describe_reference(part, second and sample.views(second), progress and "sampling")
+        # what the file holds once counts for the sample by its share alone
+        share, once = len(descriptors) / frames, 2 * descriptors.shape[1]
+        other = copy.copy(mapper.beside(round(share * taken - (1 - share) * once)))
+        other.chunk = sample.stretch
+        with torch.no_grad():
+            route = other(descriptors)
+        fit = Fit(route.mean, float(route.steps[0]), route.needed)
+        if folder is not None:
+            folder.keep_fit(fit, {} if self.whitening is None else self.whitening.state_dict())
+        return fit
+
+    def _run(self, traverse: Traverse, frames: int, second: Views | None) -> dict[str, str]:
+        """What chunks are made of, as digests: see `WorkFolder`."""
+        header: dict[str, Any] = {
+            name: part and recipe_of(part, REGISTRY)._asdict()
+            for name, part in ((name, getattr(self, name)) for name in PARTS)
+        }
+        header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE, "torch": torch.__version__}
+        sources: dict[str, Any] = {"source": [traverse.identity(), frames]}
+        if second is not None:
+            sources["second"] = [second.traverse.identity(), second.places.tolist()]
+        weights = self._weights("features")
+        if self.whitening is not None and self.whitening.fixed:
+            weights |= self._weights("whitening")
+        sums = checksums(weights, header)
+        sums["settings"] = sums.pop(HEADER)
+        return sums | {name: checksums({}, {name: value})[HEADER] for name, value in sources.items()}
+
+    def _say_reached(self, route: SpectralMap, taken: int) -> None:
+        """What a long route takes, where the sample told wrongly."""
+        wanted, places = getattr(self.mapper, "route_bytes_per_place", None), route.places
+        if wanted is None:
+            return
+        reached = (route.summary().route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
+        if abs(reached / wanted - 1) > OFF:
+            log.warning(
+                "route_bytes_per_place is %g, and the route takes %.3g: its step is of %d of its %d places",
+                *(wanted, reached, streaming.SAMPLE, places),
+            )
 
     def describe_reference(
         self, traverse: Traverse, second: Views | None = None, progress: str | None = None
@@ -223,14 +363,25 @@ class DejaVu(nn.Module):
 
         Shape: -> (N,K).
 
+        Convention: for a spectral map, a whitening of features beyond `concatenate`'s share of the memory is
+            learned from a sample of them, see `sample_of`, and descriptors beyond a quarter of it lie in a
+            temporary file as float16, which is finer than any step.
+
         Raises:
             InputError: as `learn`, or a second traverse that no whitening learns from.
         """
         whitening = self.whitening
         if second is not None:
             self._require_learning_whitening(second.traverse.name)
+        spectral = isinstance(self.mapper, SpectralMapper)
+        if whitening is not None and not whitening.fixed and spectral and self._has_many_features(traverse):
+            sample = sample_of(traverse.count(), streaming.SAMPLE)
+            part = Selection(traverse, sample.frame)
+            self.describe_reference(part, second and sample.views(second), progress and "sampling")
+            return concatenate(self.extract(traverse, progress), FEW_DESCRIPTORS, half=True)
         if whitening is None or whitening.fixed:
-            return self.extract_all(traverse, progress)
+            batches = self.extract(traverse, progress)
+            return concatenate(batches, FEW_DESCRIPTORS, half=True) if spectral else concatenate(batches)
         device = self.map.positions.device
         features = concatenate(self._features(traverse, progress))
         if second is None and len(traverse.frame_shape) == 3:
@@ -249,6 +400,14 @@ class DejaVu(nn.Module):
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
         return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
+
+    def _has_many_features(self, traverse: Traverse) -> bool:
+        """Whether the features of a traverse are too many to be held, so that a sample has to do."""
+        if traverse.length is not None and traverse.length <= streaming.SAMPLE:
+            return False
+        one = next(self._features(Selection(traverse, torch.zeros(1, dtype=torch.int64))))
+        frames = traverse.count()
+        return frames > streaming.SAMPLE and frames * one.nbytes > IN_MEMORY
 
     def views(self, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
         """Another traverse of the reference's places, for `learn`; resampled where the reference is.
@@ -271,7 +430,7 @@ class DejaVu(nn.Module):
             InputError: nothing says which places it shows, or it shows none.
         """
         second = self.resample(second, getattr(reference, "step", None))
-        frames, shown = _count(reference), _count(second)
+        frames, shown = reference.count(), second.count()
         found = ground_truth_of(truth, reference, second, frames, shown)
         if found is None:
             steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
@@ -338,14 +497,7 @@ class DejaVu(nn.Module):
                 "each frame gives %d features; smaller frames make a smaller and faster map",
                 features.shape[1],
             )
-        if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
-            log.warning("these are ready features: channel and contrast are left as they are")
-        step: float | None = None
-        source, frames, positions = traverse, len(features), self.map.positions.new_zeros(0)
-        if isinstance(traverse, ResampledTraverse):
-            step, source, frames = traverse.step, traverse.traverse, len(traverse.positions)
-            positions = traverse.positions.to(positions.device)
-        names = [] if source is None else names_of(source, frames)
+        names, positions = self._beside(traverse, len(features))
         mapper = self.mapper.beside(positions.nbytes + _bytes_of(names))
         with torch.no_grad():
             route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
@@ -354,9 +506,27 @@ class DejaVu(nn.Module):
                 f"{type(self.mapper).__name__} made a map of {route.places} places of {route.dimension} "
                 f"features from features {tuple(features.shape)}; expected as many"
             )
+        return self._take(route, traverse, names, positions)
+
+    def _beside(self, traverse: Traverse | None, places: int) -> tuple[list[str], Tensor]:
+        """What a file holds beside the map of a traverse: names of its frames, and their positions."""
+        positions = self.map.positions.new_zeros(0)
+        if isinstance(traverse, ResampledTraverse):
+            positions = traverse.positions.to(positions.device)
+            return names_of(traverse.traverse, len(positions)), positions
+        return [] if traverse is None else names_of(traverse, places), positions
+
+    def _take(
+        self, route: PlaceMap, traverse: Traverse | None, names: list[str], positions: Tensor
+    ) -> DejaVu:
+        """The map that was learned of a traverse, with what `_beside` gave."""
+        shape = () if traverse is None else traverse.frame_shape
+        if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
+            log.warning("these are ready features: channel and contrast are left as they are")
         if len(positions):
             route.positions = positions
             route.check()
+        step = traverse.step if isinstance(traverse, ResampledTraverse) else None
         self.map, self.step, self.frame_names = route, step, names
         self.frame_shape, self.trained, self.calibration = shape or None, None, None
         return self
@@ -628,10 +798,14 @@ class DejaVu(nn.Module):
 
     def _features(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """What whitening takes: features of a traverse in batches (B,D), without gradients."""
+        return feature_batches(traverse, self.pipeline, self._at_once, self.map.positions.device, progress)
+
+    @property
+    def _at_once(self) -> int:
+        """Frames of a batch: fewer than asked for where they are brought to a large size."""
         resize = getattr(self.features, "resize", None) if type(self.features) in CLASSES else None
-        pixels = math.prod(resize or (1,))  # that a frame is brought to
-        at_once = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
-        return feature_batches(traverse, self.pipeline, at_once, self.map.positions.device, progress)
+        pixels = math.prod(resize or (1,))
+        return max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
         """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""
@@ -840,11 +1014,6 @@ def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tenso
 def _bytes_of(names: list[str]) -> int:
     """What the names of frames take in a map file."""
     return len(encode_names(names)) if names else 0
-
-
-def _count(traverse: Traverse) -> int:
-    """Frames of a traverse, read where it does not know its length."""
-    return sum(map(len, traverse.batches(64))) if traverse.length is None else traverse.length
 
 
 class Header(NamedTuple):

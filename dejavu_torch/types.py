@@ -44,11 +44,13 @@ class Traverse(ABC):
         length: number of frames N, or None where only reading to the end can tell.
         place: (N,) float64, the true position of each frame in units of reference frames,
             or None where it is unknown.
+        seeks: whether `between` reads nothing ahead of the first frame that is asked for.
     """
 
     name: str = "traverse"
     length: int | None = None
     place: Tensor | None = None
+    seeks: bool = False
 
     @abstractmethod
     def batches(self, size: int) -> Iterator[Tensor]:
@@ -99,6 +101,14 @@ class Traverse(ABC):
     def frame_time(self, i: int) -> float:
         """When frame i was taken, in seconds; NaN where that is not known."""
         return math.nan
+
+    def identity(self) -> str:
+        """What tells these frames from others as far as can be told without reading them."""
+        return f"{self.name} {self.length}"
+
+    def count(self) -> int:
+        """Number of frames, read through where the traverse does not know its length."""
+        return sum(map(len, self.batches(64))) if self.length is None else self.length
 
     def batch_size(self, most: int) -> int:
         """How many frames to read at a time: `most`, or fewer where frames are large.

@@ -21,6 +21,7 @@ ORDER = [
     {"database"},
     {"recognition"},
     {"motion"},
+    {"streaming"},
     {"model"},
     {"growth"},
     {"live"},
@@ -42,14 +43,16 @@ ARROWS = {
     "database": "types memory data periods",
     "recognition": "types",
     "motion": "data memory types",
-    "model": "types text data features periods database recognition motion",
+    "streaming": "types data features database",
+    "model": "types text data features periods database recognition motion streaming",
     "growth": "types data features database model motion",
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model live evaluation "
     "training",
-    "cli": "types text data features periods database recognition motion model growth live evaluation "
+    "cli": "types text data features periods database recognition motion streaming model growth live "
+    "evaluation "
     "training experiments",
 }
 

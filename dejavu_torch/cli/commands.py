@@ -17,6 +17,7 @@ from torch import nn
 
 from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
+from dejavu_torch.data.chain import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of, with_parts
@@ -30,6 +31,7 @@ from dejavu_torch.recognition.calibration import NEVER
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.streaming.work import remove_work, work_folder_of
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
@@ -84,7 +86,7 @@ def run_demo(
 
 
 def run_learn(
-    source: str | None = None,
+    sources: Sequence[str] = (),
     *,
     map: Path | None = None,
     append: Path | None = None,
@@ -101,8 +103,8 @@ def run_learn(
     """Learn a map; print its plan, its summary and the bytes per place.
 
     Args:
-        source: folder of images, video (clip.mp4?width=160), .npy of frames or features,
-            sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96
+        sources: folder of images, video (clip.mp4?width=160), .npy of frames or features,
+            sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96; several are one route, one behind the other
         map: map file to write (.safetensors)
         append: map file behind whose places those of the source come; it is written again unless --map names
             another file
@@ -116,8 +118,7 @@ def run_learn(
         device: what learns: cpu, cuda or cuda:1
     """
     where, map = device_of(device, learns=True), append if map is None else map
-    assert source is not None  # the parser has seen to both
-    assert map is not None
+    assert map is not None  # the parser has seen to it
     if append is None:
         model.to(where)
     else:
@@ -126,20 +127,22 @@ def run_learn(
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
     check_output_file(map)
-    check_not_read(map, source, second, second_truth, descriptor, calibration, calibration_truth)
+    check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
     if calibration == NO_CALIBRATION and model.precision is not None:
         raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
     _set_seed(model, seed)
-    traverse = model.resample(open_source(source), model.step, progress=True)
+    traverse = chained([open_source(source) for source in sources])
+    traverse = model.resample(traverse, model.step, progress=True)
     _print_steps(traverse)
     traverse, views = _with_second(model, traverse, second, second_truth)
     if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
-        seen = f"--precision {model.precision}: {source} has no frames to calibrate by"
+        seen = f"--precision {model.precision}: {traverse.name} has no frames to calibrate by"
         raise InputError(f"{seen}; expected --calibration SOURCE")
     traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
-    start = model.map.places
+    start, work = model.map.places, None
     if append is None:
-        model.learn(traverse, progress=True, second=views)
+        work = work_folder_of(map)
+        model.learn(traverse, progress=True, second=views, work=work)
     else:
         growth.append(model, traverse, progress=True)
         known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
@@ -147,6 +150,8 @@ def run_learn(
         model.calibrate_if_possible(traverse, known, start)
     model.check_precision(None)
     model.save(map)
+    if work is not None:
+        remove_work(work)
     print_map(model)
     if append is not None:
         _say(f"{model.map.places - start} places behind the {start} of {append}; written to {map}")

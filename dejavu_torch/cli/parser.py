@@ -179,7 +179,7 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
     Args:
         function: its positional parameters are positional arguments, optional ones where they have a default,
             its keyword-only ones are options, and `Args:` of its docstring has their help. Those annotated
-            `Sequence` take any number of words.
+        `Sequence` take any number of words, or, without a default, at least one.
     """
     text = docstring_parser.parse(inspect.getdoc(function) or "")
     helps = {one.arg_name: one.description for one in text.params}
@@ -195,7 +195,8 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
         if parameter.annotation is bool:
             settings["action"] = "store_true"
         elif get_origin(parameter.annotation) is Sequence:
-            settings |= {"type": get_args(parameter.annotation)[0], "nargs": "*", "default": list(default)}
+            settings |= {"type": get_args(parameter.annotation)[0], "nargs": "+"}
+            settings |= {} if default is parameter.empty else {"nargs": "*", "default": list(default)}
         else:
             settings["type"] = parameter.annotation
             if default is not parameter.empty:
@@ -252,7 +253,10 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
                 there = "a --map" if given == "map" else f"the map of --{given}"
                 raise UsageError(f"--{one}: {there} has its own settings; expected one or the other")
         if name == "learn":
-            needed = {"source": arguments["source"], "--map": arguments["map"] or arguments["append"]}
+            needed = {
+                "source": arguments["sources"] or None,
+                "--map": arguments["map"] or arguments["append"],
+            }
             missing = ", ".join(one for one, value in needed.items() if value is None)
             if missing:
                 raise UsageError(f"the following arguments are required: {missing}")

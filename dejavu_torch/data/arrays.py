@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import math
+from hashlib import blake2b
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import LARGEST, reading
+from dejavu_torch.data.files import LARGEST, reading, state_of
 from dejavu_torch.data.folder import ROUNDING
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
@@ -18,6 +20,7 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
 UNNAMED = "the array"
+AT_ONCE = 4096  # rows digested at a time
 HEADER = 2**14  # bytes; numpy parses no longer header
 EXPECTED = (
     "frames (N,H,W) or (N,H,W,3) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) float"
@@ -69,6 +72,21 @@ class ArrayTraverse(IndexedTraverse):
                 raise InputError(f"{self.name}: frame {frames[at]} holds {seen}; expected 0 to 1")
             batch.clamp_(0, 1)
         return batch
+
+    def identity(self) -> str:
+        file = getattr(self.values, "filename", None)
+        if file is not None:
+            return f"{super().identity()} {state_of(Path(file))}"
+        digest = blake2b(digest_size=8)
+        for start in range(0, self.length, AT_ONCE):
+            part = torch.as_tensor(self.values[start : start + AT_ONCE]).detach().cpu().contiguous()
+            digest.update(part.view(-1).view(torch.uint8).numpy().data)
+        return f"{super().identity()} {tuple(self.values.shape)} {digest.hexdigest()}"
+
+    def __reduce__(self) -> Any:
+        # a file is opened where the traverse goes; its numbers do not go along
+        file = getattr(self.values, "filename", None)
+        return super().__reduce__() if file is None else (read_array, (Path(file),))
 
 
 def read_array(path: Path) -> ArrayTraverse:

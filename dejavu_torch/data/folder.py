@@ -10,7 +10,7 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from dejavu_torch.data.files import reading
+from dejavu_torch.data.files import reading, state_of
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.resize import MOST_PIXELS, resize_frames
@@ -76,6 +76,9 @@ class ImageFolder(IndexedTraverse):
 
     def frame_name(self, i: int) -> str:
         return self.files[i].name
+
+    def identity(self) -> str:
+        return f"{super().identity()} {self.width} x {self.height} {state_of(*self.files)}"
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file)

@@ -15,6 +15,7 @@ class IndexedTraverse(Traverse):
     """A traverse of known length that reads only the frames asked for; a subclass says how, in `read`."""
 
     length: int
+    seeks = True
 
     @abstractmethod
     def read(self, frames: range) -> Tensor:
@@ -74,6 +75,7 @@ class FrameRange(Traverse):
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
         if length is not None:
             self.length = len(self.frames)
+        self.seeks = traverse.seeks
         if traverse.place is not None:
             self.place = traverse.place[start : stop or None : self.frames.step].contiguous()
         self._least = len(self.frames) if stop else 1
@@ -94,6 +96,9 @@ class FrameRange(Traverse):
     @property
     def frame_shape(self) -> tuple[int, ...]:
         return self.traverse.frame_shape
+
+    def identity(self) -> str:
+        return f"{self.frames} of {self.traverse.identity()}"
 
     def frame_name(self, i: int) -> str:
         return self.traverse.frame_name(self.frames[i])

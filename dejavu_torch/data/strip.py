@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import blake2b
 from pathlib import Path
 
 import torch
@@ -40,12 +41,16 @@ class SlidingWindow(IndexedTraverse):
                 f"{name} is {strip.shape[2]} pixels long, window {width}, step {step}; "
                 f"expected a window of 1 to {strip.shape[2]} pixels and a step of at least 1"
             )
-        self.name = name
+        self.name, self.strip, self.step = name, strip, step
         self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
         self.length = len(self.windows)
 
     def read(self, frames: range) -> Tensor:
         return self.windows[frames.start : frames.stop : frames.step].contiguous()
+
+    def identity(self) -> str:
+        pixels = blake2b(self.strip.contiguous().numpy().data, digest_size=8).hexdigest()
+        return f"{super().identity()} by {self.step} of {pixels}"
 
 
 def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: bool = False) -> SlidingWindow:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import check_regular, reading
+from dejavu_torch.data.files import check_regular, reading, state_of
 from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.resize import MOST_PIXELS
@@ -101,6 +101,9 @@ class Video(Traverse):
         if batch:
             yield _as_tensor(batch)
 
+    def identity(self) -> str:
+        return f"{self.name} {self.width} x {self.height} {state_of(self.path)}"
+
     def frame_name(self, i: int) -> str:
         """The time of frame i, such as 0:01:23.480; "" where the file has none."""
         seconds = self.frame_time(i)
@@ -111,6 +114,11 @@ class Video(Traverse):
         if not self._complete and i >= len(self._seconds):
             self._read_times()
         return self._seconds[i]
+
+    def count(self) -> int:
+        if self.length is None and not self._complete:
+            self._read_times()
+        return len(self._seconds) if self.length is None else self.length
 
     @property
     def times(self) -> Tensor:

@@ -12,6 +12,7 @@ from dejavu_torch.periods.support import common_period, shared_factor
 from dejavu_torch.types import Plan
 
 LAYERS_SHOWN = 6
+CHUNKS_SHOWN = 32  # of a summary in lines
 LARGE = 10**9  # a common period beyond it is no figure that a person compares
 
 
@@ -116,7 +117,9 @@ def describe(summary: MapSummary) -> str:
     """
     if not summary.places:
         return f"{summary.fixed_bytes} bytes without a map ({_parts(summary.fixed)})"
-    lines = [_chunk_line(chunk) for chunk in summary.chunks]
+    lines = [_chunk_line(chunk) for chunk in summary.chunks[:CHUNKS_SHOWN]]
+    if len(summary.chunks) > CHUNKS_SHOWN:
+        lines.append(f"and {len(summary.chunks) - CHUNKS_SHOWN} more chunks")
     stored = f"{summary.templates} templates, {summary.template_numbers} numbers"
     if summary.kind == "spectral":
         stored = f"{summary.lines} lines of their spectra"

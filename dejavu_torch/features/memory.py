@@ -16,7 +16,7 @@ IN_MEMORY = 2**29  # bytes
 BLOCK = 2**26  # bytes: so large a tensor goes back to the system once it is freed, a batch may not
 
 
-def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor:
+def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: bool = False) -> Tensor:
     """The batches as one tensor, which may be larger than the memory.
 
     Args:
@@ -24,6 +24,7 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor
         in_memory: about how many bytes to keep in memory. More spill to a temporary file, which the
             tensor then maps: rows are read when they are used. The file has no name and goes with the
             tensor or the process.
+        half: whether the file holds float16.
 
     Shape: (B,D), ... -> (N,D); on the CPU where it spilled.
 
@@ -49,7 +50,7 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor
         rows += len(batch)
         held += batch.numel() * batch.element_size()
         if held > in_memory:
-            file = _spill([*blocks, *parts], file)
+            file = _spill([*blocks, *parts], file, half)
             parts, blocks, held, joined = [], [], 0, 0
         elif held - joined > BLOCK:
             blocks.append(torch.cat(parts))
@@ -63,17 +64,18 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY) -> Tensor
             whole[start : start + len(part)] = part
             start += len(part)
         return whole
-    _spill([*blocks, *parts], file)
+    _spill([*blocks, *parts], file, half)
+    kind = np.dtype(np.float16) if half else like.cpu().numpy().dtype
     # copy on write: the tensor may be written to, the file never is
-    return torch.from_numpy(np.memmap(file, like.cpu().numpy().dtype, "c", shape=(rows, like.shape[1])))
+    return torch.from_numpy(np.memmap(file, kind, "c", shape=(rows, like.shape[1])))
 
 
-def _spill(parts: list[Tensor], file: IO[bytes] | None) -> IO[bytes]:
+def _spill(parts: list[Tensor], file: IO[bytes] | None, half: bool = False) -> IO[bytes]:
     """Write the parts to the end of the file, a new one without a name if there is none."""
     try:
         file = tempfile.TemporaryFile() if file is None else file  # noqa: SIM115, it goes with the tensor
         for part in parts:
-            file.write(part.cpu().contiguous().numpy().data)
+            file.write((part.half() if half else part).cpu().contiguous().numpy().data)
         file.flush()
     except OSError as error:
         raise InputError(

@@ -130,7 +130,7 @@ class Stretches(Traverse):
 
     def _stretches(self) -> Iterator[Tensor]:
         """The frames of each."""
-        if hasattr(self.traverse, "read"):  # any frame as quickly as any other
+        if self.traverse.seeks:
             for start in self.starts:
                 yield torch.cat(list(self.traverse.between(start, start + self.stretch)))
             return

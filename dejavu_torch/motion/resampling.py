@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from hashlib import blake2b
 
 import torch
 from torch import Tensor
@@ -56,6 +57,7 @@ class ResampledTraverse(Traverse):
         progress: bool = False,
     ) -> None:
         self.traverse, self.odometry, self.name = traverse, odometry, traverse.name
+        self.seeks = traverse.seeks
         distance = odometry.distances(traverse, batch_size, progress).distance
         if -distance.min() > distance.max():  # a camera that looks back
             distance = -distance
@@ -76,6 +78,10 @@ class ResampledTraverse(Traverse):
         self.length = len(self.frame)
         if traverse.place is not None:
             self.place = traverse.place.double()[self.frame]
+
+    def identity(self) -> str:
+        digest = blake2b(self.positions.numpy().tobytes(), digest_size=8).hexdigest()
+        return f"{self.traverse.identity()} at steps {digest}"
 
     def frame_name(self, i: int) -> str:
         return self.traverse.frame_name(int(self.frame[i]))

@@ -69,6 +69,10 @@ class SimulatedRoute(IndexedTraverse):
     def _frames(self, at: Tensor) -> Tensor:
         """Draw the frames with these numbers. Shape: (B,) int64 -> (B,3,H,W) float32 in [0,1]."""
 
+    def __reduce__(self) -> Any:
+        # without what was drawn already
+        return type(self), tuple(getattr(self, entry.name) for entry in fields(self))  # type: ignore[arg-type]
+
     @cached_property
     def frame_shape(self) -> tuple[int, ...]:
         """See `Traverse`; a frame takes long to draw."""

@@ -1,0 +1,137 @@
+"""Finished chunks of a route that is being learned, in a folder, so that a kill loses little."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.output import make_output_folder, whole_file
+from dejavu_torch.database.codec import Stream
+from dejavu_torch.database.mapfile import read_map, write_map
+from dejavu_torch.database.spectral import CodedChunk
+from dejavu_torch.types import InputError
+
+log = logging.getLogger("dejavu_torch")
+
+KEY, FIT = "run.json", "fit.safetensors"
+
+
+class Fit(NamedTuple):
+    """What is learned from the sample of a route, besides the whitening.
+
+    mean, step: of its chunks. needed: see `SpectralMap`.
+    """
+
+    mean: Tensor
+    step: float
+    needed: float | None
+
+
+class WorkFolder:
+    """What is finished of one run: the fit of its sample, and the coded chunks of shards.
+
+    Args:
+        path: the folder, made if it is not there.
+        key: digests of all that the chunks are made of, by what it is.
+
+    Raises:
+        InputError: it is of a run with another key, or cannot be made.
+    """
+
+    def __init__(self, path: Path, key: Mapping[str, str]) -> None:
+        self.path = path
+        known: object = {}
+        if path.is_dir() and any(path.iterdir()):
+            try:
+                known = json.loads((path / KEY).read_text())
+            except (OSError, ValueError) as error:
+                raise InputError(
+                    f"{path} is no folder of finished chunks; expected none to be there"
+                ) from error
+        else:
+            make_output_folder(path)
+            with whole_file(path / KEY) as file:
+                file.write_text(json.dumps(key))
+            known = dict(key)
+        if known != key:
+            known = known if isinstance(known, dict) else {}
+            other = ", ".join(name for name in {**key, **known} if key.get(name) != known.get(name))
+            raise InputError(
+                f"{path} has finished chunks of another run: its {other} differ; expected the command that "
+                "began it, or the folder removed"
+            )
+
+    def fit(self) -> tuple[Fit, dict[str, Tensor]] | None:
+        """The fit, and the whitening's state, if they are there."""
+        read = self._read(FIT)
+        if read is None:
+            return None
+        tensors, header = read
+        fit = Fit(tensors.pop("fit.mean"), header["step"], header["needed"])
+        return fit, {name.removeprefix("whitening."): tensor for name, tensor in tensors.items()}
+
+    def keep_fit(self, fit: Fit, whitening: Mapping[str, Tensor]) -> None:
+        """Write the fit."""
+        tensors = {f"whitening.{name}": tensor for name, tensor in whitening.items()} | {"fit.mean": fit.mean}
+        write_map(self.path / FIT, tensors, {"step": fit.step, "needed": fit.needed})
+
+    def finished(self, shard: range) -> list[CodedChunk] | None:
+        """The chunks of a shard, None if they are not there."""
+        read = self._read(_name(shard))
+        if read is None:
+            return None
+        tensors, header = read
+        places, sizes, sums, marks = tensors["shard.table"].unbind(1)
+        streams = tensors["shard.streams"].split(sizes.tolist())
+        escapes = tensors["shard.escapes"].split(marks.tolist())
+        return [
+            CodedChunk(count, header["step"], Stream(stream, checksum), large)
+            for count, stream, checksum, large in zip(
+                places.tolist(), streams, sums.tolist(), escapes, strict=True
+            )
+        ]
+
+    def keep(self, shard: range, chunks: list[CodedChunk]) -> None:
+        """Write the chunks of a shard.
+
+        Raises:
+            InputError: the system refuses it; what was there before stays.
+        """
+        table = [(one.places, len(one.stream.bytes), one.stream.checksum, len(one.escapes)) for one in chunks]
+        tensors = {
+            "shard.table": torch.tensor(table),
+            "shard.streams": torch.cat([one.stream.bytes for one in chunks]),
+            "shard.escapes": torch.cat([one.escapes for one in chunks]),
+        }
+        write_map(self.path / _name(shard), tensors, {"step": chunks[0].step})
+
+    def _read(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+        if not (self.path / name).exists():
+            return None
+        try:
+            return read_map(self.path / name)
+        except InputError as error:
+            log.warning("%s: it is made again", error)
+            return None
+
+
+def work_folder_of(path: Path) -> Path:
+    """The work folder of a map file, beside it."""
+    return path.with_name(f"{path.name}.work")
+
+
+def remove_work(path: Path) -> None:
+    """Remove a work folder, if it is there."""
+    if (path / KEY).exists():
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _name(shard: range) -> str:
+    return f"chunks-{shard.start:07}.safetensors"
