@@ -21,8 +21,8 @@ from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.selection import Selection, runs
-from dejavu_torch.database.mapfile import HEADER, checksums, map_size, read_map, write_map
-from dejavu_torch.database.place_map import EXTRA, Mapper, PlaceMap
+from dejavu_torch.database.mapfile import HEADER, checksums, digests, map_size, read_map, write_map
+from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
 from dejavu_torch.database.schema import checked, checked_fields
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
@@ -45,7 +45,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
-from dejavu_torch.recognition.matching import Found, Matching, joined
+from dejavu_torch.recognition.matching import Found, Matching, found_lowest, joined
 from dejavu_torch.streaming import sample as streaming
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread
 from dejavu_torch.streaming.sample import sample_of
@@ -66,7 +66,7 @@ log = logging.getLogger("dejavu_torch")
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
 TRIAL_SCORES = 2**22  # of the queries of a trial at all places
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
-ROWS = 4096  # descriptors whitened at a time
+ROWS = 4096  # descriptors on the device at a time
 FEW_DESCRIPTORS = IN_MEMORY // 4  # bytes
 OFF = 0.02  # of the bytes per place asked for: worth a word
 MANY_FEATURES = 50_000  # per frame: worth a word
@@ -255,19 +255,15 @@ class DejaVu(nn.Module):
         size = int(mapper.chunk)
         names, positions = self._beside(traverse, frames)
         taken = positions.nbytes + _bytes_of(names)
-        folder = None if work is None else WorkFolder(work, self._run(traverse, frames, second))
+        folder = None
+        if work is not None:
+            sampled = runs(sample_of(frames, size).frame)
+            key = self.run_key(traverse, frames, [traverse.state(run.start, run.stop) for run in sampled])
+            seen = second and [second.traverse.identity(), second.places.tolist()]
+            folder = WorkFolder(work, key | digests(second=seen))
         with in_one_thread():
             fit = self._fit(traverse, frames, second, taken, progress, folder)
-        coder = ChunkCoder(
-            self.pipeline,
-            self.whitening,
-            self._at_once,
-            frames,
-            size,
-            *fit[:2],
-            mapper.transform,
-            mapper.resolution,
-        )
+        coder = self.chunk_coder(frames, mapper, fit.mean, fit.step)
         chunks = all_chunks(coder, traverse, folder, make, progress)
         settings = mapper.metric, mapper.transform, size, mapper.resolution
         route = SpectralMap.of_chunks(chunks, fit.mean, *settings).to(self.map.positions.device)
@@ -307,26 +303,28 @@ class DejaVu(nn.Module):
             folder.keep_fit(fit, {} if self.whitening is None else self.whitening.state_dict())
         return fit
 
-    def _run(self, traverse: Traverse, frames: int, second: Views | None) -> dict[str, str]:
-        """What chunks are made of, as digests: see `WorkFolder`."""
-        mapper = self._chunked
-        assert mapper is not None
-        header: dict[str, Any] = {
-            name: part and recipe_of(part, REGISTRY)._asdict()
-            for name, part in ((name, getattr(self, name)) for name in PARTS)
-        }
-        header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE, "torch": torch.__version__}
-        sampled = runs(sample_of(frames, int(mapper.chunk)).frame)
-        states = [traverse.state(run.start, run.stop) for run in sampled]
-        sources: dict[str, Any] = {"source": [traverse.identity(), frames, states]}
-        if second is not None:
-            sources["second"] = [second.traverse.identity(), second.places.tolist()]
+    def chunk_coder(
+        self, frames: int, settings: SpectralMap | SpectralMapper, mean: Tensor, step: float
+    ) -> ChunkCoder:
+        """What makes coded chunks of so many frames, described as this model does."""
+        module, whitening = self.pipeline, self.whitening
+        size, transform, resolution = int(settings.chunk), settings.transform, settings.resolution
+        return ChunkCoder(module, whitening, self._at_once, frames, size, mean, step, transform, resolution)
+
+    def run_key(self, traverse: Traverse, frames: int, states: list[str] | None = None) -> dict[str, str]:
+        """What the chunks of a traverse are made of, as digests: see `WorkFolder`.
+
+        Args:
+            states: of the frames that the whitening is learned from.
+        """
+        parts = {name: getattr(self, name) for name in PARTS}
+        header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
         weights = self._weights("features")
-        if self.whitening is not None and self.whitening.fixed:
+        if self.whitening is not None and (self.whitening.fixed or states is None):
             weights |= self._weights("whitening")
+        header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE, "torch": torch.__version__}
         sums = checksums(weights, header)
-        sums["settings"] = sums.pop(HEADER)
-        return sums | {name: checksums({}, {name: value})[HEADER] for name, value in sources.items()}
+        return digests(source=[traverse.identity(), frames, states]) | {"settings": sums.pop(HEADER), **sums}
 
     def _say_reached(self, route: SpectralMap, taken: int) -> None:
         """What a long route takes, where the sample told wrongly."""
@@ -520,7 +518,9 @@ class DejaVu(nn.Module):
         self.frame_shape, self.trained, self.calibration = shape or None, None, None
         return self
 
-    def calibrate(self, reference: Traverse | Tensor | None, views: Views | None = None) -> DejaVu:
+    def calibrate(
+        self, reference: Traverse | Tensor | None, views: Views | None = None, start: int = 0
+    ) -> DejaVu:
         """Find out how probably answers are right that stand out so much; `Match.probability` then tells it.
 
         Args:
@@ -529,6 +529,7 @@ class DejaVu(nn.Module):
                 whitening, which has seen the plain ones.
             views: frames of another traverse of the same places instead, which tell of its own changes;
                 those that show no place are left out.
+            start: the place that the reference's first frame is, as where it was appended to a map.
 
         Returns:
             self, with `self.calibration`.
@@ -550,8 +551,8 @@ class DejaVu(nn.Module):
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
-            stretches = Stretches(as_traverse(reference), self.map.places, strengths)
-            views, length = stretches.views, stretches.stretch
+            stretches = Stretches(as_traverse(reference), self.map.places - start, strengths)
+            views, length = Views(stretches, start + stretches.places), stretches.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
         name = views.traverse.name
@@ -569,14 +570,14 @@ class DejaVu(nn.Module):
             raise InputError(f"calibrating by {name}: {error}") from error
         return self
 
-    def calibrate_if_possible(self, reference: Traverse, views: Views | None = None) -> None:
+    def calibrate_if_possible(self, reference: Traverse, views: Views | None = None, start: int = 0) -> None:
         """As `calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
         reference."""
         if views is not None:
             self.calibrate(reference, views)
         elif self.calibration is None and len(reference.frame_shape) == 3 and self.map.summary().covered:
             try:
-                self.calibrate(reference)
+                self.calibrate(reference, start=start)
             except InputError as error:
                 log.warning("the map is not calibrated: %s", error)
 
@@ -755,6 +756,8 @@ class DejaVu(nn.Module):
             matching.sequence.check(None, self.map.places)
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         device = self.map.positions.device  # many descriptors lie in a file
+        if matching.lowest and order is None:  # no score of another place is needed
+            return self._lowest(batches, at_once)
         parts = (part.to(device) for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence
         alone = not matching.lengths and matching.platt is None and order is None
@@ -765,6 +768,16 @@ class DejaVu(nn.Module):
             place = order.argsort()
             scores = (part[:, place.to(part.device)] for part in scores)
         return matching.stream(scores)
+
+    def _lowest(self, batches: Iterable[Tensor], at_once: int) -> Iterator[Found]:
+        """The best place of each query, by the map's own way or from `at_once` queries' scores at a time."""
+        for part in (part for descriptors in batches for part in descriptors.split(ROWS)):
+            queries = part.to(self.map.positions.device)
+            lowest = self.map.lowest(queries)
+            if lowest is None:
+                yield from Matching().stream(map(self.map.scores, queries.split(at_once)))
+            else:
+                yield found_lowest(*lowest)
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""
@@ -844,7 +857,7 @@ class DejaVu(nn.Module):
                 setattr(model, name, getattr(header, name))
             own = {name: weights.pop(name) for name in tensors if name.startswith("map.")}
             if own or header.map.get("places") != 0:
-                model.map.load_state_dict(_map_state(model.map, own, header))
+                _load_map(model.map, own, header)
             else:
                 checked(header.map, model.map.state, "its map")
                 model.map.set_extra_state(header.map)
@@ -1051,19 +1064,14 @@ def read_place_map(path: Path) -> PlaceMap:
             raise InputError(NO_MAP)
         route = mapper.empty()
         own = {name: tensor for name, tensor in tensors.items() if name.startswith("map.")}
-        route.load_state_dict(_map_state(route, own, header))
+        _load_map(route, own, header)
     return route
 
 
-def _map_state(route: PlaceMap, tensors: dict[str, Tensor], header: Header) -> dict[str, Any]:
-    """The state of a map, from the tensors that a file holds of it."""
+def _load_map(route: PlaceMap, tensors: dict[str, Tensor], header: Header) -> None:
+    """Fill a map with what a file holds of it."""
     checked(header.map, route.state, "its map")
-    packed = {name.removeprefix("map."): tensor for name, tensor in tensors.items()}
-    state = {**route.unpacked(packed), EXTRA: header.map}
-    missing = route.state_dict().keys() - state.keys()
-    if missing:
-        raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
-    return state
+    route.load_packed({name.removeprefix("map."): tensor for name, tensor in tensors.items()}, header.map)
 
 
 def _check_weights(header: Header, tensors: dict[str, Tensor], given: nn.Module | None) -> None:

@@ -48,7 +48,14 @@ SLOW = (
 # modules that run whole commands again and again
 FEW_VIEWS = {
     *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_resampling", "test_several_places"),
-    *("test_faults", "test_readme", "test_footprint", "test_cli_networks", "test_pretrained"),
+    *(
+        "test_cli_growth",
+        "test_faults",
+        "test_readme",
+        "test_footprint",
+        "test_cli_networks",
+        "test_pretrained",
+    ),
 }
 PIXELS = FEW_VIEWS | {"test_real_routes", "test_reproduce", "test_cli_rejection"}
 

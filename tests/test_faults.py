@@ -34,7 +34,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     np.save(folder / "a.npy", frames(64))
     np.save(folder / "b.npy", frames(64, seed=1))
-    run("learn", folder / "a.npy", "--map", folder / "map.safetensors", *PLAIN)
+    run("learn", folder / "a.npy", "--map", folder / "map.safetensors", *PLAIN, "--mapper.chunk", "64")
     return folder
 
 
@@ -373,12 +373,13 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None
         f"{dejavu} compare a.npy b.npy {plain} --truth 0 --out disk/old > /dev/null; echo status $?",
         "dd if=/dev/zero of=disk/full bs=1k count=64 status=none 2> /dev/null",
         f"{dejavu} learn a.npy {plain} --map disk/map.safetensors > /dev/null; echo status $?",
+        f"{dejavu} learn b.npy --append disk/map.safetensors > /dev/null; echo status $?",
         "find disk -mindepth 1 | sort; cat disk/old/*; cmp map.safetensors disk/map.safetensors",
     )
     said = [line for line in found if line.startswith("dejavu: ")]
-    assert [line.rpartition(": ")[2][:13] for line in said] == ["No space left"] * 2
+    assert [line.rpartition(": ")[2][:13] for line in said] == ["No space left"] * 3
     assert [line for line in found if line not in said] == [
-        *["status 2"] * 2,
+        *["status 2"] * 3,
         *("disk/full", "disk/map.safetensors", "disk/old", "disk/old/matches.csv", "disk/old/pr.png"),
         *("old", "old"),
     ]

@@ -23,6 +23,7 @@ ORDER = [
     {"motion"},
     {"streaming"},
     {"model"},
+    {"growth"},
     {"cluster"},
     {"live"},
     {"evaluation"},
@@ -45,13 +46,14 @@ ARROWS = {
     "motion": "data memory types",
     "streaming": "types data features database",
     "model": "types text data features periods database recognition motion streaming",
+    "growth": "types data features database streaming model motion",
     "cluster": "types text data database streaming",
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
     "experiments": "types text data features periods database recognition motion model live evaluation "
     "training",
-    "cli": "types text data features periods database recognition motion streaming model cluster live "
+    "cli": "types text data features periods database recognition motion streaming model growth cluster live "
     "evaluation training experiments",
 }
 

@@ -14,14 +14,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
 from torch import nn
 
+from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.chain import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.recipe import recipe_of, with_parts
 from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision, check_sizes
 from dejavu_torch.motion.ground_plane import check_corners
@@ -86,9 +89,10 @@ def run_demo(
 
 
 def run_learn(
-    sources: Sequence[str],
+    sources: Sequence[str] = (),
     *,
-    map: Path,
+    map: Path | None = None,
+    append: Path | None = None,
     seed: int = 0,
     second: str | None = None,
     second_truth: str | None = None,
@@ -106,6 +110,8 @@ def run_learn(
         sources: folder of images, video (clip.mp4?width=160), .npy of frames or features,
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96; several are one route, one behind the other
         map: map file to write (.safetensors)
+        append: map file behind whose places those of the source come; it is written again unless --map names
+            another file
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
@@ -117,9 +123,14 @@ def run_learn(
             machine, or the address of a cluster. Sources are read there, by the same paths
         device: what learns: cpu, cuda or cuda:1
     """
+    where, map = device_of(device, learns=True), append if map is None else map
+    assert map is not None  # the parser has seen to it
+    if append is None:
+        model.to(where)
+    else:
+        model = _map_to_append_to(append, model).to(where)
     if cluster is not None:
         _check_cluster(cluster, model, device)
-    model.to(device_of(device, learns=True))
     if map.suffix != ".safetensors":
         expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
         raise InputError(f"--map {map} is no name of a map; expected {expected}")
@@ -128,22 +139,29 @@ def run_learn(
     if calibration == NO_CALIBRATION and model.precision is not None:
         raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
     _set_seed(model, seed)
-    traverse = model.resample(chained([open_source(source) for source in sources]), progress=True)
+    traverse = chained([open_source(source) for source in sources])
+    traverse = model.resample(traverse, model.step, progress=True)
     _print_steps(traverse)
     traverse, views = _with_second(model, traverse, second, second_truth)
     if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
         seen = f"--precision {model.precision}: {traverse.name} has no frames to calibrate by"
         raise InputError(f"{seen}; expected --calibration SOURCE")
     traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
-    work = work_folder_of(map)
+    start, work = model.map.places, work_folder_of(map)
     with _making(cluster) as make:
-        model.learn(traverse, progress=True, second=views, work=work, make=make)
+        if append is None:
+            model.learn(traverse, progress=True, second=views, work=work, make=make)
+        else:
+            growth.append(model, traverse, progress=True, work=work, make=make)
+            known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
     if calibration != NO_CALIBRATION:
-        model.calibrate_if_possible(traverse, known)
+        model.calibrate_if_possible(traverse, known, start)
     model.check_precision(None)
     model.save(map)
     remove_work(work)
     print_map(model)
+    if append is not None:
+        _say(f"{model.map.places - start} places behind the {start} of {append}; written to {map}")
     if model.map.summary().covered:
         _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
     else:
@@ -341,7 +359,6 @@ def run_compare(
         device: as of `dejavu learn`
     """
     from dejavu_torch.experiments.compare import compare
-    from dejavu_torch.features.hog import HOG
 
     where = device_of(device, learns=map is None)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
@@ -660,6 +677,22 @@ def _making(cluster: str | None) -> Iterator[Callable[..., Made]]:
 
     with Cluster(cluster) as workers:
         yield partial(code_on, workers)
+
+
+def _map_to_append_to(path: Path, given: DejaVu) -> DejaVu:
+    """The map of a file, which can grow, and accepts what the options say.
+
+    Args:
+        given: what the options say; of its features only what a file cannot bring counts.
+    """
+    default = recipe_of(given.features, REGISTRY) == recipe_of(HOG(), REGISTRY)
+    model = _load_map(path, None if default else given.features)
+    try:
+        growth.growing(model)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    _accept_by(model, given.threshold, given.precision)
+    return model
 
 
 def _load_map(path: Path, features: nn.Module | None = None) -> DejaVu:

@@ -241,14 +241,25 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         changed = [one for one in settings if parsed[one] != parser.get_defaults()[one]]
         lost = set(changed) - {"features", "threshold", "precision"}  # a map has all but these itself
         told = [word.lstrip("-").partition("=")[0] for word in words if word.startswith("--")]
-        if name == "compare" and arguments["map"]:
+        given = {"compare": "map", "learn": "append"}.get(name)  # a map that is taken as it is
+        if given and arguments[given]:
             taken = ("second", "second_truth", "descriptor")
             lost |= {one for one in taken if arguments[one] is not None}
             lost |= {"whitening"} if whitening else set()
+            lost |= {"seed"} if given == "append" and arguments["seed"] else set()
             if lost:
                 named = (one.partition(".")[0] for one in told)
                 one = next((one for one in named if one in lost), "whitening" if whitening else "config")
-                raise UsageError(f"--{one}: a --map has its own settings; expected one or the other")
+                there = "a --map" if given == "map" else f"the map of --{given}"
+                raise UsageError(f"--{one}: {there} has its own settings; expected one or the other")
+        if name == "learn":
+            needed = {
+                "source": arguments["sources"] or None,
+                "--map": arguments["map"] or arguments["append"],
+            }
+            missing = ", ".join(one for one, value in needed.items() if value is None)
+            if missing:
+                raise UsageError(f"the following arguments are required: {missing}")
         arguments.pop("config")
         if whitening:
             _check_own(whitening, told, "whitening")

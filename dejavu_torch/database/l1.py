@@ -16,6 +16,8 @@ from torch.autograd import forward_ad
 from torch.nn import Parameter
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
+from dejavu_torch.database.compiling import compiled
+
 log = logging.getLogger("dejavu_torch")
 
 Floats = NDArray[np.float32]
@@ -47,27 +49,16 @@ def _distances(query: Floats, templates: Floats, out: Floats) -> None:
 
 @cache
 def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
-    reason: Exception
-    for keep in (True, False):  # nowhere to keep what is compiled is no reason not to compile
-        try:
-            import numba
-
-            compiler = numba.njit(
-                "void(float32[:,::1], float32[:,::1], float32[:,:])",
-                cache=keep,
-                nogil=True,
-                error_model="numpy",
-                # sums in any order, but not "nnan" and "ninf": NaN and infinity have to arrive
-                fastmath={"reassoc", "nsz", "contract"},
-            )
-            kernel: Callable[[Floats, Floats, Floats], None] = compiler(_distances)
-            if kernel is _distances:
-                raise RuntimeError("NUMBA_DISABLE_JIT is set")
-            return kernel
-        except Exception as error:  # a broken compiler must not break what works without one
-            reason = error
-    log.info("L1 distances by torch, not by numba: %s", " ".join(str(reason).split()))
-    return None
+    try:
+        return compiled(
+            _distances,
+            "void(float32[:,::1], float32[:,::1], float32[:,:])",
+            # sums in any order, but not "nnan" and "ninf": NaN and infinity have to arrive
+            fastmath={"reassoc", "nsz", "contract"},
+        )
+    except Exception as error:  # a broken compiler must not break what works without one
+        log.info("L1 distances by torch, not by numba: %s", " ".join(str(error).split()))
+        return None
 
 
 def l1_backend() -> Literal["numba", "torch"]:

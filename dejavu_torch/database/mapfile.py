@@ -54,6 +54,11 @@ def checksums(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, s
     return {part: digest.hexdigest() for part, digest in sums.items()}
 
 
+def digests(**values: Any) -> dict[str, str]:
+    """A digest of each of these JSON values."""
+    return {name: checksums({}, {name: value})[HEADER] for name, value in values.items()}
+
+
 def map_size(tensors: dict[str, Tensor], header: dict[str, Any]) -> int:
     """Bytes of the file that `write_map` writes."""
     plain = _plain(tensors)

@@ -72,6 +72,25 @@ class PlaceMap(nn.Module, ABC):
         """
         return self.scores(queries)[:, start:stop]
 
+    def score_blocks(
+        self, queries: Tensor, start: int = 0, stop: int | None = None
+    ) -> Iterator[tuple[int, Tensor]]:
+        """As `scores_between`, a block of places behind the other: the first place and (Q,n) scores of each.
+
+        Convention: a kind of map that needs no more memory for many places yields more than one.
+        """
+        yield start, self.scores_between(queries, start, self.places if stop is None else stop)
+
+    def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
+        """The lowest score of each query and its place, where that takes less than the scores of all places.
+
+        Shape: (Q,D) -> (Q,) and (Q,) int64, -1 where no place has a finite score; None where the map has no
+            such way.
+
+        Convention: what the minimum of `scores` is, the lowest place of equal scores; no gradient.
+        """
+        return None
+
     def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """Scores of consecutive queries together, from batches (B,D) of them: (B,N) each.
 
@@ -156,6 +175,9 @@ class PlaceMap(nn.Module, ABC):
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        if not any(name.startswith(prefix) for name in state_dict):  # of other parts of a model
+            super()._load_from_state_dict(state_dict, prefix, *args)
+            return
         before = self.get_extra_state(), dict(self._buffers), dict(self._parameters)
         try:
             if prefix + EXTRA in state_dict:  # before any tensor is touched
@@ -189,6 +211,18 @@ class PlaceMap(nn.Module, ABC):
             InputError: tensors that do not fit together.
         """
         return tensors
+
+    def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
+        """Load what `packed` and `get_extra_state` gave.
+
+        Raises:
+            InputError: tensors or a state that do not fit.
+        """
+        state = {**self.unpacked(tensors), EXTRA: extra}
+        missing = self.state_dict().keys() - state.keys()
+        if missing:
+            raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
+        self.load_state_dict(state)
 
     def loaded(self) -> None:
         """Called when a state was loaded: work out what follows from the buffers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -48,16 +48,42 @@ def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
 def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
     """The series that has these lines: the inverse of `spectrum`. (...,W) -> (...,W)"""
     count = _check(lines, transform)
-    lines = lines / _scale(lines, transform)
-    nothing = torch.zeros_like(lines[..., :1])
+    where, factor, size = slots(lines, transform)
+    slotted = lines.new_zeros(*lines.shape[:-1], size).index_copy(-1, where, lines * factor)
+    return from_slots(slotted, count, transform)
+
+
+class Slots(NamedTuple):
+    """Where the inverse transform takes the lines of W numbers from, so that no copy brings them there.
+
+    where: (W,) int64, of each line. factor: (W,), what the line is multiplied with there. count: S, of slots;
+    those that no line goes to are 0.
+    """
+
+    where: Tensor
+    factor: Tensor
+    count: int  # type: ignore[assignment]  # the field shadows tuple.count
+
+
+def slots(lines: Tensor, transform: Transform) -> Slots:
+    """Of lines (...,W), whose dtype and device the factors have."""
+    count = lines.shape[-1]
+    where = torch.arange(count, device=lines.device)
     if transform == "dct":
-        cosine, sine = _quarter_steps(lines)
-        parts = [torch.cat([lines * factor, nothing], -1) for factor in (cosine, sine)]
+        return Slots(where, 1 / _scale(lines, transform), count)
+    return Slots(where + (where > 0), 1 / _scale(lines, transform), 2 * (count // 2) + 2)  # pairs
+
+
+def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:
+    """The series of so many numbers whose lines are in their `slots`: (...,S) -> (...,W)."""
+    if transform == "dct":
+        cosine, sine = _quarter_steps(slotted)
+        nothing = torch.zeros_like(slotted[..., :1])
+        parts = [torch.cat([slotted * factor, nothing], -1) for factor in (cosine, sine)]
         mirrored: Tensor = torch.fft.irfft(torch.complex(*parts), n=2 * count, norm="ortho")
         return mirrored[..., :count]
-    ends = [nothing] if count % 2 == 0 else []
-    pairs = torch.cat([lines[..., :1], nothing, lines[..., 1:], *ends], -1).unflatten(-1, (-1, 2))
-    series: Tensor = torch.fft.irfft(torch.view_as_complex(pairs), n=count, norm="ortho")
+    pairs = torch.view_as_complex(slotted.unflatten(-1, (-1, 2)))
+    series: Tensor = torch.fft.irfft(pairs, n=count, norm="ortho")
     return series
 
 

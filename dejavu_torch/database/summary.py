@@ -91,17 +91,17 @@ class MapSummary:
 def summarise(plan: Plan, places: int, route: Mapping[str, int]) -> MapSummary:
     """The summary of a plan over `places` places, whose parts take these bytes."""
     chunks = []
-    covered: set[int] = set()
+    covered = end = 0
     for start, stop in sorted({(layer.start, layer.stop) for layer in plan}):
         members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
         periods = tuple(layer.period for layer in members)
         features = tuple(len(layer.features) for layer in members)
         shared = tuple(shared_factor(a, b) for a, b in combinations(periods, 2))
         chunks.append(ChunkSummary(start, stop, periods, features, common_period(periods), shared))
-        covered.update(range(start, stop))
+        covered, end = covered + max(0, stop - max(start, end)), max(stop, end)
     templates = sum(layer.phases for layer in plan)
     numbers = sum(layer.phases * len(layer.features) for layer in plan)
-    return MapSummary("templates", places, len(covered), templates, numbers, tuple(chunks), route, {})
+    return MapSummary("templates", places, covered, templates, numbers, tuple(chunks), route, {})
 
 
 def describe(summary: MapSummary) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
+from functools import reduce
 from itertools import accumulate, pairwise
 from typing import Any, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.database.distance import Metric, check_metric, metric_name, phase_distances
+from dejavu_torch.database.layer_search import LayerSearch
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.summary import MapSummary, summarise
 from dejavu_torch.database.templates import PhaseTemplates
@@ -24,7 +26,7 @@ from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel
 Reduction = Literal["mean", "sum"]
 TRAINABLE = ("templates", "weights")
 MOST_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
-PLACE_BYTES = 32  # that a place of a layer takes while its phases are worked out, and while it is scored
+PLACE_BYTES = 16  # that a place takes while a query is scored
 
 
 class TemplateState(NamedTuple):
@@ -133,7 +135,7 @@ class TemplateMap(PlaceMap):
     feature_index: Tensor
     templates: Tensor
     weights: Tensor
-    place_phases: Tensor
+    lap_phases: Tensor
 
     def __init__(
         self,
@@ -167,7 +169,7 @@ class TemplateMap(PlaceMap):
             "templates", torch.cat([b.flatten() for b in templates]) if plan else torch.zeros(0)
         )
         self.register_buffer("weights", torch.zeros(0) if weights is None else weights.float())
-        self.register_buffer("place_phases", torch.zeros(0, dtype=torch.int64), persistent=False)
+        self.register_buffer("lap_phases", torch.zeros(0, dtype=torch.int64), persistent=False)
         self.to(self.templates.device)
         self.loaded()
         self.check()
@@ -184,7 +186,7 @@ class TemplateMap(PlaceMap):
         self._temperature = value
 
     def loaded(self) -> None:
-        """The plan, and the phase of each place of each layer, from the buffers."""
+        """The plan, and the phases of each layer in the order of its places, from the buffers."""
         problem = self._buffer_disagreement()
         if problem:
             raise InputError(f"the map does not fit together: {problem}")
@@ -202,16 +204,22 @@ class TemplateMap(PlaceMap):
                 f"feature {outside[0].features[-1]}; expected it inside {self.places} places of "
                 f"{self.dimension} features"
             )
-        # before the phase of every place is worked out
         covered = sum(layer.stop - layer.start for layer in self.plan)
         if max(self.places, covered) > MOST_PLACES:
             raise InputError(
                 f"a map of {self.places} places, {covered} in all layers; expected at most {MOST_PLACES}"
             )
-        check_room(PLACE_BYTES * (self.places + covered), f"a map of {self.places} places")
+        check_room(PLACE_BYTES * self.places, f"a map of {self.places} places")
         self.segments = segments(self.plan, self.places)
-        phases = [layer.place_phases for layer in self.plan]
-        self.place_phases = torch.cat(phases).to(self.layers.device) if phases else self.layers.new_zeros(0)
+        # phases repeat after as many places as the period's numerator says
+        self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
+        check_room(PLACE_BYTES * sum(self.laps), f"the phases of {len(self.plan)} layers")
+        phases = [
+            layer.phase(torch.arange(layer.start, layer.start + lap))
+            for layer, lap in zip(self.plan, self.laps, strict=True)
+        ]
+        self.lap_phases = torch.cat(phases).to(self.layers.device) if phases else self.layers.new_zeros(0)
+        self._search: LayerSearch | None = None
 
     def settings(self) -> dict[str, Any]:
         return {"metric": metric_name(self.metric), "reduction": self.reduction}
@@ -256,17 +264,47 @@ class TemplateMap(PlaceMap):
             for j in (range(len(blocks)) if layers is None else layers)
         ]
 
+    def along(
+        self, distances: Tensor, layer: int, start: int, stop: int, lap: Tensor | None = None
+    ) -> Tensor:
+        """The distances of a layer to the places [start, stop) that it covers: (Q,P) -> (Q,stop - start).
+
+        Args:
+            layer: its position in the plan.
+            lap: the column of the distances for each place until they repeat; None is the phase.
+        """
+        if lap is None:
+            lap = self.lap_phases.split(self.laps)[layer]
+        first, count = (start - self.plan[layer].start) % len(lap), stop - start
+        if first + count <= len(lap):
+            return distances.index_select(1, lap[first : first + count])
+        lap = torch.cat([lap[first:], lap[:first]])
+        return distances.index_select(1, lap).repeat(1, -(-count // len(lap)))[:, :count]
+
+    def added(self, members: Sequence[int], distances: Sequence[Tensor]) -> Tensor:
+        """S of places (eq. 4), from the distances that the layers which cover them have there.
+
+        Args:
+            members: the layers, by their positions in the plan.
+
+        Shape: for each a tensor (Q,n) -> (Q,n).
+        """
+        total: Tensor = reduce(torch.add, distances)
+        if self.reduction == "mean":
+            total = total / sum(weight_per_feature(self.metric, len(self.plan[j].features)) for j in members)
+        return total
+
     def combine(
         self,
         distances: Sequence[Tensor],
         segments: Sequence[Segment] | None = None,
-        columns: Sequence[Tensor] | None = None,
+        laps: Sequence[Tensor] | None = None,
     ) -> Tensor:
         """S(i) from the phase distances of each layer (eq. 4): L tensors (Q,P) -> (Q,N).
 
         Args:
             segments: of which places, in order; None is all of them.
-            columns: of each layer, the column of its distances for each of its places; None is the phase.
+            laps: of each layer, see `along`.
 
         Convention: a place that no layer covers scores +inf.
 
@@ -275,23 +313,16 @@ class TemplateMap(PlaceMap):
         """
         if not distances:
             raise InputError("there are no layers to combine; expected at least one")
-        first = distances[0]
-        if columns is None:
-            columns = self.place_phases.split([layer.stop - layer.start for layer in self.plan])
+        if laps is None:
+            laps = self.lap_phases.split(self.laps)
         parts = []
         for start, stop, members in self.segments if segments is None else segments:
-            if not members:
-                parts.append(torch.full_like(first[:, :1], math.inf).expand(-1, stop - start))
-                continue
-            total = torch.zeros_like(first[:, :1])
-            for j in members:
-                offset = self.plan[j].start
-                total = total + distances[j].index_select(1, columns[j][start - offset : stop - offset])
-            if self.reduction == "mean":
-                total = total / sum(
-                    weight_per_feature(self.metric, len(self.plan[j].features)) for j in members
+            if members:
+                parts.append(
+                    self.added(members, [self.along(distances[j], j, start, stop, laps[j]) for j in members])
                 )
-            parts.append(total)
+            else:
+                parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, stop - start))
         return torch.cat(parts, 1)
 
     def scores(self, queries: Tensor) -> Tensor:
@@ -314,6 +345,20 @@ class TemplateMap(PlaceMap):
         for j, row in zip(members, distances, strict=True):
             rows[j] = row
         return self.combine(rows, inside)[:, start - inside[0].start : stop - inside[0].start]
+
+    @torch.no_grad()
+    def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
+        """See `PlaceMap`; by `LayerSearch` where that is less work than the scores of all places."""
+        if self.temperature is not None:
+            return None
+        if self._search is None or self._search.device != self.layers.device:
+            self._search = LayerSearch(self)
+        search = self._search
+        if not search.worth:
+            return None
+        found = [search.lowest(self.distances(part)) for part in queries.split(search.at_once)]
+        scores, places = zip(*found, strict=True)
+        return torch.cat(scores), torch.cat(places)
 
     def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """See `PlaceMap`; mean scores along trajectories come from `LayerSums` where that is less work."""

@@ -47,7 +47,7 @@ class LayerSums:
         self.worth = several and LOOK_UP * (sum(self.sizes) + near) < route.places
         if not self.worth:
             return
-        device = route.place_phases.device
+        device = route.layers.device
         places = torch.cat([torch.arange(piece.start, piece.stop) for piece in self.near])
         cuts = torch.tensor([0, *(segment.stop for segment in route.segments)])
         after = torch.searchsorted(cuts, places, right=True)
@@ -60,7 +60,7 @@ class LayerSums:
         self.residue = torch.arange(len(self.size), device=device) - self.start
         pairs = list(zip(route.plan, self.sizes, strict=True))
         self.phases = [layer.phase(torch.arange(size)).to(device) for layer, size in pairs]
-        self.columns = [torch.arange(layer.start, layer.stop, device=device) % size for layer, size in pairs]
+        self.laps = [(torch.arange(size, device=device) + layer.start) % size for layer, size in pairs]
 
     def scores(self, rows: Sequence[Tensor], ahead: int) -> Tensor:
         """Scores of the last Q queries, from the phase distances of each layer to them and to those ahead.
@@ -89,7 +89,7 @@ class LayerSums:
             for k, shift in enumerate(shifts[:steps]):
                 of = self.start + (self.residue - shift) % self.size
                 total = total + table[first - k : last - k].index_select(1, of)
-            ways.append(combine((total / used).split(self.sizes, 1), columns=self.columns))
+            ways.append(combine((total / used).split(self.sizes, 1), laps=self.laps))
         near = combine(rows, self.near)
         edges = sequence(near[ahead:], near[:ahead])[:, self.of]
         best: Tensor = reduce(torch.minimum, ways)

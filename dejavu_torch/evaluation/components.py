@@ -40,13 +40,13 @@ def components(
     Convention: the constant, and what the metric does with products and norms, are part of every sum.
     """
     start, stop = route.chunks[chunk]
-    first, last = route.bounds[chunk : chunk + 2]
-    query = query.to(route.value)
+    kept_lines = route.lines(chunk)
+    query = query.to(kept_lines.value)
     length = torch.linalg.vector_norm(query)
     if route.metric == "cosine":
         query = query / torch.where(length > 0, length, 1)
-    terms = query[route.feature[first:last].long()] * route.value[first:last]
-    lines = query.new_zeros(stop - start).index_add(0, route.line[first:last].long() - start, terms)
+    terms = query[kept_lines.feature] * kept_lines.value
+    lines = query.new_zeros(stop - start).index_add(0, kept_lines.line, terms)
     lines_of: dict[Fraction, list[int]] = defaultdict(list)
     for line in range(1, stop - start):
         if lines[line]:
@@ -59,7 +59,7 @@ def components(
             kept[chosen] = lines[chosen]
         products = from_spectrum(kept, route.transform) + query @ route.mean.to(query)
         if route.metric == "cosine":
-            scores = 1 - products * route.per_norm[start:stop]
+            scores = 1 - products * route.per_norm(start, stop)
         else:
             scores = length.square() - 2 * products + route.norms[start:stop].square()
         found.append(Component(tuple(strongest[:count]), scores.cpu()))

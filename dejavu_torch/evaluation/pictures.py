@@ -402,15 +402,16 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
     """The spectra of those numbers of the descriptor of which the longest chunk keeps most energy."""
     chunk = longest_chunk(route)
     start, stop = route.chunks[chunk]
-    first, last = route.bounds[chunk : chunk + 2]
-    if stop - start < 2 or first == last:
+    lines = route.lines(chunk)
+    if stop - start < 2 or not len(lines.value):
         return {}
-    energy = route.value.new_zeros(route.dimension)
-    energy = energy.index_add(0, route.feature[first:last].long(), route.value[first:last].square())
+    energy = lines.value.new_zeros(route.dimension).index_add(0, lines.feature, lines.value.square())
     chosen = energy.argsort(descending=True, stable=True)[:STRONGEST].cpu()
     values = run.reference_features[start:stop].cpu()[:, chosen].float() - route.mean.cpu()[chosen].float()
     amplitudes = spectrum(values.T, route.transform).abs()[:, 1:]
-    kept = (route.levels[start:stop].cpu()[1:, chosen] != 0).T
+    kept = torch.zeros(stop - start, route.dimension, dtype=torch.bool)
+    kept[lines.line.cpu(), lines.feature.cpu()] = True
+    kept = kept[1:, chosen].T
     periods = torch.tensor(
         [float(period_of(j, stop - start, route.transform)) for j in range(1, stop - start)]
     )

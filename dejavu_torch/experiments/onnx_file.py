@@ -68,7 +68,7 @@ class Rebuilt(nn.Module):
         rebuilt = torch.cat([route.rebuilt(g) for g in range(len(route.chunks))])
         self.register_buffer("descriptors", rebuilt.T.contiguous())
         self.register_buffer("norms", route.norms)
-        self.register_buffer("per_norm", route.per_norm)
+        self.register_buffer("per_norm", route.per_norm())
 
     def forward(self, queries: Tensor) -> Tensor:
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)

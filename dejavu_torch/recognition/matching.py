@@ -50,6 +50,11 @@ class Found(NamedTuple):
         )
 
 
+def found_lowest(score: Tensor, place: Tensor) -> Found:
+    """What is found by the best place of each query, -1 for none, and its score: (Q,), (Q,)."""
+    return Found(Candidates(place[:, None].cpu(), score[:, None].cpu()))
+
+
 class Matching(NamedTuple):
     """How queries are matched.
 
@@ -74,6 +79,11 @@ class Matching(NamedTuple):
         return self.sequence is None or (
             isinstance(self.sequence, SequenceMatcher) and self.sequence.length == 1
         )
+
+    @property
+    def lowest(self) -> bool:
+        """Whether the best place of each query and its score are all that is wanted."""
+        return self.ranks == 1 and all(part is None for part in (self.sequence, self.platt, self.look))
 
     def found(self, batches: Iterable[Tensor]) -> Found:
         """What is found by scores (B,N) of single queries, batches one behind the other.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -16,6 +18,7 @@ from dejavu_torch.data.simulate.aerial import (
     DASH_PERIOD,
     HEIGHT,
     MARGIN,
+    TILES,
     VIEW,
     AerialRoad,
     paint_route,
@@ -167,8 +170,8 @@ def test_one_frame_is_a_route() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"frames": 0}, "1 <= frames <= 32768, a whole number"),
-        ({"frames": 10**6}, "1 <= frames <= 32768"),
+        ({"frames": 0}, f"1 <= frames <= {math.lcm(*TILES)}, a whole number"),
+        ({"frames": 10**6}, "1 <= frames <= 131072"),
         ({"frames": 40.5}, "a whole number"),
         ({"seed": -1}, "seed >= 0"),
         ({"traverse": -1}, "traverse >= 0"),
@@ -177,12 +180,55 @@ def test_one_frame_is_a_route() -> None:
         ({"noise": float("nan")}, "0 <= noise <= 1"),
         ({"drift": 20.0}, "0 <= drift <= 8"),
         ({"yaw": -2.0}, "0 <= yaw <= 5"),
+        ({"ground": "sand"}, "once or repeat"),
+        ({"ground": 1}, "once or repeat"),
     ],
 )
-def test_bad_arguments_are_refused_in_one_line(arguments: dict[str, float], expected: str) -> None:
+def test_bad_arguments_are_refused_in_one_line(arguments: dict[str, Any], expected: str) -> None:
     ((key, value),) = arguments.items()
     with refused(f"{key}={value}; expected", expected):
-        AerialRoad(**arguments)  # type: ignore[arg-type]
+        AerialRoad(**arguments)
+
+
+@pytest.fixture(scope="module")
+def repeating() -> AerialRoad:
+    """As it is drawn without what differs from flight to flight; the light that is left is a factor."""
+    return AerialRoad(ground="repeat", frames=math.lcm(*TILES), noise=0, drift=0, yaw=0)
+
+
+@pytest.mark.parametrize("start", [0, 700, 990])  # the last one sees where a tile begins anew
+def test_each_half_of_repeating_ground_comes_again_after_its_tile(repeating: AerialRoad, start: int) -> None:
+    upper, lower = slice(0, VIEW // 2), slice(VIEW // 2, VIEW)
+    cycles = torch.tensor([0, 1, 7, 900])
+    for period, same, other in zip(TILES, (upper, lower), (lower, upper), strict=True):
+        first, *later = (
+            repeating._frames(start + cycles * period)
+            / repeating._gain[start + cycles * period, :, None, None]
+        )
+        for frame in later:
+            assert torch.allclose(frame[:, same], first[:, same], atol=0.02)
+            assert (frame[:, other] - first[:, other]).abs().max() > 0.2
+
+
+def test_a_window_of_repeating_ground_slides_by_one_column_a_frame(repeating: AerialRoad) -> None:
+    frames = repeating._frames(torch.arange(1000, 1004))
+    assert torch.allclose(frames[3][..., :-3], frames[0][..., 3:], atol=0.02)
+
+
+def test_the_road_between_the_tiles_is_the_same_everywhere(repeating: AerialRoad) -> None:
+    band = repeating._frames(torch.arange(0, 10**6, 99_999))[..., 24:40, :]
+    assert (band - band[..., :1]).abs().max() < 1e-4
+    assert (band - band[:1]).abs().max() < 0.1  # the light
+
+
+def test_repeating_ground_has_more_frames_than_ground_that_does_not() -> None:
+    road = AerialRoad(ground="repeat", frames=math.lcm(*TILES), traverse=1)
+    assert road.name == f"sim:aerial?seed=0&traverse=1&frames={math.lcm(*TILES)}&ground=repeat"
+    assert road.read(range(road.length - 1, road.length)).shape == (1, 3, VIEW, VIEW)
+    with refused(f"frames={math.lcm(*TILES)}", "frames <= 131072", "ground=repeat"):
+        AerialRoad(frames=math.lcm(*TILES))
+    with refused("frames=", f"1 <= frames <= {math.lcm(*TILES)}"):
+        AerialRoad(ground="repeat", frames=math.lcm(*TILES) + 1)
 
 
 def test_an_empty_batch_is_refused() -> None:

@@ -769,7 +769,7 @@ def test_a_position_far_off_is_refused(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("lengths", torch.tensor([10**12]), ("claims 1000000000000 x",)),
+        ("lengths", torch.tensor([10**12]), ("1000000000000 places",)),
         ("lengths", torch.tensor([-64]), ("a chunk of -64 places",)),
         ("lengths", torch.tensor([64.0]), ("lengths is (1,) torch.float32",)),
         ("lengths", None, ("lengths is missing",)),

@@ -56,10 +56,10 @@ def test_the_lines_that_are_marked_are_those_of_the_map(chunk: int | str) -> Non
     picture = draw_spectrum(run, held)["spectrum"]
     figure, axes = picture.plot
     start, stop = held.chunks[0]
-    first, last = held.bounds[:2]
+    every = held.lines(0)
     assert [axis.get_title(loc="left").split(":")[0] for axis in axes] == [f"feature {j}" for j in (4, 3, 0)]
     for axis, feature in zip(axes, (4, 3, 0), strict=True):
-        lines = held.line[first:last][(held.feature[first:last] == feature)]
+        lines = every.line[every.feature == feature]
         expected = sorted(float(period_of(line, stop - start)) for line in lines.tolist() if line)
         zero, kept = (sorted(one.get_xdata().tolist()) for one in axis.lines[:2])
         assert kept == pytest.approx(expected)

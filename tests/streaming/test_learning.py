@@ -14,10 +14,11 @@ from command_line import frames, write_images
 from helpers import Stream, refused
 from torch import Tensor
 
+from dejavu_torch import growth
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.chain import Chain
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.spectral import SpectralMapper, code_chunk
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
@@ -294,3 +295,33 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pyt
     assert torch.allclose(found.float(), exact, rtol=1e-3, atol=1e-3)
     learnt = DejaVu(whitening=Whitening(numbers=32)).learn(values)
     assert (learnt.localize(values[::7]).index == torch.arange(0, PLACES, 7)).float().mean() > 0.95
+
+
+def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[int]) -> None:
+    first, rest = route()[:500], route()[500:]
+
+    def stopped(*work: object) -> Iterator[object]:
+        for done, part in enumerate(code_here(*work)):  # type: ignore[arg-type]
+            if done == 2:
+                raise KeyboardInterrupt
+            yield part
+
+    whole = file_of(growth.append(learned(first), rest), tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        growth.append(learned(first), rest, work=tmp_path / "work", make=stopped)  # type: ignore[arg-type]
+    model = learned(first)
+    made.clear()
+    assert file_of(growth.append(model, rest, work=tmp_path / "work"), tmp_path) == whole
+    assert sum(made) == PLACES - 500 - 4 * CHUNK
+    with refused("work", "map"):  # it has more places by now
+        growth.append(model, rest, work=tmp_path / "work")
+
+
+def test_a_map_appended_to_is_that_of_both_parts(tmp_path: Path) -> None:
+    whole = learned(route())
+    assert whole.whitening is not None
+    part = DejaVu(whitening=whole.whitening, mapper=whole.mapper)
+    part.learn_features(whole.whitened(route()[:600]), ArrayTraverse(route()))
+    part.map = SpectralMap.of_chunks(whole.map.coded()[:12], whole.map.mean, **whole.map.settings())
+    growth.append(part, route()[600:])
+    assert file_of(part, tmp_path) == file_of(whole, tmp_path)

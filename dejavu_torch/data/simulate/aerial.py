@@ -1,7 +1,9 @@
 """A road seen from a drone, painted procedurally: `sim:aerial`.
 
 One image column is one frame step, about 0.25 m of road. The lane dashes repeat exactly every
-`DASH_PERIOD` frames and the chevrons every `CHEVRON_PERIOD`; everything else occurs once.
+`DASH_PERIOD` frames and the chevrons every `CHEVRON_PERIOD`; everything else occurs once. With
+`ground=repeat` nothing occurs once: one side of the road repeats every `TILES[0]` frames, the other every
+`TILES[1]`, and the road itself is the same everywhere.
 """
 
 from __future__ import annotations
@@ -15,13 +17,22 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.simulate.route import Random, SimulatedRoute, option, rgb
+from dejavu_torch.data.simulate.route import Random, SimulatedRoute, choice, option, rgb
+from dejavu_torch.types import InputError
 
 DASH_PERIOD = 93
 CHEVRON_PERIOD = 171
 VIEW = 64  # the camera sees VIEW x VIEW image pixels
 MARGIN = 8  # columns beyond the first and the last view, so that yaw never leaves the image
 HEIGHT = 96  # rows of the painted image; the camera flies along the middle one
+ONCE = 2**17  # frames of a route on which everything occurs once, at most: it is one image
+TILES = (
+    997,
+    1009,
+)  # columns of the two tiles of ground that repeats; co-prime, so that no place is like another
+PLAIN = (
+    9  # rows from the middle of the view to the edge of the road between the tiles: more than a cell of HOG
+)
 
 ROAD = 40.0  # image row of the road's middle
 HALF, LANE = 14.0, 6.3  # rows from the road's middle to its edge, to a lane's middle
@@ -238,6 +249,27 @@ def paint_route(frames: int, seed: int = 0) -> Tensor:
     return F.avg_pool2d(canvas.pixels.clamp(0, 1), scale)
 
 
+def paint_tiles(seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Paint the two tiles of ground that repeats: one lies above the middle of the road, one below.
+
+    Columns [0, P) of either go on as its columns [P, 2P), and so on. Both show their half of a road that is
+    the same in every column, and beyond it the roadside of a route of their own.
+
+    Args:
+        seed: chooses the roadsides.
+
+    Shape: two (3, HEIGHT / 2, TILES[k]) float32 in [0,1], row 0 the one that is nearest to the middle.
+    """
+    tiles = []
+    for side, period in enumerate(TILES):
+        edge = round(ROAD + HALF)
+        beside = paint_route(period, 2 * seed + side)[:, edge : edge + HEIGHT // 2 - PLAIN, :period]
+        road = rgb(ASPHALT).repeat(1, PLAIN, 1)
+        road[:, PLAIN - 3] = rgb(WHITE)[:, 0]  # the edge line
+        tiles.append(torch.cat([road.expand(-1, -1, period), beside], 1))
+    return tiles[0], tiles[1]
+
+
 @dataclass(eq=False)
 class AerialRoad(SimulatedRoute):
     """A flight along a painted road, one image column per frame: `sim:aerial`.
@@ -249,11 +281,14 @@ class AerialRoad(SimulatedRoute):
     Args:
         seed: chooses the route, at least 0.
         traverse: chooses the flight, at least 0; 0 is the reference.
-        frames: number of frames, 1 to 32768.
+        frames: number of frames, 1 to 131072; with ground="repeat" to 1005973, where both tiles begin anew.
         size: height and width of a frame in pixels, 16 to 256; it always shows VIEW x VIEW image pixels.
         noise: standard deviation of the sensor noise, 0 to 1, on the scale where white is 1.
         drift: largest sideways drift, 0 to 8 image pixels.
         yaw: largest turn of the camera, 0 to 5 degrees.
+        ground: "once": the lane dashes and chevrons repeat, everything else occurs once. "repeat": the upper
+            half of the view repeats every `TILES[0]` frames and the lower half every `TILES[1]`, without
+            traffic: a place is the pair of its phases.
 
     Raises:
         InputError: an argument that is no number or out of its range.
@@ -265,16 +300,22 @@ class AerialRoad(SimulatedRoute):
 
     seed: int = option(0, 0)
     traverse: int = option(0, 0)
-    frames: int = option(3072, 1, 2**15)
+    frames: int = option(3072, 1, math.lcm(*TILES))
     size: int = option(64, 16, 256)
     noise: float = option(0.025, 0, 1)
     drift: float = option(3.0, 0, 8)
     yaw: float = option(1.5, 0, 5)
+    ground: str = choice("once", "repeat")
 
     kind = "aerial"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.ground == "once" and self.frames > ONCE:
+            raise InputError(
+                f"sim:aerial has frames={self.frames}; expected 1 <= frames <= {ONCE}, with ground=repeat "
+                f"{math.lcm(*TILES)}"
+            )
         self.length, self.place = self.frames, torch.arange(self.frames, dtype=torch.float64)
         random, swing = Random("flight", self.seed, self.traverse), 1.0 if self.traverse else 0.4
         looks = [random.pick(values) for values in ((0.78, 0.84, 1.16), (0.86, 1.16), (-0.06, 0.06))]
@@ -299,17 +340,42 @@ class AerialRoad(SimulatedRoute):
                 x += random.uniform(90, 600)
         return image.clamp_(0, 1)
 
+    @cached_property
+    def _tiles(self) -> tuple[Tensor, Tensor]:
+        """The two halves of the ground that repeats as (3, HEIGHT, P + margins), each mirrored at the middle.
+
+        So a sample near the middle, which mixes two rows, finds its own tile on both sides.
+        """
+        ahead = VIEW + 2 * MARGIN
+        tiles = (torch.cat([tile.flip(1), tile], 1) for tile in paint_tiles(self.seed))
+        first, second = (torch.cat([tile, tile[..., :ahead]], 2) for tile in tiles)
+        return first, second
+
     def _frames(self, at: Tensor) -> Tensor:
         fine = math.ceil(VIEW / self.size)  # a small frame averages samples that lie an image pixel apart
         across = ((torch.arange(fine * self.size).double() + 0.5) / (fine * self.size) - 0.5) * VIEW
-        down, (height, width) = across[:, None], self._scene.shape[1:]
+        down = across[:, None]
         c, s, drift = (curve[at, None, None] for curve in (self._yaw.cos(), self._yaw.sin(), self._drift))
-        column = at[:, None, None] + (MARGIN + VIEW / 2) + c * across - s * down
+        column = MARGIN + VIEW / 2 + c * across - s * down  # from the frame's first one
         row = HEIGHT / 2 + drift + s * across + c * down
-        grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], -1).float()
-        seen = F.grid_sample(self._scene.expand(len(at), -1, -1, -1), grid, align_corners=False)
+        if self.ground == "once":
+            seen = _sample(self._scene, at, column, row)
+        else:
+            halves = [
+                _sample(tile, at % period, column, row)
+                for tile, period in zip(self._tiles, TILES, strict=True)
+            ]
+            seen = torch.where((row < HEIGHT / 2)[:, None], halves[0], halves[1])
         seen = F.avg_pool2d(seen, fine) * self._gain[at, :, None, None]
         seen = seen ** self._gamma[at, None, None, None]
         for frame, i in zip(seen, at.tolist(), strict=True):
             frame += self.noise * Random("noise", self.seed, self.traverse, i).normal(*frame.shape)
         return seen.clamp_(0, 1)
+
+
+def _sample(image: Tensor, first: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Samples of an image (3,H,W) at columns, counted from the first of each frame, and rows: (B,h,w)."""
+    height, width = image.shape[1:]
+    column = first[:, None, None] + column
+    grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], -1).float()
+    return F.grid_sample(image.expand(len(first), -1, -1, -1), grid, align_corners=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field, fields
 from functools import cached_property
 from hashlib import blake2b
@@ -29,11 +29,17 @@ def option(default: float, low: float, high: float = math.inf) -> Any:
     return field(default=default, metadata={"span": (low, high)})
 
 
+def choice(*names: str) -> Any:
+    """A field that takes one of these names, the first by default."""
+    return field(default=names[0], metadata={"names": names})
+
+
 class SimulatedRoute(IndexedTraverse):
     """A route drawn by the computer, so that the true place of every frame is known.
 
-    A subclass is a dataclass whose fields are each an `option`, `seed` and `traverse` among them. It sets
-    `length` and `place` and draws frames in `_frames`, each from its number and the options alone.
+    A subclass is a dataclass whose fields are each an `option` or a `choice`, `seed` and `traverse` among
+    them. It sets `length` and `place` and draws frames in `_frames`, each from its number and the options
+    alone.
 
     Attributes:
         kind: its name, as in `sim:KIND?seed=0`.
@@ -47,12 +53,10 @@ class SimulatedRoute(IndexedTraverse):
         """Refuse options out of their span, and name the route by those that differ from their defaults."""
         address = []
         for entry in fields(self):  # type: ignore[arg-type]  # a subclass is a dataclass
-            key, (low, high) = entry.name, entry.metadata["span"]
-            value, default = getattr(self, key), getattr(type(self), key)
-            whole = isinstance(default, int)
-            if not (isinstance(value, Integral if whole else Real) and low <= value <= high):
-                span = f"{low} <= {key} <= {high}" if high < math.inf else f"{key} >= {low}"
-                wanted = f"{span}, a whole number" if whole else span
+            key, default = entry.name, getattr(type(self), entry.name)
+            value = getattr(self, key)
+            wanted = _problem(key, value, default, entry.metadata)
+            if wanted:
                 raise InputError(f"sim:{self.kind} has {key}={value}; expected {wanted}")
             value = type(default)(value)
             setattr(self, key, value)
@@ -76,6 +80,18 @@ class SimulatedRoute(IndexedTraverse):
 
     def read(self, frames: range) -> Tensor:
         return self._frames(torch.arange(frames.start, frames.stop, frames.step))
+
+
+def _problem(key: str, value: object, default: object, allowed: Mapping[str, Any]) -> str:
+    """What is expected of an option, where its value is something else."""
+    if "names" in allowed:
+        return "" if value in allowed["names"] else " or ".join(allowed["names"])
+    low, high = allowed["span"]
+    whole = isinstance(default, int)
+    if isinstance(value, Integral if whole else Real) and low <= value <= high:
+        return ""
+    span = f"{low} <= {key} <= {high}" if high < math.inf else f"{key} >= {low}"
+    return f"{span}, a whole number" if whole else span
 
 
 class Random:

@@ -1,0 +1,75 @@
+"""The coder as Python and compiled: one code, and which of them codes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest import mock
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch.database import codec
+from dejavu_torch.database.codec import coded_bytes, encode
+
+
+@contextmanager
+def coded_by(code: codec._Code) -> Iterator[None]:
+    with mock.patch.object(codec, "_code", return_value=code):
+        yield
+
+
+@given(st.integers(1, 700), st.integers(1, 12), st.integers(0, 400), st.integers(0, 2**32 - 1))
+def test_compiled_and_plain_are_one(rows: int, columns: int, spread: int, seed: int) -> None:
+    """What is near, the streams, and how a stream of anything ends."""
+    fast = codec._compiled()
+    assert fast is not None
+    random = np.random.default_rng(seed)
+    own = (random.integers(-spread, spread + 1, (rows, columns)) * random.random((rows, 1)) ** 4).clip(
+        -128, 127
+    )
+    own = own.astype(np.int8)
+    for slow, other in zip(codec._symbols(own, codec.PLAIN), codec._symbols(own, fast), strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(slow, other, strict=True))
+    told = []
+    for code in (codec.PLAIN, fast):
+        with coded_by(code):
+            stream = encode(torch.from_numpy(own))
+            altered = stream.bytes.numpy().copy()
+            altered[seed // 8 % len(altered)] ^= 1 << seed % 8
+            told.append([stream.bytes.tolist(), coded_bytes(torch.from_numpy(own)), stream.checksum])
+            for packed in (altered, altered[: len(altered) // 2]):
+                found = np.zeros_like(own)
+                try:
+                    codec._decode(packed.tobytes(), found)
+                except ValueError as error:
+                    told[-1].append(str(error))
+                told[-1].append(found.tolist())
+    assert told[0] == told[1]
+
+
+def test_it_is_compiled_once_it_pays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codec, "_coded", 0)
+    assert codec._code(codec.WORTH_COMPILING - 1) is codec.PLAIN
+    assert codec._code(1) is codec._compiled() is not codec.PLAIN
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_without_numba_it_is_coded_in_python(
+    missing: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    if missing:
+        monkeypatch.setitem(sys.modules, "numba.extending", None)
+    else:
+        monkeypatch.setattr(pytest.importorskip("numba").config, "DISABLE_JIT", 1)
+    codec._compiled.cache_clear()
+    monkeypatch.setattr(codec, "_coded", codec.WORTH_COMPILING)
+    with caplog.at_level("INFO", "dejavu_torch"):
+        assert codec._code(1) is codec._code(1) is codec.PLAIN
+    codec._compiled.cache_clear()
+    (line,) = caplog.messages
+    assert "not by numba" in line

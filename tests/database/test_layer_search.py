@@ -1,0 +1,155 @@
+"""The best place, found in the layers of a map, is that of a scan: bit for bit, the first of equal ones."""
+
+from __future__ import annotations
+
+import random
+from fractions import Fraction
+from unittest.mock import patch
+
+import pytest
+import torch
+from helpers import Fixed, template_model
+from torch import Tensor
+
+from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
+from dejavu_torch.database import layer_search
+from dejavu_torch.database.layer_search import LayerSearch, sliding_minimum
+from dejavu_torch.recognition.select import best_match
+from dejavu_torch.types import Plan
+
+LONG: Plan = tuple(FrequencyLayer(Fraction(p), p, 0, 60_000, (j,)) for j, p in enumerate((210, 286)))
+
+
+def random_values(draw: random.Random, generator: torch.Generator, *shape: int) -> Tensor:
+    """Many equal ones, sums that are equal once rounded, or neither."""
+    kind = draw.choice(["few", "rounded", "any", "flat"])
+    if kind == "few":
+        return torch.randint(0, 3, shape, generator=generator).float()
+    if kind == "rounded":
+        small = 1e-4 * torch.rand(shape, generator=generator)
+        return small + 1000.0 * torch.randint(0, 3, shape, generator=generator)
+    return torch.ones(shape) if kind == "flat" else torch.rand(shape, generator=generator)
+
+
+def random_map(draw: random.Random, generator: torch.Generator) -> TemplateMap:
+    """One to three chunks with gaps, most of two layers, whose periods share any factor or are equal."""
+    plan, place = [], 0
+    for _ in range(draw.choice([1, 1, 2, 3])):
+        start = place + draw.choice([0, 0, 1, 7, 30])
+        factor, layers = draw.choice([1, 1, 2, 3, 6]), draw.choice([1, 2, 2, 2, 2, 2, 3])
+        place = start + draw.choice([draw.randint(1, 60), draw.randint(60, 1200)])
+        for _ in range(layers):
+            period = Fraction(factor * draw.randint(1, 14), draw.choice([1, 1, 1, 2, 5]))
+            phases = draw.choice([period.numerator, period.numerator, 1, 4])
+            some = tuple(sorted(draw.sample(range(3), draw.randint(1, 3))))
+            ends = place if draw.random() < 0.9 else draw.randint(start + 1, place)
+            plan.append(FrequencyLayer(period, phases, start, ends, some))
+    blocks = [random_values(draw, generator, layer.phases, len(layer.features)) for layer in plan]
+    metric, reduction = draw.choice(["l1", "l2"]), draw.choice(["sum", "mean"])
+    return TemplateMap(tuple(plan), blocks, place + draw.choice([0, 0, 5]), 3, metric, reduction)
+
+
+def check(route: TemplateMap, queries: Tensor) -> tuple[int, int]:
+    search, rows = LayerSearch(route), route.distances(queries)
+    score, place = search.lowest(rows)
+    expected = best_match(route.combine(rows))
+    assert torch.equal(score, expected.score)
+    assert torch.equal(place, expected.index)
+    return len(search.pairs), len(search.scanned)
+
+
+@patch.multiple(layer_search, LOOK_UP=1, FIXED=0)
+@pytest.mark.parametrize("seed", range(4))
+def test_equals_the_scan_in_random_cases(seed: int) -> None:
+    draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
+    pairs = scanned = 0
+    for _ in range(500):
+        route = random_map(draw, generator)
+        with patch.object(layer_search, "AHEAD", draw.choice([1, 7, 4096])):
+            found = check(route, random_values(draw, generator, draw.randint(1, 5), 3))
+        pairs, scanned = pairs + found[0], scanned + found[1]
+    assert min(pairs, scanned) > 200
+
+
+@pytest.mark.parametrize("periods", [(210, 286), (286, 210), (200, 200), (64, 256), (199, 201), (1, 300)])
+@pytest.mark.parametrize("places", [5000, 30_030, 60_000])
+def test_equals_the_scan_below_and_above_the_common_period(periods: tuple[int, int], places: int) -> None:
+    plan = tuple(FrequencyLayer(Fraction(p), p, 17, places, (j,)) for j, p in enumerate(periods))
+    generator = torch.Generator().manual_seed(places)
+    blocks = [torch.rand(p, 1, generator=generator) for p in periods]
+    check(TemplateMap(plan, blocks, places, 2), torch.rand(8, 2, generator=generator))
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan(value: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    route = TemplateMap(LONG, [torch.rand(layer.phases, 1, generator=generator) for layer in LONG], 60_000, 2)
+    rows = route.distances(torch.rand(3, 2, generator=generator))
+    rows[0][0, 5], rows[1][1] = value, value
+    expected = best_match(route.combine(rows))
+    score, place = LayerSearch(route).lowest(rows)
+    assert torch.equal(place, expected.index)
+    assert torch.equal(score.nan_to_num(-1, -2), expected.score.nan_to_num(-1, -2))
+    assert place[1] == -1
+
+
+def test_localize_takes_it_and_gives_what_the_scan_gives() -> None:
+    features = (torch.arange(60_000)[:, None] % torch.tensor([210, 286])).float()
+    model = template_model(periods=Fixed(*LONG)).learn(features)
+    queries = features[torch.tensor([17, 30_029, 4000])] + torch.tensor([[0.1], [0.2], [0.3]])
+    with patch.object(TemplateMap, "scores", side_effect=AssertionError("all scores")):
+        found = model.localize(queries)
+    assert found.index.tolist() == [17, 30_029, 4000]
+    scores = model.map.scores(queries)
+    assert torch.equal(found.score, scores.amin(1))
+    model.threshold = float(scores.amin(1).sort().values[1])
+    assert model.localize(queries).accepted.sum() == 1
+    # everything that needs other scores makes them
+    seen: list[tuple[int, ...]] = []
+    list(model.matches_of([queries], look=lambda scores: seen.append(tuple(scores.shape))))
+    assert seen == [(3, 60_000)]
+    assert torch.equal(model.candidates(queries, k=2).index[:, 0], found.index)
+    assert model.localize(queries, sequence=SequenceMatcher(1)).index.tolist() == found.index.tolist()
+
+
+def test_a_map_it_is_not_worth_for_has_no_such_way() -> None:
+    queries = torch.rand(2, 2)
+    short = tuple(FrequencyLayer(layer.period, layer.phases, 0, 1024, layer.features) for layer in LONG)
+    blocks = [torch.rand(layer.phases, 1) for layer in LONG]
+    assert TemplateMap(short, blocks, 1024, 2).lowest(queries) is None
+    third = FrequencyLayer(Fraction(289), 289, 0, 60_000, (0, 1))
+    assert TemplateMap((*LONG, third), [*blocks, torch.rand(289, 2)], 60_000, 2).lowest(queries) is None
+    assert TemplateMap(LONG, blocks, 60_000, 2, temperature=1.0).lowest(queries) is None
+    assert TemplateMap((), (), 60_000, 2).lowest(queries) is None
+    assert TemplateMap(LONG, blocks, 60_000, 2).lowest(queries) is not None
+
+
+def test_many_queries_are_searched_a_few_at_a_time() -> None:
+    route = TemplateMap(LONG, [torch.rand(layer.phases, 1) for layer in LONG], 60_000, 2)
+    queries = torch.rand(9, 2)
+    whole = route.lowest(queries)
+    with patch.object(layer_search, "AT_ONCE", 2 * (210 + 286)):
+        route.loaded()
+        parts = route.lowest(queries)
+    assert whole is not None
+    assert parts is not None
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
+
+
+def test_a_map_of_ten_million_places_holds_its_templates_alone() -> None:
+    plan = tuple(FrequencyLayer(Fraction(p), p, 0, 10**7, (j,)) for j, p in enumerate((3163, 3164)))
+    route = TemplateMap(plan, [torch.rand(layer.phases, 1) for layer in plan], 10**7, 2)
+    assert route.lowest(torch.rand(1, 2)) is not None
+    assert route.summary().covered == 10**7
+    search = route._search
+    assert search is not None
+    held = [*route.buffers(), search.places, *(part for pair in search.pairs for part in pair[-2:])]
+    assert sum(tensor.nbytes for tensor in held) < 300_000
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 12])
+def test_sliding_minimum_is_that_of_every_window(size: int) -> None:
+    values = torch.randint(0, 9, (2, 3, size), generator=torch.Generator().manual_seed(size))
+    for width in range(1, size + 1):
+        windows = torch.stack([values.roll(-k, -1) for k in range(width)])
+        assert torch.equal(sliding_minimum(values, width), windows.amin(0))

@@ -1,0 +1,259 @@
+"""Maps that grow, from descriptors."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from footage import REFERENCE, SIDE, camera, footage
+from helpers import refused, template_model
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import HOG, DejaVu, Preprocess, SpectralMapper, growth
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.positions import count_places, shown_frames
+from dejavu_torch.database.spectral import SpectralMap, code_chunk
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.growth import append, positions_behind
+from dejavu_torch.streaming import coder
+from dejavu_torch.types import Traverse
+
+NUMBERS = 6
+
+
+def walk(places: int, seed: int = 0) -> Tensor:
+    """Descriptors (N,6) that change slowly."""
+    steps = torch.randn(places, NUMBERS, generator=torch.Generator().manual_seed(seed))
+    return 0.1 * steps.cumsum(0) + torch.arange(6.0)
+
+
+def learned(route: Tensor | Traverse, chunk: int | str = 64, **settings: object) -> DejaVu:
+    mapper = SpectralMapper(4.0, chunk=chunk, **settings)  # type: ignore[arg-type]
+    return DejaVu(whitening="none", mapper=mapper).learn(route)
+
+
+class Named(ArrayTraverse):
+    """Frames or features with names."""
+
+    def frame_name(self, i: int) -> str:
+        return f"{self.name}_{i:04}.png"
+
+
+def state_of(model: DejaVu) -> dict[str, Tensor]:
+    return {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
+
+
+def spectral(model: DejaVu) -> SpectralMap:
+    assert isinstance(model.map, SpectralMap)
+    return model.map
+
+
+# places behind those of a map
+
+
+@pytest.mark.parametrize(
+    ("chunk", "parts", "settings"),
+    [
+        (64, (128, 100), {}),
+        (64, (64, 128, 7), {"metric": "l2", "transform": "dct"}),
+        (50, (100, 50, 200), {"resolution": 8.0}),
+        (32, (192, 1), {}),
+    ],
+)
+def test_the_file_is_that_of_all_places_learned_at_once(
+    chunk: int, parts: tuple[int, ...], settings: dict[str, object], tmp_path: Path
+) -> None:
+    route = walk(sum(parts))
+    first, *others = route.split(parts)
+    model, whole = (learned(first, chunk, **settings) for _ in range(2))
+    for i, part in enumerate(others):
+        append(model, ArrayTraverse(part, "rest") if i else part)
+    known = spectral(whole)
+    coding = known.mean, float(known.steps[0]), known.transform, known.resolution
+    chunks = [code_chunk(part, *coding) for part in route.split(chunk)]
+    whole.map = SpectralMap.of_chunks(chunks, known.mean, **known.settings())
+    ours, theirs = state_of(model), state_of(whole)
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    for name, one in (("appended", model), ("whole", whole)):
+        one.save(tmp_path / name)
+    assert (tmp_path / "appended").read_bytes() == (tmp_path / "whole").read_bytes()
+    assert DejaVu.load(tmp_path / "appended").map.places == len(route)
+
+
+def test_the_old_places_stay_and_the_new_ones_are_found() -> None:
+    route = walk(500)
+    model = learned(route[:200])  # 200 is no multiple of 64: the last chunk stays short
+    model.threshold = 0.25
+    before, query = model.map, walk(1, seed=3)
+    old = model.map.scores(query)
+    assert append(model, route[200:]) is model
+    assert model.map is not before
+    assert [stop - start for start, stop in spectral(model).chunks] == [*[64] * 3, 8, *[64] * 4, 44]
+    assert torch.equal(model.map.scores(query)[:, :200], old)
+    assert spectral(model).steps.unique().numel() == 1
+    assert torch.equal(spectral(model).mean, spectral(learned(route[:200])).mean)
+    assert (model.localize(route[::7]).index - torch.arange(0, 500, 7)).abs().max() <= 2
+    assert (model.threshold, model.summary().places) == (0.25, 500)
+
+
+def test_an_extended_map_is_an_appended_one() -> None:
+    route = walk(300)
+    one, other = learned(route[:128]), learned(route[:128])
+    one.map.extend(route[128:])
+    append(other, route[128:])
+    query = walk(5, seed=1)
+    assert torch.equal(one.map.scores(query), other.map.scores(query))
+
+
+def test_whitening_stays() -> None:
+    route = walk(300)
+    model = DejaVu(whitening=Whitening(numbers=4), mapper=SpectralMapper(4.0, chunk=50)).learn(route[:200])
+    assert model.whitening is not None
+    before = model.whitening.projection.clone()
+    append(model, route[200:])
+    assert torch.equal(model.whitening.projection, before)
+    assert (model.localize(route[::9]).index - torch.arange(0, 300, 9)).abs().max() <= 2
+
+
+def test_names_follow_and_parts_without_names_stay_without() -> None:
+    route = walk(192)
+    model = learned(Named(route[:64], "a"))
+    append(append(model, Named(route[64:128], "b")), route[128:])
+    assert [model.frame_name(i) for i in (0, 63, 64, 127, 128, 191)] == [
+        *("a_0000.png", "a_0063.png", "b_0000.png", "b_0063.png", "", "")
+    ]
+    model = append(learned(route[:64]), Named(route[64:128], "b"))
+    assert [model.frame_name(i) for i in (0, 63, 64)] == ["", "", "b_0000.png"]
+    assert append(learned(route[:64]), route[64:128]).frame_names == []
+    assert len(model.frame_names) == 128
+
+
+def test_a_calibration_goes_and_comes_again_from_the_new_places() -> None:
+    frames = torch.rand(120, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    mapper = SpectralMapper(40.0, chunk=20)
+    model = DejaVu(HOG(resize=(32, 32)), "none", mapper, precision=0.9).learn(frames[:80])
+    model.calibrate(frames[:80])
+    append(model, frames[80:])
+    assert model.calibration is None
+    model.calibrate(frames[80:], start=80)
+    assert model.calibration is not None
+    assert model.calibration.single is not None
+    matched = model.localize(frames)
+    assert matched.probability is not None
+    assert torch.equal(matched.accepted, matched.probability >= 0.9)
+    assert matched.accepted.float().mean() > 0.5
+    right = model.calibration
+    model.calibrate(frames[80:])  # as if those frames were the first places
+    lower = model.localize(frames).probability
+    assert lower is not None
+    assert (model.calibration != right, lower.mean() < matched.probability.mean() - 0.3) == (True, True)
+
+
+def test_places_at_even_steps_go_on_behind_the_last() -> None:
+    parts = ArrayTraverse(footage(REFERENCE), "first"), ArrayTraverse(footage(REFERENCE + 31), "next")
+    mapper = SpectralMapper(200.0, chunk=20)
+    model = DejaVu(HOG(), "none", mapper, velocity=camera()).learn(parts[0])
+    alone = model.map.frame_of(torch.arange(101))
+    assert model.map.places == 101
+    append(model, parts[1])
+    assert model.map.places == 202
+    frames = len(REFERENCE)
+    assert torch.equal(model.map.frame_of(torch.arange(101)), alone)
+    assert ((model.map.frame_of(torch.arange(101, 202)) - frames - alone).abs() <= 1).all()
+    assert len(model.map.positions) == 2 * frames
+    assert model.map.frame_of(torch.tensor([101])).tolist() == [frames]
+    assert model.map.place_of(torch.tensor([0, frames])).tolist() == [0, 101]
+    matched = model.localize(parts[1]).index
+    assert ((matched - torch.arange(101, 202)).abs() <= 2).float().mean() > 0.9
+    with refused("ready features", "even steps"):
+        append(model, walk(30))
+
+
+@given(
+    st.lists(st.floats(-3.0, 3.0, width=32), min_size=2, max_size=40),
+    st.sampled_from([1, 7, 1000, 99_999, 2**23]),
+)
+def test_positions_behind_others_reach_as_many_places(moves: list[float], places: int) -> None:
+    own = torch.tensor([0.0, *moves]).cumsum(0)
+    behind = positions_behind(own, places)
+    assert count_places(behind) == places + count_places(own)
+    assert behind.min() >= places
+    if places < 10_000:  # beyond, float32 holds them to a thousandth of a step only
+        joined = torch.cat([torch.tensor([0.0, places - 0.75]), behind])
+        shown = shown_frames(joined)[places:]
+        assert shown[0] == 2
+        assert (shown - 2 - shown_frames(own.clamp(min=0))).abs().max() <= 1
+
+
+def test_only_a_chunk_of_descriptors_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, sizes = learned(walk(64)), []
+    code = coder.code_chunk
+    monkeypatch.setattr(coder, "code_chunk", lambda part, *rest: sizes.append(len(part)) or code(part, *rest))
+    append(model, walk(1000, seed=2))
+    assert sizes == [*[64] * 15, 40]
+
+
+# what is refused leaves the map as it was
+
+
+def image_model(chunk: int | str = 20, **settings: object) -> DejaVu:
+    frames = torch.rand(40, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    mapper = SpectralMapper(40.0, chunk=chunk)
+    return DejaVu(whitening="none", mapper=mapper, **settings).learn(frames)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("model", "added", "words"),
+    [
+        ("route", torch.rand(40, NUMBERS), ("whole route", "--mapper.chunk 1024")),
+        ("templates", torch.rand(40, NUMBERS), ("'templates'", "'spectral'")),
+        ("none", torch.rand(40, NUMBERS), ("no map",)),
+        ("features", torch.rand(40, 7), ("7 features", "expected 6")),
+        ("features", torch.rand(40, 1, 9, 9), ("holds frames", "ready features")),
+        ("features", torch.full((40, NUMBERS), math.nan), ("NaN",)),
+        ("features", torch.rand(0, NUMBERS), ("holds nothing",)),
+        ("frames", torch.rand(40, NUMBERS), ("holds ready features", "from frames")),
+        ("frames", torch.rand(40, 3, 48, 32), ("3 x 48 x 32", "3 x 32 x 32")),
+        ("frames", torch.rand(40, 1, 32, 32), ("1 x 32 x 32", "3 x 32 x 32")),
+    ],
+    ids=lambda value: "" if isinstance(value, Tensor) else str(value),
+)
+def test_what_cannot_be_appended(model: str, added: Tensor, words: tuple[str, ...]) -> None:
+    base = {
+        "route": lambda: learned(walk(64), "route"),
+        "templates": lambda: template_model().learn(walk(64)),
+        "none": lambda: DejaVu(),
+        "features": lambda: learned(walk(64)),
+        "frames": lambda: image_model(),
+    }[model]()
+    before, state = base.map, base.get_extra_state()
+    with refused(*words):
+        append(base, added)
+    assert base.map is before
+    assert base.get_extra_state() == state
+
+
+def test_frames_of_another_size_go_where_features_resize_them() -> None:
+    model = image_model(features=HOG(resize=(32, 32)))
+    assert append(model, torch.rand(20, 3, 64, 48)).map.places == 60
+    grey = image_model(preprocess=Preprocess(channel="grey"))
+    assert append(grey, torch.rand(20, 1, 32, 32)).map.places == 60
+
+
+def test_more_places_than_lines_can_be_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = learned(walk(64))
+    monkeypatch.setattr(growth, "MOST", 100)
+    with refused("128 places", "at most 100"):
+        append(model, walk(64))
+    assert append(model, walk(36)).map.places == 100
+    monkeypatch.setattr(growth, "EXACT", 150)
+    moved = DejaVu(HOG(), "none", SpectralMapper(200.0, chunk=20), velocity=camera())
+    route = ArrayTraverse(footage(REFERENCE)[:, :, :SIDE], "route")
+    moved.learn(route)
+    with refused("202 places at even steps", "at most 150"):
+        append(moved, route)
