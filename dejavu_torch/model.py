@@ -36,7 +36,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import STRETCH, AugmentedTraverse, Stretches, Views
+from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
@@ -65,6 +65,7 @@ log = logging.getLogger("dejavu_torch")
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
 TRIAL_SCORES = 2**22  # of the queries of a trial at all places
+CALIBRATION_SCORES = 2**30  # of all frames that a map is calibrated by, at all places
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors on the device at a time
 FEW_DESCRIPTORS = IN_MEMORY // 4  # bytes
@@ -528,7 +529,7 @@ class DejaVu(nn.Module):
                 looked up in changed light and view: `Augmentation` of 1.5 times the strengths of the
                 whitening, which has seen the plain ones.
             views: frames of another traverse of the same places instead, which tell of its own changes;
-                those that show no place are left out.
+                those that show no place are left out, and of very many all but evenly spaced stretches.
             start: the place that the reference's first frame is, as where it was appended to a map.
 
         Returns:
@@ -551,7 +552,8 @@ class DejaVu(nn.Module):
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
-            stretches = Stretches(as_traverse(reference), self.map.places - start, strengths)
+            among = self.map.places
+            stretches = Stretches(as_traverse(reference), among - start, strengths, places=among)
             views, length = Views(stretches, start + stretches.places), stretches.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
@@ -559,6 +561,8 @@ class DejaVu(nn.Module):
         if len(views.places) and int(views.places.max()) >= self.map.places:
             shown = f"{name} shows place {int(views.places.max())}"
             raise InputError(f"{shown}; expected one of the map's {self.map.places}")
+        if another:
+            views = _stretches_of(views, length, max(LEAST, CALIBRATION_SCORES // self.map.places))
         descriptors = self.extract_all(views.traverse)
         if len(descriptors) != len(views.places):
             seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
@@ -987,6 +991,18 @@ def check_precision(precision: float | None) -> None:
     """
     if precision is not None and not 0 < precision < 1:
         raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
+
+
+def _stretches_of(views: Views, length: int, most: int) -> Views:
+    """Evenly spaced stretches of views, as long as that and about `most` frames in all; all if there are no
+    more."""
+    count = len(views.places) // length
+    wanted = max(1, most // length)
+    if count <= wanted:
+        return views
+    starts = torch.arange(wanted) * (count - 1) // max(1, wanted - 1) * length
+    frame = (starts[:, None] + torch.arange(length)).flatten()
+    return Views(Selection(views.traverse, frame), views.places[frame.to(views.places.device)])
 
 
 def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -16,6 +16,7 @@ STRETCH, EVERY = 20, 10  # frames of a stretch, and which of the stretches are t
 STRONGER = 1.5  # than what a whitening knows, since it has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all stretches together
 TIMES = 2  # of a short route, as many as it has itself at most
+LEAST, SCORES = 240, 2**27  # frames of a long route at least, and scores of them all at all of its places
 
 
 class Views(NamedTuple):
@@ -88,25 +89,34 @@ class Stretches(Traverse):
     """Stretches of a traverse, each frame as it may look on another visit: what a map is calibrated by.
 
     Every 10th stretch of 20 frames is taken, of a short traverse fewer frames; several times where that is
-    little, and of a long one not all. Each frame is changed for itself, 1.5 times as much as by `strengths`.
+    little, and of a long one not all: 1200 frames of one of 10^5, down to 240 of longer ones. Each frame is
+    changed for itself, 1.5 times as much as by `strengths`.
 
     Args:
         traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
-        seed: of the changes.
+        seed: of the changes. places: of the map, among which they are looked up; None is N.
 
     Raises:
         InputError: ready features.
     """
 
-    def __init__(self, traverse: Traverse, frames: int, strengths: Mapping[str, Any], seed: int = 0) -> None:
+    def __init__(
+        self,
+        traverse: Traverse,
+        frames: int,
+        strengths: Mapping[str, Any],
+        seed: int = 0,
+        places: int | None = None,
+    ) -> None:
         from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
 
         if len(traverse.frame_shape) != 3:
             raise InputError(f"{traverse.name} holds ready features; expected frames to calibrate by")
         length = min(STRETCH, max(1, frames // EVERY))
         starts = range(0, frames - length + 1, EVERY * length)
-        self.starts = starts[:: max(1, -(-len(starts) * length // MOST))]
-        wanted = min(FEWEST, TIMES * frames)
+        most = min(MOST, max(LEAST, SCORES // (places or frames)))
+        self.starts = starts[:: max(1, -(-len(starts) * length // most))]
+        wanted = min(FEWEST, TIMES * frames, most)
         self.times = max(1, -(-wanted // (len(self.starts) * length)))
         self.traverse, self.stretch, self.seed = traverse, length, seed
         self.augmentation = KorniaAugmentation(**_checked(strengths, STRONGER))

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import refused
+from helpers import Stream, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from torch import Tensor
 
-from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, open_source
-from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, open_source
+from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.features.views import Stretches, Views
 from dejavu_torch.recognition.calibration import (
+    NEVER,
     Calibration,
     Platt,
     Track,
@@ -178,6 +180,40 @@ def test_every_tenth_stretch_is_taken(frames: int, stretch: int, starts: list[in
     assert bool((shown == shown[:, :1]).all())
 
 
+@pytest.mark.parametrize(
+    ("frames", "places", "most"), [(10**5, None, 1200), (10**6, None, 260), (10**5, 10**7, 260)]
+)
+def test_long_routes_are_looked_at_in_fewer_frames(frames: int, places: int | None, most: int) -> None:
+    route = open_source("sim:aerial?frames=30")  # none of it is read
+    changed = Stretches(route, frames, {"noise": 0.01}, places=places)
+    assert changed.length is not None
+    assert most * 0.7 < changed.length <= most
+    assert int(changed.places.max()) > 0.8 * frames
+
+
+def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    route = torch.randn(2000, 6)
+    seen: list[Tensor] = []
+    views = Views(as_traverse(route + 0.2 * torch.randn_like(route)), torch.arange(2000))
+    model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(route)
+    monkeypatch.setattr("dejavu_torch.model.LONGEST_TRIAL", 20)
+    monkeypatch.setattr("dejavu_torch.model.CALIBRATION_SCORES", 400 * 2000)
+
+    def noted(route: object, trials: Iterable[Trial], another: bool) -> Calibration:
+        seen.extend(trial.places for trial in trials)
+        return NEVER
+
+    monkeypatch.setattr("dejavu_torch.model.calibrated", noted)
+    model.calibrate(None, views)
+    starts = torch.stack(seen)[:, 0]
+    assert len(seen) == 20
+    assert all(torch.equal(part, part[0] + torch.arange(20)) for part in seen)
+    assert int(starts[0]) == 0
+    assert int(starts[-1]) == 1980
+    assert set(starts.diff().tolist()) <= {100, 120}
+
+
 def test_changed_frames_show_their_places_whatever_the_batch() -> None:
     route = open_source("sim:aerial?frames=300")
     frames = torch.cat(list(route.batches(64)))
@@ -191,7 +227,7 @@ def test_changed_frames_show_their_places_whatever_the_batch() -> None:
     assert (once - frames[changed.places]).std() == pytest.approx(
         0.15 * 0.7**0.5, rel=0.3
     )  # 1.5 times as much
-    unread = FrameRange(route, 0, 300)  # which cannot begin anywhere
+    unread = Stream(frames)  # which cannot begin anywhere
     torch.testing.assert_close(torch.cat(list(Stretches(unread, 300, plain).batches(9))), frames[same.places])
     with refused("ready features"):
         Stretches(open_source_of(torch.rand(30, 4)), 30, plain)
