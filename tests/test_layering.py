@@ -51,8 +51,8 @@ ARROWS = {
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",
-    "experiments": "types text data features periods database recognition motion model live evaluation "
-    "training",
+    "experiments": "types text data features periods database recognition motion streaming model cluster "
+    "live evaluation training",
     "cli": "types text data features periods database recognition motion streaming model growth cluster live "
     "evaluation training experiments",
 }

@@ -506,8 +506,8 @@ def run_bench(
 
     Args:
         what: matcher (time of HOG, L1 distances, sequences, filters), live (time of single frames on 100000
-            places), train (seconds of a training, and accuracy), memory (of learning and localizing) or
-            storage (accuracy over bytes)
+            places), train (seconds of a training, and accuracy), memory (of learning and localizing), cluster
+            (time of workers beside one process) or storage (accuracy over bytes)
         sources: of storage and train, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
@@ -519,7 +519,7 @@ def run_bench(
         seeds: of train, a training each; 0, 1 and 2 if not given
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench, footprint, frontier, live_speed
+    from dejavu_torch.experiments import bench, cluster_speed, footprint, frontier, live_speed
 
     for file in (out, out / "bench.json", out / "bench.png"):
         check_not_read(file, *sources, codebooks)
@@ -548,7 +548,7 @@ def run_bench(
         seen = f"{trained[0].case}, seeds {seeded}, threads: {trained[0].threads}"
         _say(f"{seen}; each row changes one thing of the row above; next: open {out / 'bench.png'}")
         return
-    known = what in bench.BENCHES or what in ("memory", "live")
+    known = what in bench.BENCHES or what in ("memory", "live", "cluster")
     if known and (sources or map or codebooks or whitening or (places and what != "memory")):
         raise InputError(
             f"bench {what} takes no sources, maps, codebooks, whitening or places; bench storage does"
@@ -560,6 +560,9 @@ def run_bench(
     elif what == "live":
         print(text_table(live_speed.live_table(live_speed.run_live(out))))
         note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
+    elif what == "cluster":
+        print(text_table(bench.bench_table(cluster_speed.run_cluster(out))))
+        note = "difference: share of chunks that are not those of one process"
     else:
         rows = bench.run_bench(what, out)
         print(text_table(bench.bench_table(rows)))

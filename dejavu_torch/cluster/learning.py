@@ -35,7 +35,7 @@ def code_on(
     total = sum(len(range(*coder.span(shard))) for shard in shards)
     bar = tqdm(total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False)
     with bar:
-        for task, result in cluster.run(_coded, shared, tasks):
+        for task, result in cluster.run(coded, shared, tasks):
             if isinstance(result, Failure):
                 failed.append((range(task[0].start, task[-1].stop), result))
                 if len(failed) == FAILURES:
@@ -51,7 +51,8 @@ def code_on(
         raise InputError(f"frames {start} to {stop - 1}, read on {failure.host}: {failure.why}{more}")
 
 
-def _coded(shards: list[range], coder: ChunkCoder, traverse: Traverse) -> list[list[CodedChunk]]:
+def coded(shards: list[range], coder: ChunkCoder, traverse: Traverse) -> list[list[CodedChunk]]:
+    """The chunks of shards, by a worker."""
     return [chunks for _, chunks in code_here(coder, traverse, shards)]
 
 

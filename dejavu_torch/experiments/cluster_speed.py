@@ -1,0 +1,124 @@
+"""How fast workers of a cluster make the chunks of a route, beside one process: `dejavu bench cluster`."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dejavu_torch.cluster.learning import code_on, coded
+from dejavu_torch.cluster.session import Cluster
+from dejavu_torch.data.arrays import read_array
+from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.output import check_output_folder, whole_folder
+from dejavu_torch.data.simulate.aerial import AerialRoad
+from dejavu_torch.database.spectral import CodedChunk, SpectralMap, SpectralMapper
+from dejavu_torch.experiments.bench import Row, write_bench
+from dejavu_torch.model import DejaVu
+from dejavu_torch.streaming.coder import ChunkCoder, code_here
+from dejavu_torch.types import Traverse
+
+CHUNK = 128  # places
+SAMPLE = 1000  # frames that whitening, mean and step are learned from
+
+
+def run_cluster(out: Path, frames: int = 8192, repeats: int = 3) -> list[Row]:
+    """Time the chunks of frames of sim:aerial, drawn beforehand, and write bench.json and bench.png.
+
+    Args:
+        frames: of the route. repeats: timed runs of each contender, in turn; the best counts.
+
+    Convention: workers have started, and have what they need, before time counts. All contenders but the one
+        with several threads make the same bytes, which is checked; with several threads matrix products
+        round otherwise, so that no map is made so.
+
+    Raises:
+        InputError: Ray is not there, or a folder that cannot be written in.
+    """
+    check_output_folder(out)
+    with tempfile.TemporaryDirectory() as folder, Cluster() as cluster:
+        path = Path(folder) / "route.npy"
+        pictures = AerialRoad(frames=frames).batches(64)
+        np.save(path, np.concatenate([(255 * one.permute(0, 2, 3, 1)).byte().numpy() for one in pictures]))
+        route = read_array(path)
+        rows = _timed(_contenders(_coder(route), route, cluster), frames, cluster.workers, repeats)
+    with whole_folder(out) as written:
+        write_bench(written, rows)
+    return rows
+
+
+def _coder(route: Traverse) -> ChunkCoder:
+    model = DejaVu(mapper=SpectralMapper(4.0, chunk=CHUNK)).learn(FrameRange(route, stop=SAMPLE))
+    assert isinstance(model.map, SpectralMap)
+    return model.chunk_coder(route.count(), model.map, model.map.mean, float(model.map.steps[0]))
+
+
+def _contenders(
+    coder: ChunkCoder, route: Traverse, cluster: Cluster
+) -> dict[tuple[str, int], Callable[[], list[CodedChunk]]]:
+    """By name and number of threads in all: what makes all chunks."""
+    shards = coder.shards()
+    shared = cluster.put(coder, route)
+
+    def here() -> list[CodedChunk]:
+        return [one for _, chunks in code_here(coder, route, shards) for one in chunks]
+
+    def threaded() -> list[CodedChunk]:
+        threads = torch.get_num_threads()
+        torch.set_num_threads(cluster.workers)
+        try:
+            return list(coder.chunks(route, range(shards[-1].stop)))
+        finally:
+            torch.set_num_threads(threads)
+
+    def one_worker() -> list[CodedChunk]:
+        ((_, made),) = cluster.run(coded, shared, [shards])
+        return [one for chunks in made for one in chunks]
+
+    def workers() -> list[CodedChunk]:
+        made = dict(code_on(cluster, coder, route, shards))
+        return [one for shard in shards for one in made[shard]]
+
+    return {
+        ("dejavu, one process", 1): here,
+        (f"dejavu, one process, {cluster.workers} threads", cluster.workers): threaded,
+        ("dejavu, 1 worker", 1): one_worker,
+        (f"dejavu, {cluster.workers} workers", cluster.workers): workers,
+    }
+
+
+def _timed(
+    contenders: dict[tuple[str, int], Callable[[], list[CodedChunk]]], frames: int, workers: int, repeats: int
+) -> list[Row]:
+    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in contenders}
+    sums: dict[tuple[str, int], list[int]] = {}
+    for _ in range(1 + repeats):
+        for key, make in contenders.items():
+            began = time.perf_counter()
+            chunks = make()
+            seconds[key].append(time.perf_counter() - began)
+            sums[key] = [one.stream.checksum for one in chunks]
+    best = {key: min(times[1:]) for key, times in seconds.items()}
+    first = next(iter(sums.values()))
+    case = f"chunks of {frames} frames"
+    return [
+        Row(
+            case,
+            name,
+            time_,
+            seconds[name, threads][0],
+            time_ / min(best.values()),
+            threads=threads,
+            difference=_share_of_others(sums[name, threads], first),
+        )
+        for (name, threads), time_ in best.items()
+    ]
+
+
+def _share_of_others(sums: Sequence[int], expected: Sequence[int]) -> float:
+    """The share of chunks that are other ones."""
+    return sum(a != b for a, b in zip(sums, expected, strict=True)) / len(expected)
