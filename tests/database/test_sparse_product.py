@@ -30,7 +30,7 @@ def test_sums_are_those_of_the_levels(largest: int, numbers: int, monkeypatch: p
     expected = torch.zeros(3, 100, dtype=torch.float64)
     expected[:, where] = queries.double() @ levels_of(own, numbers).double().T * factor.double()
     assert found is not None
-    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-6 * largest * numbers)
 
 
 def test_what_it_cannot_do_is_left_to_torch(monkeypatch: pytest.MonkeyPatch) -> None:
