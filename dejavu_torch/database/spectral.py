@@ -7,7 +7,7 @@ import copy
 import functools
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -18,7 +18,6 @@ from dejavu_torch.database.codec import (
     ESCAPE,
     Stream,
     check_claim,
-    coded_bytes,
     decode,
     encode,
     to_int8,
@@ -34,6 +33,7 @@ from dejavu_torch.database.coefficients import (
     lines_of,
 )
 from dejavu_torch.database.place_map import Mapper, PlaceMap
+from dejavu_torch.database.quantisation import RouteLines, dead_zone, quantise
 from dejavu_torch.database.sparse_product import compiled_sums
 from dejavu_torch.database.spectrum import Slots, Transform, from_slots, period_of, slots, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
@@ -42,48 +42,17 @@ from dejavu_torch.types import InputError
 log = logging.getLogger("dejavu_torch")
 
 SpectralMetric = Literal["cosine", "l2"]
-ROUNDING = 0.35  # what is added ahead of rounding down: a dead zone of 1.3 steps around 0
 SILENT = 1e-6  # of the map's RMS norm: a place below it has no direction
-FINEST = 64  # steps in an RMS line at most: a finer step changes no score
 STRONGEST = 10  # periods that a summary names
 CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and checksum in the file
-HALVINGS = 14  # of the steps to choose from, which leaves 0.1 % of a step
 BLOCK = 2**19  # numbers made at a time: they stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk made at a time, which is gone through for each
+ROWS = 2**14  # of descriptors, looked at together
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
 LINE_COST = 150  # of a coded line in a query's sum
 TRANSFORM_COST = 280  # of a place in a query's inverse transform
 REBUILD_COST = 200  # of a number that is rebuilt for all queries at once
-
-
-@torch.no_grad()
-def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -> Tensor:
-    """Whole numbers of steps, those below 1 - `ROUNDING` of a step 0. Same shape, float; no gradient.
-
-    Args:
-        width: by how much that dead zone is wider for each line, at least 1; see `dead_zone`.
-    """
-    # in place: the lines of a long route are large
-    levels = lines.abs().div_(step).add_(ROUNDING).floor_().copysign_(lines)
-    return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
-
-
-def dead_zone(lines: Tensor, lengths: list[int], resolution: float, transform: Transform) -> Tensor | None:
-    """By how much the dead zone of each of (N,K) lines, of chunks of these lengths, is wider than line 0's.
-
-    That of a line of period P is 1 + (resolution / P)^2 times as wide: it costs as many bits as a slow one,
-    and tells nothing of where one is but within P places.
-
-    Returns:
-        (N,1), or None where all lines count alike.
-    """
-    if not resolution:
-        return None
-    # line r has r half cycles (DCT), or of pairs of a cosine and a sine as many cycles (DFT)
-    halves = [torch.arange(n) if transform == "dct" else (torch.arange(n) + 1) // 2 * 2 for n in lengths]
-    inverse = torch.cat([r / (2 * n) for r, n in zip(halves, lengths, strict=True)]).to(lines)
-    return (1 + (resolution * inverse).square())[:, None]
 
 
 class CodedChunk(NamedTuple):
@@ -692,33 +661,33 @@ class SpectralMapper(Mapper):
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
         check_descriptors(features)
-        features = features.float()
-        mean = features.mean(0).to(torch.bfloat16)
-        lengths = _lengths(len(features), self.chunk)
-        lines = _lines(features - mean.float(), lengths, self.transform)
-        scale = float(lines.square().mean().sqrt())
-        if not scale > 1e-6 * float(features.square().mean().sqrt()):
-            raise InputError(f"the {len(features)} descriptors are all alike; expected a route that changes")
-        overhead = mean.nbytes + CHUNK_BYTES * len(lengths)
-        overhead += self._within(len(features), overhead)
-        width = dead_zone(lines, lengths, self.resolution, self.transform)
-        step = self._step(lines, width, lengths, overhead) if self.step is None else self.step
+        places = len(features)
+        lengths = _lengths(places, self.chunk)
+        lines = RouteLines(features, lengths, self.transform, self.resolution)
+        if not lines.scale > 1e-6 * lines.rms:
+            raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
+        overhead = lines.mean.nbytes + CHUNK_BYTES * len(lengths)
+        overhead += self._within(places, overhead)
+        step = self._step(lines, overhead) if self.step is None else self.step
         step = float(torch.tensor(step))  # as the file holds it
-        small, escapes = to_int8(quantise(lines, step, width))
-        steps = features.new_full((len(lengths),), step)
+        needed = None
+        if lines.held(step) < LITTLE:
+            half = lines.coded_bytes(lines.step_that_holds(0.5), even=True)
+            needed = (overhead + half) / places
+        coefficients = joined([coefficients_of(*levels) for levels in lines.levels(step)])
+        mean = lines.mean
+        del lines  # as large as the descriptors
         route = SpectralMap(
-            coefficients_of(small, escapes),
+            coefficients,
             torch.tensor(lengths, device=features.device),
-            steps,
+            features.new_full((len(lengths),), step, dtype=torch.float32),
             mean,
             self.metric,
             self.transform,
             self.chunk,
             self.resolution,
         )
-        if _held(lines, width, step) < LITTLE:
-            half = _smallest_step(lambda step: _held(lines, None, step) < 0.5, *_steps(lines))
-            route.needed = (overhead + _coded_bytes(lines, None, lengths, half)) / len(features)
+        route.needed = needed
         return route
 
     def extra_repr(self) -> str:
@@ -749,22 +718,19 @@ class SpectralMapper(Mapper):
         )
         return 0
 
-    def _step(self, lines: Tensor, width: Tensor | None, lengths: list[int], overhead: int) -> float:
+    def _step(self, lines: RouteLines, overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %."""
         assert self.route_bytes_per_place is not None
-        places, numbers = lines.shape
-        finest, coarsest = _steps(lines)
+        places, numbers = lines.lines.shape
         room = self.route_bytes_per_place * places - overhead
-        least = _coded_bytes(lines, width, lengths, coarsest)  # none of them
+        least = lines.coded_bytes(lines.steps[1])  # none of them
         if room <= least or self.route_bytes_per_place > 4 * numbers:
             raise InputError(
                 f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
                 f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
                 f"and at most {4 * numbers}, {numbers} numbers as floats"
             )
-        return _smallest_step(
-            lambda step: _coded_bytes(lines, width, lengths, step) <= room, finest, coarsest
-        )
+        return lines.step_of(room)
 
 
 def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:
@@ -791,7 +757,7 @@ def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
             f"the descriptors are {tuple(features.shape)} {features.dtype}; expected floats (N, {expected}), "
             f"N at least {least}"
         )
-    if not bool(features.isfinite().all()):
+    if not all(bool(part.isfinite().all()) for part in features.split(ROWS)):
         raise InputError("the descriptors hold NaN or infinity; expected finite numbers")
 
 
@@ -803,30 +769,3 @@ def _lengths(places: int, chunk: int | str) -> list[int]:
 
 def _lines(series: Tensor, lengths: list[int], transform: Transform) -> Tensor:
     return torch.cat([spectrum(part.T, transform).T for part in series.split(lengths)])
-
-
-def _coded_bytes(lines: Tensor, width: Tensor | None, lengths: list[int], step: float) -> int:
-    small, escapes = to_int8(quantise(lines, step, width))
-    return escapes.nbytes + sum(coded_bytes(part) for part in small.split(lengths))
-
-
-def _steps(lines: Tensor) -> tuple[float, float]:
-    """The finest step that is worth trying, and one so coarse that no line is left."""
-    return float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
-
-
-def _held(lines: Tensor, width: Tensor | None, step: float) -> float:
-    """The share of the variance that lines in such steps hold."""
-    error = lines - step * quantise(lines, step, width)
-    return 1 - float(error.square().sum() / lines.square().sum())
-
-
-def _smallest_step(enough: Callable[[float], bool], finest: float, coarsest: float) -> float:
-    """The smallest step that is coarse enough, by bisection of its logarithm."""
-    if enough(finest):
-        return finest
-    low, high = math.log(finest), math.log(coarsest)
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
-    return math.exp(high)
