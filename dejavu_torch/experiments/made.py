@@ -76,7 +76,8 @@ def _filters(series: Tensor) -> Tensor:
     power = sum(torch.fft.rfft(series[s : s + 2 * reach] * window, dim=0).abs().square() for s in starts)
     filters = torch.fft.irfft(torch.as_tensor(power).sqrt(), dim=0).roll(reach, 0) * window
     # white noise in, as much variance out as was there
-    return filters * (series.std(0) / torch.linalg.vector_norm(filters, dim=0).clamp(min=1e-12))
+    scaled: Tensor = filters * (series.std(0) / torch.linalg.vector_norm(filters, dim=0).clamp(min=1e-12))
+    return scaled
 
 
 class MadeRoute(IndexedTraverse):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
-from dejavu_torch.database.spectral import quantise
+from dejavu_torch.database.quantisation import quantise
 from dejavu_torch.database.spectrum import spectrum
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.model import DejaVu
