@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import math
 import os
+import tempfile
 from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from dejavu_torch.types import InputError
 
 GROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
 OWN = Path("/proc/self/cgroup")  # in which of them the process is
+IN_MEMORY = 2**29  # bytes of a tensor, at most
 CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back where memory is short
 
 
@@ -33,6 +39,36 @@ def check_room(needed: float, what: str) -> None:
     free = free_memory()
     if needed > free:
         raise InputError(f"{what} takes {_told(needed)}; expected at most the {_told(free)} free")
+
+
+def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEMORY) -> Tensor:
+    """Room for a tensor that may be larger than the memory: then on the CPU, and in a temporary file.
+
+    Args:
+        in_memory: bytes, at most. The file has no name and goes with the tensor or the process.
+
+    Shape: (rows,columns) float32.
+
+    Raises:
+        InputError: no room for the file.
+
+    Example:
+        >>> empty(3, 2, torch.device("cpu")).shape
+        torch.Size([3, 2])
+    """
+    size = 4 * rows * columns
+    if device.type != "cpu" or size <= in_memory:
+        return torch.empty(rows, columns, device=device)
+    try:
+        with tempfile.TemporaryFile() as file:
+            if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
+                os.posix_fallocate(file.fileno(), 0, size)
+            return torch.from_numpy(np.memmap(file, np.float32, "w+", shape=(rows, columns)))
+    except OSError as error:
+        raise InputError(
+            f"{rows} x {columns} numbers do not fit into a temporary file: {error.strerror}; "
+            "expected room there, or TMPDIR set to a folder with room"
+        ) from error
 
 
 def _told(size: float) -> str:

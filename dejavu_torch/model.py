@@ -22,6 +22,7 @@ from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.selection import Selection, runs
 from dejavu_torch.database.mapfile import HEADER, checksums, digests, map_size, read_map, write_map
+from dejavu_torch.database.merged import MergedMapper
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
 from dejavu_torch.database.schema import checked, checked_fields
@@ -86,6 +87,7 @@ CLASSES: tuple[type[nn.Module], ...] = (
     ImposedPeriods,
     TemplateMapper,
     SpectralMapper,
+    MergedMapper,
     GroundOdometry,
 )
 REGISTRY: Registry = {cls.__name__: cls for cls in CLASSES}

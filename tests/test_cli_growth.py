@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import fails, frames, run
+from command_line import fails, frames, report_of, run
 
 from dejavu_torch import DejaVu
 
 ROUTE = "sim:aerial?frames=128"
 FIRST, NEXT = "sim:aerial?frames=128&stop=64", "sim:aerial?frames=128&start=64"
+PAIR = "first.safetensors other.safetensors"
 CHUNKS = ("--mapper.chunk", "32", "--whitening.views", "2")
 
 
@@ -119,3 +121,126 @@ def test_what_is_refused_leaves_the_map(
     error = fails(capsys, "learn", *words.split())
     assert [one for one in said if one not in error] == [], error
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+# maps of several routes
+
+
+@pytest.fixture(scope="module")
+def merged(folder: Path) -> Path:
+    """Two routes, described alike, in one map."""
+    options = ("--whitening", folder / "first.safetensors", "--calibration", "none")
+    run("learn", "sim:aerial?frames=96&seed=1", "--map", folder / "other.safetensors", *options)
+    run(
+        "merge",
+        folder / "first.safetensors",
+        folder / "other.safetensors",
+        "--map",
+        folder / "both.safetensors",
+    )
+    return folder / "both.safetensors"
+
+
+def test_merged_routes_are_listed_and_matches_name_them(
+    merged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    run("info", merged)
+    told = capsys.readouterr().out
+    model = DejaVu.load(merged)
+    for name, first, last in (("first", 0, 63), ("other", 64, 159)):
+        size = model.map.part(name).summary().route_bytes  # type: ignore[operator]
+        assert f"route {name}: places {first}-{last}, {size} bytes" in told
+    query = "sim:aerial?frames=96&seed=1&traverse=1"
+    run("localize", merged, query, "--out", tmp_path / "m.csv")
+    assert "--route ROUTE" in capsys.readouterr().out
+    rows = matches(tmp_path / "m.csv")
+    assert [*rows[0]] == ["query", "place", "score", "accepted", "route", "query_name", "place_name"]
+    right = [row["route"] == "other" and abs(int(row["query"]) - int(row["place"])) <= 5 for row in rows]
+    assert sum(right) > 48
+    for table in ((), ("--map", merged)):
+        run(
+            "evaluate",
+            tmp_path / "m.csv",
+            "--truth",
+            "0",
+            "--route",
+            "other",
+            "--out",
+            tmp_path / "e",
+            *table,
+        )
+        report = report_of(tmp_path / "e")
+        assert report["accepted_right"] == sum(right)
+        assert report["elsewhere"] == sum(row["route"] == "first" for row in rows)
+        assert (report["route"], report["accepted"]) == ("other", 96)
+    run("localize", merged, query, "--out", tmp_path / "top.csv", "--top", "5")
+    top = matches(tmp_path / "top.csv")
+    assert [*top[0]][4:6] == ["rank", "route"]
+    assert [row["route"] for row in top[::5]] == [row["route"] for row in rows]
+    run("evaluate", tmp_path / "top.csv", "--truth", "0", "--route", "other", "--out", tmp_path / "e")
+    assert report_of(tmp_path / "e")["recall_at_5"] >= report["recall_at_1"]
+    run("evaluate", tmp_path / "m.csv", "--truth", "0", "--route", "first", "--out", tmp_path / "e")
+    wrong = report_of(tmp_path / "e")
+    assert wrong["accepted_right"] == sum(
+        row["route"] == "first" and abs(int(row["query"]) - int(row["place"])) <= 5 for row in rows
+    )
+
+
+def test_live_names_the_route(merged: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    run("live", merged, "sim:aerial?frames=96&seed=1&traverse=1&start=90", "--sequence", "1")
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(lines) == 6
+    known = {"first": 64, "other": 96}
+    assert all(0 <= line["reference_frame"] < known[line["route"]] for line in lines)
+    assert sum(line["route"] == "other" and line["reference_frame"] >= 84 for line in lines) >= 3
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("merge first.safetensors", ["merging first.safetensors", "at least two"]),
+        ("merge", ["0 maps", "at least two"]),
+        ("merge first.safetensors first.safetensors", ["first.safetensors", "one file"]),
+        ("merge first.safetensors f.safetensors", ["first", "f cannot be merged", "no whitening"]),
+        ("merge f.safetensors templates.safetensors", ["templates is", "'templates'", "'spectral'"]),
+        ("merge f.safetensors absent.safetensors", ["absent.safetensors"]),
+        (f"merge {PAIR} --map other.safetensors", ["other.safetensors is what is read"]),
+        (f"merge {PAIR} --map m.npy", ["--map m.npy", "m.safetensors"]),
+        ("compare a.npy a.npy --map both.safetensors --out e", ["both.safetensors has", "first, other"]),
+        ("export both.safetensors --onnx both.onnx", ["routes first, other"]),
+        (f"live both.safetensors {ROUTE} --page 0 --reference {ROUTE}", ["--reference", "2 routes"]),
+        (f"localize both.safetensors {ROUTE} --out m.csv --precision .9", ["is 0.9", "not calibrated"]),
+        ("learn a.npy --append both.safetensors", ["both.safetensors", "routes first, other"]),
+        ("evaluate r.csv --truth 0 --out e", ["column route, with answers on first, other"]),
+        ("evaluate r.csv --truth 0 --out e --map both.safetensors", ["routes first, other", "--route"]),
+        ("evaluate r.csv --truth 0 --out e --map both.safetensors --route b", ["'b'", "first, other"]),
+        ("evaluate p.csv --truth 0 --out e --route first", ["p.csv, line 2", "--route first"]),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_merged_or_done_with_several_routes(
+    folder: Path,
+    merged: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: str,
+    said: list[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "r.csv").write_text("query,place,score,route\n0,0,.1,first\n1,3,.1,other\n2,-1,inf,\n")
+    (folder / "p.csv").write_text("query,place,score\n0,0,.1\n")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    more = () if words.split()[0] != "merge" or "--map" in words else ("--map", "new.safetensors")
+    error = fails(capsys, *words.split(), *more)
+    assert [one for one in said if one not in error] == [], error
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_route_that_no_answer_is_on_is_told(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "r.csv").write_text("query,place,score,route\n0,0,.1,first\n1,3,.1,other\n")
+    run("evaluate", tmp_path / "r.csv", "--truth", "0", "--route", "b", "--out", tmp_path / "e")
+    assert "no answer is on route b; it has answers on first, other" in caplog.text
+    assert report_of(tmp_path / "e")["recall_at_1"] == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,12 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch import HOG, DejaVu, Preprocess, SpectralMapper, growth
+from dejavu_torch import HOG, DejaVu, PlaceFilter, Preprocess, SequenceMatcher, SpectralMapper, growth
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.positions import count_places, shown_frames
+from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
+from dejavu_torch.database.mapfile import read_map, write_map
 from dejavu_torch.database.spectral import SpectralMap, code_chunk
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.growth import append, positions_behind
+from dejavu_torch.growth import append, merge
+from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.streaming import coder
 from dejavu_torch.types import Traverse
 
@@ -257,3 +260,195 @@ def test_more_places_than_lines_can_be_numbered(monkeypatch: pytest.MonkeyPatch)
     moved.learn(route)
     with refused("202 places at even steps", "at most 150"):
         append(moved, route)
+
+
+# maps of several routes
+
+
+def routes(*names: str, chunks: Sequence[int | str] = (64, 50, "route"), **settings: object) -> list[DejaVu]:
+    """Models of other routes that describe them alike, each at its own mean and step."""
+    whitening = Whitening(numbers=4)
+    models = []
+    for i, (name, chunk) in enumerate(zip(names, chunks, strict=False)):
+        mapper = SpectralMapper(3.0 + i, chunk=chunk, **settings)  # type: ignore[arg-type]
+        models.append(DejaVu(whitening=whitening, mapper=mapper))
+        models[-1].learn(Named(walk(100 + 30 * i, seed=i) + i, name))
+        whitening.fixed = True
+    return models
+
+
+@pytest.mark.parametrize("metric", ["cosine", "l2"])
+def test_a_merged_map_scores_as_its_parts_do(metric: str, tmp_path: Path) -> None:
+    models = routes("a", "b", "c", metric=metric)
+    merged = merge(models, ["a", "b", "c"])
+    merged.save(tmp_path / "m.safetensors")
+    loaded = DejaVu.load(tmp_path / "m.safetensors")
+    fresh = merge(routes("x", "y"), ["x", "y"])  # of other routes
+    fresh.mapper, fresh.map = merged.mapper, merged.mapper.empty()
+    fresh.load_state_dict(merged.state_dict())
+    for queries in (walk(1, seed=9), walk(40, seed=9)):
+        descriptors = merged.whitened(queries)
+        expected = torch.cat([model.map.scores(descriptors) for model in models], 1)
+        for one in (merged, loaded, fresh):
+            assert torch.equal(one(queries), expected)
+            assert torch.equal(one.map.scores_between(descriptors, 90, 240), expected[:, 90:240])
+            assert torch.equal(one.map.scores_between(descriptors, 101, 103), expected[:, 101:103])
+    assert loaded.summary().map_bytes == (tmp_path / "m.safetensors").stat().st_size
+    own = [model.summary() for model in models]
+    assert loaded.summary().lines == sum(one.lines for one in own)
+    sizes = [sum(size for name, size in one.route.items() if name != "names") for one in own]
+    kept = loaded.summary().route
+    assert sum(size for name, size in kept.items() if name != "names") == sum(sizes)
+    assert (loaded.map.routes, loaded.map.kind) == (merged.map.routes, "merged")
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "m.safetensors").read_bytes()
+
+
+def test_a_place_of_a_merged_map_has_a_route_and_a_frame() -> None:
+    models = routes("a", "b", "c")
+    merged = merge(models, ["a", "b", "c"])
+    assert merged.map.routes == (("a", 100, 100), ("b", 130, 130), ("c", 160, 160))
+    places = torch.tensor([[0, 99, 100], [229, 230, 389], [-1, 5, -1]])
+    assert merged.map.route_of(places).tolist() == [[0, 0, 1], [1, 2, 2], [-1, 0, -1]]
+    assert merged.map.own_frame_of(places).tolist() == [[0, 99, 0], [129, 0, 159], [-1, 5, -1]]
+    assert torch.equal(merged.map.frame_of(places), places)
+    assert [merged.frame_name(i) for i in (99, 100, 389)] == ["a_0099.png", "b_0000.png", "c_0159.png"]
+    for i in range(3):
+        found = merged.localize(walk(100 + 30 * i, seed=i) + i).index
+        assert (merged.map.route_of(found) == i).float().mean() > 0.95
+        near = (merged.map.own_frame_of(found) - torch.arange(100 + 30 * i)).abs() <= 5
+        assert near.float().mean() > 0.8
+    assert merged.map.part("b") is models[1].map  # type: ignore[operator]
+    with refused("no route 'd'", "a, b, c"):
+        merged.map.part("d")  # type: ignore[operator]
+
+
+def test_even_steps_of_merged_routes() -> None:
+    mapper = SpectralMapper(200.0)
+    grounds = footage(REFERENCE), footage(REFERENCE[:70]).flip(3)
+    models = [
+        DejaVu(HOG(), "none", mapper, velocity=camera()).learn(ArrayTraverse(ground, "route"))
+        for ground in grounds
+    ]
+    merged = merge(models, ["out", "back"])
+    first, second = (model.map for model in models)
+    assert merged.map.routes == (("out", 101, len(REFERENCE)), ("back", second.places, 70))
+    places = torch.arange(merged.map.places)
+    assert torch.equal(merged.map.own_frame_of(places[:101]), first.frame_of(places[:101]))
+    own = merged.map.own_frame_of(places[101:]) - second.frame_of(places[: second.places])
+    assert own.abs().max() <= 1
+    matched = merged.localize(ArrayTraverse(grounds[1], "query")).index
+    assert (merged.map.route_of(matched) == 1).float().mean() > 0.9
+    models[1].step = 7.0
+    with refused("steps", "6", "7", "--velocity.step"):
+        merge(models, ["out", "back"])
+
+
+def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
+    models = routes("a", "b")
+    merged = merge(models, ["a", "b"])
+    queries = walk(30, seed=4)
+    for speeds in ((1.0,), (0.8, 1.0, -1.2)):
+        matcher = SequenceMatcher(7, speeds)
+        parts = [list(model.map.sequences(queries_of(model, queries), matcher)) for model in models]
+        expected = torch.cat([torch.cat(part) for part in parts], 1)
+        found = torch.cat(list(merged.map.sequences(queries_of(merged, queries), matcher)))
+        assert torch.equal(found, expected)
+        whole = torch.cat(list(matcher.stream(map(merged.map.scores, queries_of(merged, queries)))))
+        assert not torch.equal(whole, expected)  # as one route's places they would count
+        assert torch.equal(merged.localize(queries, sequence=matcher).index, expected.argmin(1))
+    assert merged.localize(queries, sequence=PlaceFilter()).index.shape == (30,)
+
+
+def queries_of(model: DejaVu, queries: Tensor) -> Iterator[Tensor]:
+    return (model.whitened(part) for part in queries.split(8))
+
+
+def test_merging_merged_maps_and_names_that_are_there(caplog: pytest.LogCaptureFixture) -> None:
+    models = routes("a", "b", "c")
+    for model in models:
+        model.threshold = 0.25
+    pair = merge(models[:2], ["route", "route"])
+    assert [one.name for one in pair.map.routes] == ["route", "route-2"]
+    both = merge([pair, models[2], pair], ["x", "route", "y"])
+    names = [one.name for one in both.map.routes]
+    assert names == ["route", "route-2", "route-3", "route-4", "route-2-2"]
+    assert (both.map.places, both.threshold, len(both.frame_names)) == (2 * 230 + 160, 0.25, 620)
+    assert both.frame_name(390) == "a_0000.png"
+    assert caplog.text == ""
+
+
+def test_what_is_of_single_routes_is_not_kept_and_told(caplog: pytest.LogCaptureFixture) -> None:
+    models = routes("a", "b")
+    models[0].calibration = Calibration(Platt(1.0, 0.0), None)
+    models[1].precision, models[1].threshold = 0.9, 0.5
+    merged = merge(models, ["a", "b"])
+    assert (merged.calibration, merged.precision, merged.threshold) == (None, None, None)
+    assert "no thresholds or calibration or precision" in caplog.text
+    assert models[1].precision == 0.9
+
+
+def test_maps_that_cannot_be_merged() -> None:
+    one, two = routes("a", "b")
+    other = DejaVu(whitening=Whitening(numbers=4), mapper=SpectralMapper()).learn(walk(90, seed=8))
+    plain, plain_too = learned(walk(90)), learned(walk(90, seed=1))
+    wide = learned(torch.randn(90, 7).cumsum(0))
+    l2 = learned(walk(90), metric="l2")
+    cells = DejaVu(HOG(cell=4), "none", SpectralMapper()).learn(walk(90))
+    grey = DejaVu(None, "none", SpectralMapper(), preprocess=Preprocess(channel="grey")).learn(walk(90))
+    images, wider = image_model(), image_model()
+    wider.frame_shape = (3, 40, 40)
+    templates = template_model(whitening="none").learn(walk(90))
+    for pair, words in (
+        ((one, other), ("a and b", "whitening", "learned apart", "--whitening MAP")),
+        ((one, plain), ("has whitening", "has no whitening")),
+        ((plain, wide), ("6 and 7",)),
+        ((plain, l2), ("metric", "cosine", "l2")),
+        ((plain, cells), ("features", "cell=8", "cell=4")),
+        ((plain, grey), ("preprocess", "grey")),
+        ((images, wider), ("3 x 32 x 32", "3 x 40 x 40")),
+        ((plain, templates), ("b is", "'templates'", "'spectral'")),
+        ((plain, DejaVu()), ("b is no map",)),
+        ((plain,), ("1 maps", "at least two")),
+    ):
+        with refused(*words):
+            merge(pair, ["a", "b"][: len(pair)])
+    assert merge([plain, plain_too], ["a", "b"]).map.places == 180
+    with refused("routes a, b", "append to the map of a route"):
+        append(merge([one, two], ["a", "b"]), walk(64))
+
+
+def test_merged_places_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    models = routes("a", "b")
+    monkeypatch.setattr(growth, "MOST", 229)
+    with refused("230 places", "at most 229"):
+        merge(models, ["a", "b"])
+
+
+def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was(tmp_path: Path) -> None:
+    merged = merge(routes("a", "b"), ["a", "b"])
+    query = walk(1)
+    before = merged(query)
+    good = merged.map.state_dict()
+    extra = good["_extra_state"]
+    for change, words in (
+        ({"places": 231}, ("231 places", "230")),
+        ({"names": ["a", "a"]}, ("names a, a",)),
+        ({"names": ["a"]}, ("names a;",)),
+        ({"parts": [*extra["parts"][:1], {}]}, ("part 1",)),
+        ({"kind": "spectral"}, ("'spectral'", "'merged'")),
+    ):
+        with refused(*words):
+            merged.map.load_state_dict(good | {"_extra_state": extra | change})
+        assert torch.equal(merged(query), before)
+    merged.save(tmp_path / "m.safetensors")
+    tensors, header = read_map(tmp_path / "m.safetensors")
+    for name in ("map.parts.1.steps", "map.parts.0.streams"):
+        write_map(tmp_path / "bad.safetensors", {k: v for k, v in tensors.items() if k != name}, header)
+        with refused("bad.safetensors", name.rpartition(".")[2]):
+            DejaVu.load(tmp_path / "bad.safetensors")
+    write_map(tmp_path / "bad.safetensors", tensors | {"map.parts.7.steps": torch.ones(1)}, header)
+    with refused("parts.7.steps", "no route"):
+        DejaVu.load(tmp_path / "bad.safetensors")
+    with refused("made of maps"):
+        merged.learn(walk(90))

@@ -22,6 +22,7 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
     "train": "train features that repeat: fit, validate, test or export",
     "bench": "speed, trainings, memory, or accuracy over bytes, beside what a user would pick instead",
+    "merge": "join the maps of several routes",
     "export": "write a map, and what is ahead of it, as an ONNX file",
     "info": "what is in a map",
 }

@@ -5,6 +5,7 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 
 from __future__ import annotations
 
+import copy
 import shlex
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,6 +23,8 @@ from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.chain import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
+from dejavu_torch.database.merged import MergedMap
+from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.recipe import recipe_of, with_parts
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.hog import HOG
@@ -131,9 +134,7 @@ def run_learn(
         model = _map_to_append_to(append, model).to(where)
     if cluster is not None:
         _check_cluster(cluster, model, device)
-    if map.suffix != ".safetensors":
-        expected = map.with_suffix(".safetensors") if map.name else "such as route.safetensors"
-        raise InputError(f"--map {map} is no name of a map; expected {expected}")
+    _check_map_name(map)
     check_output_file(map)
     check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
     if calibration == NO_CALIBRATION and model.precision is not None:
@@ -190,7 +191,7 @@ def run_localize(
     Args:
         map: map file
         source: as of `dejavu learn`
-        out: csv of query,place,score,accepted[,probability][,rank],query_name,place_name
+        out: csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name
         threshold: accept a match whose score is below
         precision: accept instead what is at least as probably right, such as .99
         top: write so many places of each query, no two within 5 of each other, a row each with its rank
@@ -241,6 +242,7 @@ def run_localize(
         print("no threshold given or stored in the map: every query with a finite score is accepted")
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
+    table += ("--route", "ROUTE") if model.map.routes else ()
     _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
 
@@ -368,6 +370,9 @@ def run_compare(
     if map is not None:
         given = model
         model = _load_map(map, None if isinstance(given.features, HOG) else given.features)
+        if model.map.routes:
+            names = ", ".join(route.name for route in model.map.routes)
+            raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
         _accept_by(model, asked, given.precision)
         model.threshold = None if filter and asked is not None else model.threshold
     model.to(where)
@@ -421,12 +426,13 @@ def run_evaluate(
     reference: str | None = None,
     query: str | None = None,
     map: Path | None = None,
+    route: str | None = None,
     command: str,
 ) -> None:
     """Evaluate the matches in a csv, whatever found them: scores, curve, coverage.
 
     Args:
-        matches: csv of query,place,score[,accepted][,probability][,rank]
+        matches: csv of query,place,score[,accepted][,probability][,rank][,route]
         truth: as of `dejavu compare`
         out: folder for report and pictures
         tolerance: right within this many places, inclusive
@@ -434,13 +440,15 @@ def run_evaluate(
         reference: says how many frames there are, and has the coordinates for utm; as of `dejavu learn`
         query: as --reference, of the queries
         map: says how many frames there are, and which place each of them is where the map's are resampled
+        route: of matches on a merged map, the route that --truth, --reference and the query are of; answers
+            on other routes are wrong
     """
     from dejavu_torch.evaluation.report import report_folder, write_report
     from dejavu_torch.experiments.evaluate import evaluate_file
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
     _check_report_folder(out, (), [reference, query], [matches, truth, map])
-    result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map)
+    result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map, route)
     with report_folder(out) as folder:
         title = f"{matches} evaluated by {truth}"
         write_report(folder, result.report, result.pictures, title, command)
@@ -615,6 +623,35 @@ def run_export(
     _say(f"{size}; {written.difference:.1g} from torch at most, on noise; written to {onnx}")
 
 
+def run_merge(
+    maps: Sequence[Path] = (), *, map: Path, features: nn.Module | None = None, command: str
+) -> None:
+    """Join the maps of several routes that describe frames alike: an answer is then a route and its frame.
+
+    Routes describe frames alike where all but the first were learned with --whitening FIRST.safetensors.
+
+    Args:
+        maps: map files, at least two; each route is called as its file, those of merged maps as they were
+        map: map file to write (.safetensors)
+        features: class of the maps' features, if not ours
+    """
+    _check_map_name(map)
+    check_output_file(map)
+    check_not_read(map, *maps)
+    for i, path in enumerate(maps):
+        twice = next((one for one in maps[:i] if one.exists() and path.exists() and one.samefile(path)), None)
+        if twice is not None:
+            raise InputError(f"{path} and {twice} are one file; expected each map once")
+    models = [_load_map(path, copy.deepcopy(features)) for path in maps]
+    try:
+        model = growth.merge(models, [path.stem for path in maps])
+    except InputError as error:
+        raise InputError(f"merging {', '.join(str(path) for path in maps)}: {error}") from error
+    model.save(map)
+    print_map(model)
+    _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+
+
 def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> None:
     """What is in a map, and its summary.
 
@@ -680,6 +717,12 @@ def _making(cluster: str | None) -> Iterator[Callable[..., Made]]:
 
     with Cluster(cluster) as workers:
         yield partial(code_on, workers)
+
+
+def _check_map_name(path: Path) -> None:
+    if path.suffix != ".safetensors":
+        expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
+        raise InputError(f"--map {path} is no name of a map; expected {expected}")
 
 
 def _map_to_append_to(path: Path, given: DejaVu) -> DejaVu:
@@ -855,12 +898,30 @@ def print_map(model: DejaVu) -> None:
     if summary.places and not summary.covered:
         print("this route does not repeat")
     print(summary)
+    for line in route_lines(model.map):
+        _say(line)
     whitening = model.whitening
     if whitening is not None:
         numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))
         print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
         print(f"this route needs about {model.map.needed:.2g} bytes per place")
+
+
+def route_lines(route: PlaceMap) -> list[str]:
+    """The routes of a merged map: their places, frames and bytes."""
+    if not isinstance(route, MergedMap):
+        return []
+    lines, start = [], 0
+    for one in route.routes:
+        size = route.part(one.name).summary().route_bytes
+        shown = f" of {one.frames} frames" * (one.frames != one.places)
+        lines.append(
+            f"route {one.name}: places {start}-{start + one.places - 1}{shown}, {size} bytes, "
+            f"{size / one.places:.2f} per place"
+        )
+        start += one.places
+    return lines
 
 
 def _print_next(*words: str | Path) -> None:
@@ -914,7 +975,7 @@ def _write_matches(
     if isinstance(query, ResampledTraverse):
         frames, source = query.frame, query.traverse
     names = source.frame_name, model.frame_name
-    return write_matches(path, matches, frames, model.map.frame_of, *names, ranks)
+    return write_matches(path, matches, frames, model.map.frame_of, *names, ranks, model.map.routes)
 
 
 def _print_scores(report: Report, out: Path) -> None:

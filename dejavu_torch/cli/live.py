@@ -51,6 +51,9 @@ def follow(
         if port is not None:
             pictures = None
             if reference is not None:
+                if model.map.routes:
+                    seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
+                    raise InputError(f"{seen}; expected the page without, or the map of that route")
                 frames = len(model.map.positions) or model.map.places
                 pictures = ReferencePictures(open_source(reference), frames)
             page = stack.enter_context(Page(port, title, pictures))
@@ -116,6 +119,7 @@ def line_of(shot: Shot, match: LiveMatch) -> str:
         "accepted": match.accepted,
         "milliseconds": round(match.milliseconds, 3),
     }
+    facts |= {"route": match.route} if match.route else {}
     known = {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in facts.items()

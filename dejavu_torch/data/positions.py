@@ -41,6 +41,19 @@ def count_places(positions: Tensor) -> int:
     return int(float(positions.double().max()) + NEAR) + 1
 
 
+def positions_behind(positions: Tensor, places: int) -> Tensor:
+    """Positions (F,) of frames whose first place is behind so many others, float32.
+
+    Convention: frames behind their own first place are moved to it: there are other places behind it now.
+    """
+    double = positions.double().clamp(min=0)
+    moved = (double + places).float()
+    # at many places float32 would round some up to the next place
+    reached = (double + NEAR).floor() + places
+    below = torch.nextafter((reached + 1 - NEAR).float(), torch.zeros_like(moved))
+    return torch.where((moved.double() + NEAR).floor() > reached, below, moved)
+
+
 def borders(positions: Tensor) -> Tensor:
     """The frame with which each place begins, and behind the last place the number of frames.
 

@@ -64,9 +64,8 @@ def coefficients_of(small: Tensor, escapes: Tensor) -> Coefficients:
 def levels_of(coefficients: Coefficients, width: int) -> Tensor:
     """All levels, (W,K), zeros too."""
     counts, feature, level = coefficients
-    line = lines_of(counts, len(level))
     levels = level.new_zeros(len(counts), width)
-    return levels.index_put((line, feature.long()), level)
+    return levels.index_put((lines_of(counts, len(level)).long(), feature.long()), level)
 
 
 def coded_levels(coefficients: Coefficients, width: int) -> tuple[Tensor, Tensor]:
@@ -75,12 +74,12 @@ def coded_levels(coefficients: Coefficients, width: int) -> tuple[Tensor, Tensor
 
 
 def lines_of(counts: Tensor, total: int) -> Tensor:
-    """The line of each coefficient, (L,) int64.
+    """The line of each coefficient, (L,) int32.
 
     Args:
         total: L, the sum of the counts; it is not read from them, which may be on another device.
     """
-    lines = torch.arange(counts.shape[0], device=counts.device)
+    lines = torch.arange(counts.shape[0], dtype=torch.int32, device=counts.device)
     return lines.repeat_interleave(counts.int(), output_size=total)
 
 
@@ -101,8 +100,10 @@ def disagreement(coefficients: Coefficients, width: int) -> str:
         return f"{len(feature)} features and {len(level)} levels; expected {total}, as the lines count"
     if not total:
         return ""
-    key = lines_of(counts, total) * width + feature
-    if int(feature.min()) < 0 or int(feature.max()) >= width or not bool((key[1:] > key[:-1]).all()):
+    begins = counts.cumsum(0, dtype=torch.int64)[:-1]
+    ascending = feature[1:] > feature[:-1]
+    ascending[begins[(begins > 0) & (begins < total)] - 1] = True  # from one line to the next
+    if int(feature.min()) < 0 or int(feature.max()) >= width or not bool(ascending.all()):
         return f"features out of order; expected numbers from 0 to {width - 1}, ascending within a line"
     return ""
 

@@ -84,21 +84,23 @@ def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
     Convention: the number of queries has no say, and a pair is summed in one order wherever it stands:
         a query alone gets the bits it gets in a batch, and equal templates get equal distances.
     """
-    if torch.compiler.is_compiling() or templates.numel() < WORTH_COMPILING:
+    if templates.numel() < WORTH_COMPILING:
         return None
     if query.ndim != 2 or templates.ndim != 2 or query.shape[1] != templates.shape[1]:
         return None  # torch says what is wrong
-    if torch.jit.is_tracing() or is_in_torch_dispatch_mode():  # type: ignore[attr-defined, no-untyped-call]
-        return None
-    a, b = _memory(query), _memory(templates)
+    a, b = numbers_of(query), numbers_of(templates)
     kernel = None if a is None or b is None else _compiled()
     if a is None or b is None or kernel is None:
         return None
     return torch.from_numpy(_in_threads(kernel, a, b, torch.get_num_threads()))
 
 
-def _memory(tensor: Tensor) -> Floats | None:
-    """The numbers of a tensor, or None where they are not all there is to it."""
+def numbers_of(tensor: Tensor) -> Floats | None:
+    """The float32 numbers of a tensor on the CPU, or None where they are not all there is to it."""
+    if torch.compiler.is_compiling():
+        return None
+    if torch.jit.is_tracing() or is_in_torch_dispatch_mode():  # type: ignore[attr-defined, no-untyped-call]
+        return None
     if type(tensor) not in (Tensor, Parameter) or tensor.device.type != "cpu":
         return None
     if tensor.dtype != torch.float32 or (tensor.requires_grad and torch.is_grad_enabled()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,14 @@ from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.types import InputError, SequenceModel
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
+
+
+class Route(NamedTuple):
+    """A route of a map that has several: its name, and how many places and frames."""
+
+    name: str
+    places: int
+    frames: int
 
 
 class PlaceMap(nn.Module, ABC):
@@ -29,6 +37,8 @@ class PlaceMap(nn.Module, ABC):
         places: N, the number of places. dimension: D, features per frame. Plain ints.
         positions: (F,) float32, how many even steps each reference frame lies from the first place, where
             frames were resampled (section IV-B); (0,) where place i is reference frame i.
+        routes: of a merged map, in order; () for one route. Places and frames then count through all of them,
+            and `route_of` and `own_frame_of` tell the route of a place and the frame of that route.
 
     Shape: queries (Q,D) -> scores (Q,N), lower is better, +inf where nothing covers a place.
 
@@ -39,6 +49,7 @@ class PlaceMap(nn.Module, ABC):
 
     kind: ClassVar[str]
     state: ClassVar[Any] = dict[str, Any]
+    routes: tuple[Route, ...] = ()
     positions: Tensor
 
     def __init__(self, places: int = 0, dimension: int = 0) -> None:
@@ -109,6 +120,17 @@ class PlaceMap(nn.Module, ABC):
     def frame_of(self, places: Tensor) -> Tensor:
         """The reference frame that each place shows; -1, no place, stays -1. int64 of any shape."""
         return look_up(shown_frames(self.positions), places) if len(self.positions) else places
+
+    def route_of(self, places: Tensor) -> Tensor:
+        """The number of the route that each place is on; -1, no place, stays -1. int64 of any shape."""
+        ends = torch.tensor([route.places for route in self.routes], device=places.device).cumsum(0)
+        return torch.where(places >= 0, torch.searchsorted(ends, places.contiguous(), right=True), -1)
+
+    def own_frame_of(self, places: Tensor) -> Tensor:
+        """As `frame_of`, each frame counted on its own route. int64 of any shape."""
+        counts = torch.tensor([0, *(route.frames for route in self.routes)], device=places.device)
+        ahead = look_up(counts.cumsum(0), self.route_of(places))
+        return torch.where(places >= 0, self.frame_of(places) - ahead, -1)
 
     def place_of(self, frames: Tensor) -> Tensor:
         """The place nearest to each reference frame; -1 for one behind the first place, and for -1.

@@ -7,7 +7,7 @@ import copy
 import functools
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -18,7 +18,6 @@ from dejavu_torch.database.codec import (
     ESCAPE,
     Stream,
     check_claim,
-    coded_bytes,
     decode,
     encode,
     to_int8,
@@ -34,6 +33,8 @@ from dejavu_torch.database.coefficients import (
     lines_of,
 )
 from dejavu_torch.database.place_map import Mapper, PlaceMap
+from dejavu_torch.database.quantisation import RouteLines, dead_zone, quantise
+from dejavu_torch.database.sparse_product import compiled_sums
 from dejavu_torch.database.spectrum import Slots, Transform, from_slots, period_of, slots, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
@@ -41,48 +42,17 @@ from dejavu_torch.types import InputError
 log = logging.getLogger("dejavu_torch")
 
 SpectralMetric = Literal["cosine", "l2"]
-ROUNDING = 0.35  # what is added ahead of rounding down: a dead zone of 1.3 steps around 0
 SILENT = 1e-6  # of the map's RMS norm: a place below it has no direction
-FINEST = 64  # steps in an RMS line at most: a finer step changes no score
 STRONGEST = 10  # periods that a summary names
 CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and checksum in the file
-HALVINGS = 14  # of the steps to choose from, which leaves 0.1 % of a step
-BLOCK = 2**20  # numbers made at a time: they stay in the processor's cache
-LONG = 2**24  # as BLOCK, where a single chunk is larger: it is gone through for each
+BLOCK = 2**19  # numbers made at a time: they stay in the processor's cache
+LONG = 2**22  # numbers of a long chunk made at a time, which is gone through for each
+ROWS = 2**14  # of descriptors, looked at together
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
-LINE_COST = 60  # of a coded line in a query's sum
-TRANSFORM_COST = 200  # of a place in a query's inverse transform
-REBUILD_COST = 120  # of a number that is rebuilt for all queries at once
-
-
-@torch.no_grad()
-def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -> Tensor:
-    """Whole numbers of steps, those below 1 - `ROUNDING` of a step 0. Same shape, float; no gradient.
-
-    Args:
-        width: by how much that dead zone is wider for each line, at least 1; see `dead_zone`.
-    """
-    # in place: the lines of a long route are large
-    levels = lines.abs().div_(step).add_(ROUNDING).floor_().copysign_(lines)
-    return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
-
-
-def dead_zone(lines: Tensor, lengths: list[int], resolution: float, transform: Transform) -> Tensor | None:
-    """By how much the dead zone of each of (N,K) lines, of chunks of these lengths, is wider than line 0's.
-
-    That of a line of period P is 1 + (resolution / P)^2 times as wide: it costs as many bits as a slow one,
-    and tells nothing of where one is but within P places.
-
-    Returns:
-        (N,1), or None where all lines count alike.
-    """
-    if not resolution:
-        return None
-    # line r has r half cycles (DCT), or of pairs of a cosine and a sine as many cycles (DFT)
-    halves = [torch.arange(n) if transform == "dct" else (torch.arange(n) + 1) // 2 * 2 for n in lengths]
-    inverse = torch.cat([r / (2 * n) for r, n in zip(halves, lengths, strict=True)]).to(lines)
-    return (1 + (resolution * inverse).square())[:, None]
+LINE_COST = 150  # of a coded line in a query's sum
+TRANSFORM_COST = 280  # of a place in a query's inverse transform
+REBUILD_COST = 200  # of a number that is rebuilt for all queries at once
 
 
 class CodedChunk(NamedTuple):
@@ -188,6 +158,7 @@ class SpectralMap(PlaceMap):
 
     Attributes:
         chunks: the places [start, stop) of each. bounds: (G+1) where the coefficients of each chunk begin.
+        longest: places of the longest chunk.
         needed: bytes per place that would hold half the variance of a route of which this map holds under a
             tenth; None where it holds more, or was loaded.
 
@@ -293,25 +264,23 @@ class SpectralMap(PlaceMap):
         """The chunks as the file holds them: what `of_chunks` makes the same map of."""
         chunks = []
         for g, (length, step) in enumerate(zip(self.lengths.tolist(), self.steps.tolist(), strict=True)):
-            stream, level = self._streams[g], self._of(g).level
+            stream, own = self._streams[g], self._of(range(g, g + 1))
             if stream is None:
-                stream = self._streams[g] = encode(coded_levels(self._of(g), self.dimension)[0])
-            escapes = level[level.abs() > 127] if level.dtype != torch.int8 else level[:0]
+                stream = self._streams[g] = encode(coded_levels(own, self.dimension)[0])
+            escapes = own.level[own.level.to(torch.int32).abs() > 127]
             chunks.append(CodedChunk(length, step, stream, escapes.to(torch.int32).cpu()))
         return chunks
 
-    def _of(self, chunk: int) -> Coefficients:
-        """The coefficients of a chunk."""
-        first, last = self.bounds[chunk : chunk + 2]
-        return Coefficients(
-            self.counts[slice(*self.chunks[chunk])], self.feature[first:last], self.level[first:last]
-        )
+    def _of(self, chunks: range) -> Coefficients:
+        """The coefficients of chunks."""
+        some = slice(self.bounds[chunks.start], self.bounds[chunks.stop])
+        return Coefficients(self.counts[self._span(chunks)], self.feature[some], self.level[some])
 
     def lines(self, chunk: int) -> Lines:
         """The coefficients of a chunk, by line and feature."""
-        counts, feature, level = self._of(chunk)
+        counts, feature, level = self._of(range(chunk, chunk + 1))
         value = level * self.steps[chunk]
-        return Lines(lines_of(counts, len(level)), feature.long(), value)
+        return Lines(lines_of(counts, len(level)).long(), feature.long(), value)
 
     @property
     def levels(self) -> Tensor:
@@ -329,6 +298,7 @@ class SpectralMap(PlaceMap):
             raise InputError(f"the map does not fit together: {problem}")
         stops = self.lengths.cumsum(0).tolist()
         self.chunks: list[tuple[int, int]] = list(zip([0, *stops], stops, strict=False))
+        self.longest: int = max(self.lengths.tolist(), default=0)
         sums = torch.cat([self.lengths.new_zeros(1), self.counts.cumsum(0, dtype=torch.int64)])
         self.bounds: list[int] = [0, *sums[self.lengths.cumsum(0)].tolist()]
         self._streams: list[Stream | None] = [None] * len(self.chunks)  # coded when they are asked for
@@ -387,32 +357,26 @@ class SpectralMap(PlaceMap):
         factor = self.steps[chunks.start : chunks.stop, None] * one.factor
         return (first + one.where).flatten(), factor.flatten(), one
 
-    def _slotted(self, chunks: range) -> tuple[Tensor, Tensor, Tensor]:
-        """Of each coefficient of equally long chunks its slot, its feature and its number there."""
-        where, factor, _ = self._slots(chunks)
-        first, last = self.bounds[chunks.start], self.bounds[chunks.stop]
-        line = lines_of(self.counts[self._span(chunks)], last - first)
-        return where[line], self.feature[first:last].int(), self.level[first:last] * factor[line]
-
     def _series(self, chunks: range) -> Iterator[tuple[slice, Tensor]]:
         """The rebuilt descriptors of equally long chunks, some of their numbers at a time: (F,W G) each.
 
         All of them at a time unless the chunk is long.
         """
-        length, one = self._length(chunks.start), self._slots(chunks)[2]
-        where, feature, value = self._slotted(chunks)
+        length, (slot, factor, one) = self._length(chunks.start), self._slots(chunks)
+        counts, feature, level = self._of(chunks)
+        line = lines_of(counts, level.shape[0])
         size, places = len(chunks) * one.count, len(chunks) * length
-        mean = self.mean.to(value) * (math.sqrt(length) * one.factor[0])  # of line 0
-        step = max(1, max(BLOCK, LONG * (places > LONG // self.dimension)) // places)
+        mean = self.mean.to(factor) * (math.sqrt(length) * one.factor[0])  # of line 0
+        step = self.dimension if self.dimension * length <= LONG else max(1, LONG // length)
         for start in range(0, self.dimension, step):
             stop = min(start + step, self.dimension)
-            slotted = value.new_zeros((stop - start) * size)
-            if stop - start < self.dimension:
+            some = (line, feature, level)
+            if step < self.dimension:
                 inside = (feature >= start) & (feature < stop)
-                spot, number = (feature[inside].long() - start) * size + where[inside], value[inside]
-            else:
-                spot, number = feature.long() * size + where, value
-            slotted = slotted.scatter_(0, spot, number).view(stop - start, len(chunks), one.count)
+                some = (line[inside], feature[inside], level[inside])
+            spot = (some[1].long() - start) * size + slot[some[0]]
+            slotted = factor.new_zeros((stop - start) * size).scatter_(0, spot, some[2] * factor[some[0]])
+            slotted = slotted.view(stop - start, len(chunks), one.count)
             slotted[..., 0] += mean[start:stop, None]
             yield slice(start, stop), from_slots(slotted, length, self.transform).reshape(-1, places)
 
@@ -422,14 +386,17 @@ class SpectralMap(PlaceMap):
         The inverse transform is linear, so the product with every descriptor is the inverse transform of the
         product with every line: O(lines + W log W) for a query instead of O(W K).
         """
-        length, one = self._length(chunks.start), self._slots(chunks)[2]
-        where, feature, value = self._slotted(chunks)
-        terms = queries.index_select(1, feature) * value.to(queries)
-        # shape[0], since len() would fix the number of queries in an exported program
-        lines = queries.new_zeros(queries.shape[0], len(chunks) * one.count)
-        lines = lines.scatter_add(
-            1, where.expand(terms.shape), terms
-        )  # of one query 30 times as fast as index_add
+        length, (slot, factor, one) = self._length(chunks.start), self._slots(chunks)
+        size = len(chunks) * one.count
+        own = self._of(chunks)
+        lines = compiled_sums(queries, own, slot, factor, size)
+        if lines is None:
+            line = lines_of(own.counts, own.level.shape[0])
+            terms = queries.index_select(1, own.feature.int()) * (own.level * factor[line]).to(queries)
+            # shape[0], since len() would fix the number of queries in an exported program
+            lines = queries.new_zeros(queries.shape[0], size)
+            # of one query 30 times as fast as index_add
+            lines = lines.scatter_add(1, slot[line].expand(terms.shape), terms)
         lines = lines.unflatten(1, (len(chunks), one.count))
         mean = queries @ self.mean.to(queries) * (math.sqrt(length) * one.factor[0].to(queries))
         lines[..., 0] += mean[:, None]
@@ -440,6 +407,8 @@ class SpectralMap(PlaceMap):
 
         That is how `scores` chooses what is faster.
         """
+        if self.longest * self.dimension > LONG:  # which is gone through many times
+            return False
         in_frequency = LINE_COST * len(self.level) + TRANSFORM_COST * self.places
         return queries * in_frequency > (REBUILD_COST + queries) * self.places * self.dimension
 
@@ -472,19 +441,29 @@ class SpectralMap(PlaceMap):
             rows = queries.shape[0] * (1 + len(self.level) // max(1, self.places))
         for chunks in self._runs(self._inside(start, stop), max(1, rows)):
             span = self._span(chunks)
-            products = self._rebuilt_products(queries, chunks) if rebuild else self.products(queries, chunks)
-            if self.metric == "cosine":
-                scores = 1 - products * self.per_norm(span.start, span.stop).to(products)
+            if rebuild:
+                scores = self._rebuilt_scores(queries, chunks)
+            elif self.metric == "cosine":
+                per_norm = self.per_norm(span.start, span.stop).to(queries)
+                scores = torch.addcmul(
+                    queries.new_ones(()), self.products(queries, chunks), per_norm, value=-1
+                )
             else:
-                norms = self.norms[span].to(products)
-                scores = (length.square() - 2 * products + norms.square()).clamp(min=0)
+                scores = self.norms[span].to(queries).square() - 2 * self.products(queries, chunks)
+            if self.metric == "l2":
+                scores = (scores + length.square()).clamp(min=0)
             low, high = max(start, span.start), min(stop, span.stop)
             yield low, scores[:, low - span.start : high - span.start]
 
-    def _rebuilt_products(self, queries: Tensor, chunks: range) -> Tensor:
-        """As `products`, by rebuilding the descriptors."""
-        parts = (queries[:, some] @ part.to(queries) for some, part in self._series(chunks))
-        return functools.reduce(torch.add, parts)
+    def _rebuilt_scores(self, queries: Tensor, chunks: range) -> Tensor:
+        """By rebuilding the descriptors, (Q,W G); of l2, but for the square of the query."""
+        span, cosine = self._span(chunks), self.metric == "cosine"
+        scores = queries.new_ones(1, 1) if cosine else self.norms[span].to(queries).square()[None]
+        for some, part in self._series(chunks):
+            if cosine:
+                part *= self.per_norm(span.start, span.stop)  # a pass over (K,n), not over (Q,n)
+            scores = torch.addmm(scores, queries[:, some], part.to(queries), alpha=-1 if cosine else -2)
+        return scores
 
     def extend(self, features: Tensor) -> None:
         """Add the places of (n,K) descriptors in chunks of their own; the others stay as they are.
@@ -682,33 +661,33 @@ class SpectralMapper(Mapper):
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
         check_descriptors(features)
-        features = features.float()
-        mean = features.mean(0).to(torch.bfloat16)
-        lengths = _lengths(len(features), self.chunk)
-        lines = _lines(features - mean.float(), lengths, self.transform)
-        scale = float(lines.square().mean().sqrt())
-        if not scale > 1e-6 * float(features.square().mean().sqrt()):
-            raise InputError(f"the {len(features)} descriptors are all alike; expected a route that changes")
-        overhead = mean.nbytes + CHUNK_BYTES * len(lengths)
-        overhead += self._within(len(features), overhead)
-        width = dead_zone(lines, lengths, self.resolution, self.transform)
-        step = self._step(lines, width, lengths, overhead) if self.step is None else self.step
+        places = len(features)
+        lengths = _lengths(places, self.chunk)
+        lines = RouteLines(features, lengths, self.transform, self.resolution)
+        if not lines.scale > 1e-6 * lines.rms:
+            raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
+        overhead = lines.mean.nbytes + CHUNK_BYTES * len(lengths)
+        overhead += self._within(places, overhead)
+        step = self._step(lines, overhead) if self.step is None else self.step
         step = float(torch.tensor(step))  # as the file holds it
-        small, escapes = to_int8(quantise(lines, step, width))
-        steps = features.new_full((len(lengths),), step)
+        needed = None
+        if lines.held(step) < LITTLE:
+            half = lines.coded_bytes(lines.step_that_holds(0.5), even=True)
+            needed = (overhead + half) / places
+        coefficients = joined([coefficients_of(*levels) for levels in lines.levels(step)])
+        mean = lines.mean
+        del lines  # as large as the descriptors
         route = SpectralMap(
-            coefficients_of(small, escapes),
+            coefficients,
             torch.tensor(lengths, device=features.device),
-            steps,
+            features.new_full((len(lengths),), step, dtype=torch.float32),
             mean,
             self.metric,
             self.transform,
             self.chunk,
             self.resolution,
         )
-        if _held(lines, width, step) < LITTLE:
-            half = _smallest_step(lambda step: _held(lines, None, step) < 0.5, *_steps(lines))
-            route.needed = (overhead + _coded_bytes(lines, None, lengths, half)) / len(features)
+        route.needed = needed
         return route
 
     def extra_repr(self) -> str:
@@ -739,22 +718,19 @@ class SpectralMapper(Mapper):
         )
         return 0
 
-    def _step(self, lines: Tensor, width: Tensor | None, lengths: list[int], overhead: int) -> float:
+    def _step(self, lines: RouteLines, overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %."""
         assert self.route_bytes_per_place is not None
-        places, numbers = lines.shape
-        finest, coarsest = _steps(lines)
+        places, numbers = lines.lines.shape
         room = self.route_bytes_per_place * places - overhead
-        least = _coded_bytes(lines, width, lengths, coarsest)  # none of them
+        least = lines.coded_bytes(lines.steps[1])  # none of them
         if room <= least or self.route_bytes_per_place > 4 * numbers:
             raise InputError(
                 f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
                 f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
                 f"and at most {4 * numbers}, {numbers} numbers as floats"
             )
-        return _smallest_step(
-            lambda step: _coded_bytes(lines, width, lengths, step) <= room, finest, coarsest
-        )
+        return lines.step_of(room)
 
 
 def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:
@@ -781,7 +757,7 @@ def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
             f"the descriptors are {tuple(features.shape)} {features.dtype}; expected floats (N, {expected}), "
             f"N at least {least}"
         )
-    if not bool(features.isfinite().all()):
+    if not all(bool(part.isfinite().all()) for part in features.split(ROWS)):
         raise InputError("the descriptors hold NaN or infinity; expected finite numbers")
 
 
@@ -793,30 +769,3 @@ def _lengths(places: int, chunk: int | str) -> list[int]:
 
 def _lines(series: Tensor, lengths: list[int], transform: Transform) -> Tensor:
     return torch.cat([spectrum(part.T, transform).T for part in series.split(lengths)])
-
-
-def _coded_bytes(lines: Tensor, width: Tensor | None, lengths: list[int], step: float) -> int:
-    small, escapes = to_int8(quantise(lines, step, width))
-    return escapes.nbytes + sum(coded_bytes(part) for part in small.split(lengths))
-
-
-def _steps(lines: Tensor) -> tuple[float, float]:
-    """The finest step that is worth trying, and one so coarse that no line is left."""
-    return float(lines.square().mean().sqrt()) / FINEST, 2 * float(lines.abs().max())
-
-
-def _held(lines: Tensor, width: Tensor | None, step: float) -> float:
-    """The share of the variance that lines in such steps hold."""
-    error = lines - step * quantise(lines, step, width)
-    return 1 - float(error.square().sum() / lines.square().sum())
-
-
-def _smallest_step(enough: Callable[[float], bool], finest: float, coarsest: float) -> float:
-    """The smallest step that is coarse enough, by bisection of its logarithm."""
-    if enough(finest):
-        return finest
-    low, high = math.log(finest), math.log(coarsest)
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
-    return math.exp(high)

@@ -121,7 +121,7 @@ def describe(summary: MapSummary) -> str:
     if len(summary.chunks) > CHUNKS_SHOWN:
         lines.append(f"and {len(summary.chunks) - CHUNKS_SHOWN} more chunks")
     stored = f"{summary.templates} templates, {summary.template_numbers} numbers"
-    if summary.kind == "spectral":
+    if summary.kind != "templates":
         stored = f"{summary.lines} lines of their spectra"
     lines.append(f"{summary.covered} of {summary.places} places covered; {stored}")
     growing = summary.route_bytes / max(summary.places, 1)

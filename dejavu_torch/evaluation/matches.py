@@ -1,11 +1,13 @@
-"""Matches as a csv of query,place,score,accepted[,probability][,rank],query_name,place_name."""
+"""Matches as a csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name."""
 
 from __future__ import annotations
 
 import csv
 import itertools
+import logging
 import math
-from collections.abc import Callable, Iterable, Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,11 +16,15 @@ from torch import Tensor
 
 from dejavu_torch.data.files import as_number, read_text
 from dejavu_torch.data.output import whole_file
+from dejavu_torch.database.place_map import Route
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match
 
+log = logging.getLogger("dejavu_torch")
+
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
-EXPECTED = "columns query,place,score and, if wanted, accepted, probability and rank"
+EXPECTED = "columns query,place,score and, if wanted, accepted, probability, rank and route"
+ELSEWHERE = -2  # the place of an answer on another route
 _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 
 
@@ -26,7 +32,8 @@ class Matches(NamedTuple):
     """Matches read from a file, in its order.
 
     query: (Q,) int64, the frame number of each query. match: Match of (Q,), its index a frame number as well.
-    candidates: (Q,K) int64, the frames of the K ranks of each query, -1 for none; K is 1 without ranks.
+    candidates: (Q,K) int64, the frames of the K ranks of each query, -1 for none; K is 1 without ranks. Both
+        have `ELSEWHERE` for what lies on another route than the one asked for.
     """
 
     query: Tensor
@@ -42,6 +49,7 @@ def write_matches(
     query_name: Callable[[int], str] | None = None,
     place_name: Callable[[int], str] | None = None,
     ranks: int | None = None,
+    routes: Sequence[Route] = (),
 ) -> tuple[int, int]:
     """Write matches that come in parts as a csv; returns how many (queries, accepted at their first rank).
 
@@ -55,17 +63,21 @@ def write_matches(
             `Traverse.frame_name`; None leaves the column empty. A character that is not printable, such as a
             line break, is escaped.
         ranks: how many matches each query has; None is one, and no column for the rank.
+        routes: of a merged map, which get a column with the name of each: the place is then a frame of that
+            route, while `frame_of` and `place_name` count through all of them.
 
     Convention 11: query and place count frames of the sources, -1 where no place is reported.
     """
     total = accepted = 0
     each = 1 if ranks is None else ranks
+    starts = list(itertools.accumulate((route.frames for route in routes), initial=0))
     matches = iter(matches)
     start = next(matches, None)
     known = start is not None and start.probability is not None
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        also = [*(["probability"] if known else []), *([] if ranks is None else ["rank"])]
+        told = (("probability", known), ("rank", ranks is not None), ("route", bool(routes)))
+        also = [name for name, is_told in told if is_told]
         writer.writerow([*NUMBERS, *also, *NAMES])
         for match in () if start is None else itertools.chain([start], matches):
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
@@ -78,8 +90,11 @@ def write_matches(
             rows = zip(*(column.tolist() for column in columns), strict=True)
             for query, place, score, good, p, at in rows:
                 names = _name(query_name, query), _name(place_name, place)
-                also = [*([f"{p:.6g}"] if known else []), *([] if ranks is None else [at])]
-                writer.writerow([query, place, f"{score:.{digits}g}", int(good), *also, *names])
+                route = bisect_right(starts, place) - 1 if routes and place >= 0 else -1
+                cells = (f"{p:.6g}", at, printable(routes[route].name) if route >= 0 else "")
+                also = [cell for cell, (_, is_told) in zip(cells, told, strict=True) if is_told]
+                own = place - starts[route] if route >= 0 else place
+                writer.writerow([query, own, f"{score:.{digits}g}", int(good), *also, *names])
                 accepted += good and at == 1
     return total, accepted
 
@@ -88,7 +103,7 @@ def _name(name_of: Callable[[int], str] | None, frame: int) -> str:
     return "" if name_of is None or frame < 0 else printable(name_of(frame))
 
 
-def read_matches(path: Path) -> Matches:
+def read_matches(path: Path, route: str | None = None) -> Matches:
     """The matches of a csv, which may come from any method.
 
     Args:
@@ -98,14 +113,18 @@ def read_matches(path: Path) -> Matches:
             0; where the column is missing, every match with a finite score is accepted. probability: of being
             right, from 0 to 1; where the column is missing, none is known. rank: where there is
             such a column, the lines of a query are its candidates, ranks 1 to K in this order with one K for
-            all queries, and the first is its match. Other columns are ignored.
+            all queries, and the first is its match. route: where there is such a column, the name of the
+            route whose frame the place is. Other columns are ignored.
+        route: whose places count, of a file with that column.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
         accepted, probability 0.
 
     Raises:
-        InputError: what cannot be read, with the number of the line.
+        InputError: what cannot be read, with the number of the line, or a route where there is no such
+            column, or none where there is one.
     """
+    routes: dict[str, None] = {}
     queries: list[int] = []
     seen: set[int] = set()
     reports: list[tuple[int, float, bool, float]] = []
@@ -124,7 +143,12 @@ def read_matches(path: Path) -> Matches:
         accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
         if accepted is None:
             raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
+        if route is not None and "route" not in cells:
+            raise InputError(f"{where}: no column route for --route {route}; expected none")
         nothing = place < 0 or math.isinf(score)
+        if "route" in cells and not nothing:
+            routes[cells["route"]] = None
+            place = place if cells["route"] == route else ELSEWHERE
         probability = 0.0 if nothing else as_number(cells.get("probability", "0"))
         if probability is None or not 0 <= probability <= 1:
             seen_ = f"probability is {cells['probability']!r}"
@@ -138,6 +162,12 @@ def read_matches(path: Path) -> Matches:
         reports.append((-1, math.inf, False, 0.0) if nothing else (place, score, accepted, probability))
     if not queries:
         raise InputError(f"{path} holds no matches; expected a line for each query")
+    if route is None and "route" in cells:
+        known = f", with answers on {', '.join(routes)}" if routes else ""
+        raise InputError(f"{path} has a column route{known}; expected --route with the one that truth is of")
+    if route is not None and route not in routes:
+        known = f"; it has answers on {', '.join(routes)}" if routes else ""
+        log.warning("%s: no answer is on route %s%s", path, route, known)
     for query, places in zip(queries, ranked, strict=True):
         if len(places) != len(ranked[0]):
             seen_ = f"query {query} has {len(places)} ranks"

@@ -239,6 +239,33 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) ->
     return figure, axes[:, 0]
 
 
+def plot_growth(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]) -> Plot:
+    """Figures of contenders over the number of places, a panel each, both axes logarithmic.
+
+    Args:
+        panels: at least one: what is drawn -> contender -> places and figure. Names that start with "dejavu"
+            are ours.
+    """
+    names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
+    figure, axes = canvas(2.4 * len(panels) + 1.1 * LINE * len(names), len(panels), squeeze=False)
+    others = [name for name in names if not name.startswith("dejavu")]
+    for axis, (heading, lines) in zip(axes[:, 0], panels.items(), strict=True):
+        for name, points in lines.items():
+            ours = name.startswith("dejavu")
+            order = (
+                [one for one in names if one.startswith("dejavu")].index(name) if ours else others.index(name)
+            )
+            style = ("-", "--", ":", "-.")[order % 4]
+            colour = _OURS if ours else f"C{order % 10}"
+            axis.loglog(*zip(*points, strict=True), style, color=colour, marker="o", markersize=3, label=name)
+        axis.set_title(heading, loc="left", fontsize=10, weight="bold")
+        axis.grid(alpha=0.25)
+    axes[-1, 0].set_xlabel("places")
+    drawn = {t: h for a in axes[:, 0] for h, t in zip(*a.get_legend_handles_labels(), strict=True)}
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower left", frameon=False, fontsize=9)
+    return figure, axes[:, 0]
+
+
 def plot_frontiers(
     cases: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]],
     whitenings: Mapping[str, Sequence[tuple[str, int, float]]] = MappingProxyType({}),

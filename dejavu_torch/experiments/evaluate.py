@@ -17,6 +17,7 @@ from dejavu_torch.data.ground_truth import (
     ground_truth_in_places,
 )
 from dejavu_torch.data.positions import unit_of
+from dejavu_torch.database.merged import MergedMap
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
@@ -25,7 +26,7 @@ from dejavu_torch.evaluation.curves import (
     recall_at,
     threshold_of_full_precision,
 )
-from dejavu_torch.evaluation.matches import read_matches
+from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
 from dejavu_torch.evaluation.pictures import draw_coverage, draw_curves
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
@@ -55,6 +56,7 @@ def evaluate_file(
     reference: Traverse | None = None,
     query: Traverse | None = None,
     map: Path | None = None,
+    route: str | None = None,
 ) -> Evaluation:
     """Scores and pictures of the matches in a csv.
 
@@ -67,6 +69,8 @@ def evaluate_file(
             frames there are: without it, an offset gives every query a right answer.
         map: file of a map of the reference. It says how many frames there are as well; where its places are
             resampled by distance, matches and ground truth are turned from frames into places.
+        route: of matches on a merged map, the route that `truth` and `reference` are of: answers on other
+            routes are wrong.
 
     Raises:
         InputError: matches, ground truth or map that cannot be read, do not fit each other, or leave no query
@@ -77,13 +81,19 @@ def evaluate_file(
     if truth is not None:
         check_ground_truth(truth, interpolate)
     place_map = None if map is None else read_place_map(map)
+    if isinstance(place_map, MergedMap):
+        if route is None:
+            names = ", ".join(place_map.names)
+            raise InputError(f"{map} has the routes {names}; expected --route with the one that truth is of")
+        place_map = place_map.part(route)
     positions = torch.zeros(0) if place_map is None else place_map.positions
     resampled = len(positions) > 0
     frames = places = None if reference is None else reference.length
     if place_map is not None:
         places = place_map.places
         frames = len(positions) if resampled else places
-    queries, match, candidates = read_matches(matches)
+    queries, match, candidates = read_matches(matches, route)
+    elsewhere = match.index == ELSEWHERE, candidates == ELSEWHERE
     if frames is not None and int(candidates.max()) >= frames:
         raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
@@ -93,6 +103,11 @@ def evaluate_file(
         known = ground_truth_in_places(known, place_map.place_of)
         match = match._replace(index=place_map.place_of(match.index))
         candidates = place_map.place_of(candidates)
+    if route is not None:  # other routes lie behind all of this one, and all that its truth has
+        highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
+        behind = max(places or 0, 1 + highest) + tolerance
+        match = match._replace(index=match.index.masked_fill(elsewhere[0], behind))
+        candidates = candidates.masked_fill(elsewhere[1], behind)
     facts = evaluation_facts(
         match, known, tolerance, positions, describe_ground_truth(truth, interpolate, positions=True)
     )
@@ -104,11 +119,14 @@ def evaluate_file(
         "matches": str(matches),
         "places": places,
     }
+    if route is not None:
+        facts |= {"route": route, "elsewhere": int(elsewhere[0].sum())}
     ours = contend(printable(matches.name), match, known, tolerance)
-    seen = places or 1 + max(int(table.max()) for table in (match.index, known.positives))
+    here = match._replace(index=match.index.masked_fill(elsewhere[0], -1))
+    seen = places or 1 + max(int(table.max()) for table in (here.index, known.positives))
     borders = torch.tensor([seen]) if place_map is None else place_map.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
-    pictures |= draw_coverage(match, known, tolerance, borders, queries, facts["unit"])
+    pictures |= draw_coverage(here, known, tolerance, borders, queries, facts["unit"])
     pictures |= draw_reliability(match, known, tolerance)
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
 

@@ -265,10 +265,15 @@ def give_back() -> None:
 
 def measured(task: Task, folder: Path) -> dict[str, Any]:
     """`measure` in a process of its own; why there are no figures where it fails."""
+    return in_process(__name__, [task, str(folder)])
+
+
+def in_process(module: str, arguments: object) -> dict[str, Any]:
+    """What a module prints as JSON, run by itself on arguments; where it fails why, as `skipped`."""
     # without the current folder, from which nothing is imported
     search = os.pathsep.join(filter(None, sys.path))
     done = subprocess.run(
-        [sys.executable, "-P", "-m", __name__, json.dumps([task, str(folder)])],
+        [sys.executable, "-P", "-m", module, json.dumps(arguments)],
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONPATH": search},

@@ -137,6 +137,9 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
     _require_packages()
     if not model.map.places:
         raise InputError("there is no map yet; expected learn(...) or load(...) first")
+    if model.map.routes:
+        routes = ", ".join(route.name for route in model.map.routes)
+        raise InputError(f"the map has the routes {routes}; expected to export the map of each")
     if model.frame_shape is None:
         raise InputError(
             "the map does not know what frames it was learned from; expected one learned from a source"

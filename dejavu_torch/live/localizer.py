@@ -31,7 +31,7 @@ class LiveMatch(NamedTuple):
     likewise. name: of that frame, "" where it has none. score: as of `Match`, lower is better. posterior: the
     probability that the filter gives the place, of all frames so far; NaN without a filter. probability: of
     being right, where the map is calibrated; NaN where it is not. accepted: as of `Match`. milliseconds: from
-    the frame to this answer.
+    the frame to this answer. route: of a merged map, the name of the route whose frame it is, else "".
     """
 
     place: int
@@ -42,6 +42,7 @@ class LiveMatch(NamedTuple):
     probability: float
     accepted: bool
     milliseconds: float
+    route: str = ""
 
 
 class LiveLocalizer:
@@ -118,16 +119,18 @@ class LiveLocalizer:
             if filter is not None:
                 filter.moved = 1
         place, score = int(match.index), float(match.score)
-        shown = int(self.model.map.frame_of(match.index))
+        found = self.model.map
+        shown, routes = int(found.frame_of(match.index)), found.routes
         return LiveMatch(
             place,
-            shown,
+            int(found.own_frame_of(match.index)) if routes else shown,
             self.model.frame_name(shown) if shown >= 0 else "",
             score,
             math.nan if filter is None else math.exp(-score),
             math.nan if match.probability is None else float(match.probability),
             bool(match.accepted),
             1e3 * (time.perf_counter() - began),
+            routes[int(found.route_of(match.index))].name if routes and place >= 0 else "",
         )
 
     def _describe(self, batch: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.spectral import quantise
+from dejavu_torch.database.quantisation import quantise
 from dejavu_torch.database.spectrum import Transform, from_spectrum
 from dejavu_torch.training.losses import laplace_bits
 from dejavu_torch.types import InputError

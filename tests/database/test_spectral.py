@@ -13,7 +13,8 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, code_chunk, dead_zone, quantise
+from dejavu_torch.database.quantisation import dead_zone, quantise
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer
 

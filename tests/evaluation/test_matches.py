@@ -11,7 +11,8 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.evaluation.matches import read_matches, write_matches
+from dejavu_torch.database.place_map import Route
+from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches, write_matches
 from dejavu_torch.types import Match
 
 INF = float("inf")
@@ -248,3 +249,25 @@ def test_names_with_commas_quotes_and_line_breaks(tmp_path: Path) -> None:
     rows = list(csv.DictReader(path.open(newline="", encoding="utf-8")))
     assert [row["query_name"] for row in rows] == ['a, "b".png', "ä\\n.png", "c\\u2028d\\udcff.png"]
     assert len(lines(path)) == 4
+
+
+def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path: Path) -> None:
+    routes = (Route("out", 4, 8), Route("b,ack", 3, 5))
+    match = Match(torch.tensor([0, 3, 4, -1, 6]), torch.tensor([0.1, 0.2, 0.3, INF, 0.5]), torch.ones(5) > 0)
+    path = tmp_path / "m.csv"
+    frame_of = torch.tensor([0, 2, 4, 7, 8, 10, 12, -1])  # of all routes, one behind the other
+    write_matches(path, [match], None, lambda p: frame_of[p], None, lambda f: f"{f}.png", None, routes)
+    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    assert [(row["place"], row["route"], row["place_name"]) for row in rows] == [
+        ("0", "out", "0.png"),
+        ("7", "out", "7.png"),
+        ("0", "b,ack", "8.png"),
+        ("-1", "", ""),
+        ("4", "b,ack", "12.png"),
+    ]
+    assert read_matches(path, "out").match.index.tolist() == [0, 7, ELSEWHERE, -1, ELSEWHERE]
+    _, back, candidates = read_matches(path, "b,ack")
+    assert back.index.tolist() == candidates[:, 0].tolist() == [ELSEWHERE, ELSEWHERE, 0, -1, 4]
+    assert back.accepted.tolist() == [True, True, True, False, True]
+    with refused("column route", "out, b,ack", "--route"):
+        read_matches(path)

@@ -25,14 +25,15 @@ CHEVRON_PERIOD = 171
 VIEW = 64  # the camera sees VIEW x VIEW image pixels
 MARGIN = 8  # columns beyond the first and the last view, so that yaw never leaves the image
 HEIGHT = 96  # rows of the painted image; the camera flies along the middle one
-ONCE = 2**17  # frames of a route on which everything occurs once, at most: it is one image
 TILES = (
     997,
     1009,
 )  # columns of the two tiles of ground that repeats; co-prime, so that no place is like another
-PLAIN = (
-    9  # rows from the middle of the view to the edge of the road between the tiles: more than a cell of HOG
-)
+LONGEST = {
+    "once": 2**17,
+    "repeat": math.lcm(*TILES),
+}  # frames, by ground: where nothing repeats, of one image
+PLAIN = 9  # rows from the middle of the view to the edge of the road between tiles: over a cell of HOG
 
 ROAD = 40.0  # image row of the road's middle
 HALF, LANE = 14.0, 6.3  # rows from the road's middle to its edge, to a lane's middle
@@ -300,7 +301,7 @@ class AerialRoad(SimulatedRoute):
 
     seed: int = option(0, 0)
     traverse: int = option(0, 0)
-    frames: int = option(3072, 1, math.lcm(*TILES))
+    frames: int = option(3072, 1, LONGEST["repeat"])
     size: int = option(64, 16, 256)
     noise: float = option(0.025, 0, 1)
     drift: float = option(3.0, 0, 8)
@@ -311,10 +312,10 @@ class AerialRoad(SimulatedRoute):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ground == "once" and self.frames > ONCE:
+        if self.frames > LONGEST[self.ground]:
             raise InputError(
-                f"sim:aerial has frames={self.frames}; expected 1 <= frames <= {ONCE}, with ground=repeat "
-                f"{math.lcm(*TILES)}"
+                f"{self.name} has frames={self.frames}; expected 1 <= frames <= {LONGEST[self.ground]}, with "
+                f"ground=repeat {LONGEST['repeat']}"
             )
         self.length, self.place = self.frames, torch.arange(self.frames, dtype=torch.float64)
         random, swing = Random("flight", self.seed, self.traverse), 1.0 if self.traverse else 0.4

@@ -1,0 +1,127 @@
+"""Descriptors of a long route, made as they are read, like those of a route that is there."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.types import InputError
+
+REACH = 2048  # places on either side that a made descriptor depends on, at most
+BLOCK = 4096  # places made at a time; each block has its own random numbers
+PRIME = 1_000_003  # between the random numbers of one seed and the next
+
+
+class Likeness(NamedTuple):
+    """What descriptors of K numbers are like along one route, and how those of a second traverse differ.
+
+    mean: (K,), of the route. axes: (K,K), its principal components as columns. filters: (2R,K), which make
+    each component of white noise: the spectrum along the route. query_mean: (K,), of the second traverse.
+    rho: (K,), what is left of each number there, by regression. spread: (K,K), makes of white noise what
+    comes on top of it. sizes: (n,), how large that was of each query, beside its root mean square.
+    """
+
+    mean: Tensor
+    axes: Tensor
+    filters: Tensor
+    query_mean: Tensor
+    rho: Tensor
+    spread: Tensor
+    sizes: Tensor
+
+
+def likeness(places: Tensor, queries: Tensor, truth: Tensor) -> Likeness:
+    """Measure a route and a second traverse of it.
+
+    Args:
+        truth: the place that each query shows.
+
+    Shape: (N,K), (Q,K), (Q,).
+
+    Raises:
+        InputError: fewer than 16 places or queries.
+    """
+    if min(len(places), len(queries)) < 16:
+        raise InputError(
+            f"{len(places)} places and {len(queries)} queries to measure; expected at least 16 each"
+        )
+    mean = places.mean(0)
+    centred = places - mean
+    _, axes = torch.linalg.eigh((centred.T @ centred / len(places)).double())
+    axes = axes.float()
+    seen = centred[truth]
+    query_mean = queries.mean(0)
+    moved = queries - query_mean
+    about = seen - seen.mean(0)
+    rho = (moved * about).mean(0) / about.square().mean(0).clamp(min=1e-12)
+    left = moved - rho * about
+    values, turn = torch.linalg.eigh((left.T @ left / len(left)).double())
+    root = values.clamp(min=1e-9 * float(values[-1])).sqrt()
+    white = left.double() @ turn / root
+    sizes = white.square().mean(1).sqrt().float()
+    return Likeness(mean, axes, _filters(centred @ axes), query_mean, rho, (turn * root).T.float(), sizes)
+
+
+def _filters(series: Tensor) -> Tensor:
+    """Filters that make of white noise what has the spectrum of (N,K) series: (2R,K), the middle one at R."""
+    count = len(series)
+    reach = min(REACH, 1 << (count // 4).bit_length() - 1)
+    window = torch.hann_window(2 * reach)[:, None]
+    starts = range(0, count - 2 * reach + 1, reach)
+    power = sum(torch.fft.rfft(series[s : s + 2 * reach] * window, dim=0).abs().square() for s in starts)
+    filters = torch.fft.irfft(torch.as_tensor(power).sqrt(), dim=0).roll(reach, 0) * window
+    # white noise in, as much variance out as was there
+    scaled: Tensor = filters * (series.std(0) / torch.linalg.vector_norm(filters, dim=0).clamp(min=1e-12))
+    return scaled
+
+
+class MadeRoute(IndexedTraverse):
+    """Descriptors with the covariance, and the spectrum along the route, of one that was measured.
+
+    Args:
+        like: see `likeness`.
+        length: N. seed: of the random numbers.
+
+    Convention: Gaussian, then scaled to length 1 as whitened descriptors are. A place depends on its number
+        and the seed alone: any part of the route can be made by itself, and is not held.
+    """
+
+    def __init__(self, like: Likeness, length: int, seed: int = 0) -> None:
+        self.like, self.length, self.seed = like, length, seed
+        self.name = f"{length} made descriptors"
+        self._noise = lru_cache(4)(self._drawn)
+        self._made = lru_cache(2)(self._block)
+
+    def read(self, frames: range) -> Tensor:
+        at = torch.arange(frames.start, frames.stop, frames.step)
+        blocks = at // BLOCK
+        return torch.cat([self._made(int(b))[at[blocks == b] - int(b) * BLOCK] for b in blocks.unique()])
+
+    def seen_again(self, places: Tensor) -> Tensor:
+        """The same places on a second traverse: what is left of each number, and noise. (Q,) -> (Q,K)"""
+        like = self.like
+        own = torch.cat([self.read(range(i, i + 1)) for i in places.tolist()])
+        generator = torch.Generator().manual_seed(PRIME * self.seed + PRIME - 1)
+        noise = torch.randn(own.shape, generator=generator) @ like.spread
+        sizes = like.sizes[torch.randint(len(like.sizes), (len(own), 1), generator=generator)]
+        return F.normalize(like.query_mean + like.rho * (own - like.mean) + sizes * noise, dim=1)
+
+    def _drawn(self, block: int) -> Tensor:
+        generator = torch.Generator().manual_seed(PRIME * self.seed + block + 1)
+        return torch.randn(BLOCK, len(self.like.mean), generator=generator)
+
+    def _block(self, block: int) -> Tensor:
+        taps = self.like.filters
+        reach = len(taps) // 2
+        noise = torch.cat([self._noise(b) for b in (block - 1, block, block + 1)])
+        noise = noise[BLOCK - reach : 2 * BLOCK + reach]
+        size = len(noise) + len(taps)
+        product = torch.fft.rfft(noise, size, dim=0) * torch.fft.rfft(taps, size, dim=0)
+        components = torch.fft.irfft(product, size, dim=0)[2 * reach : 2 * reach + BLOCK]
+        made: Tensor = F.normalize(self.like.mean + components @ self.like.axes.T, dim=1)
+        return made

@@ -1,0 +1,77 @@
+"""Descriptors of ground that truly repeats, made of its two tiles: `sim:aerial?ground=repeat`."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
+from dejavu_torch.database.quantisation import quantise
+from dejavu_torch.database.spectrum import spectrum
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.model import DejaVu
+
+LOOKED_AT = 16  # numbers of a descriptor that a step is chosen by
+HALVINGS = 12
+ROWS = 8192
+
+
+@torch.no_grad()
+def tiles_of(model: DejaVu) -> dict[str, Tensor]:
+    """What each tile adds to whitened descriptors ahead of their scaling to length 1, by phase.
+
+    Blocks of HOG see one tile or the road between them, which is the same everywhere: so a descriptor of a
+    frame without noise, drift and yaw is a sum of two.
+
+    Args:
+        model: HOG with its defaults and a whitening.
+
+    Returns:
+        first, second: (P,K), the arguments of `TiledRoute`.
+    """
+    assert isinstance(model.features, HOG)
+    assert model.whitening is not None
+    whitening, road = model.whitening, AerialRoad(frames=max(TILES), ground="repeat", noise=0, drift=0, yaw=0)
+    features = torch.cat([model.describe(part) for part in road.batches(64)])
+    middle = features.shape[1] // 7 * 3  # rows of blocks: three see the first tile
+    whole, scale = whitening.unpacked(), whitening.scale
+    first = features[: TILES[0], :middle] @ whole[:middle] * scale - whitening.offset
+    second = features[: TILES[1], middle:] @ whole[middle:] * scale
+    return {"first": first, "second": second}
+
+
+class TiledRoute(IndexedTraverse):
+    """Descriptors of two tiles, over and over.
+
+    Args:
+        first, second: see `tiles_of`. length: N.
+    """
+
+    def __init__(self, first: Tensor, second: Tensor, length: int) -> None:
+        self.first, self.second, self.length = first, second, length
+        self.name = f"{length} places of two tiles"
+
+    def read(self, frames: range) -> Tensor:
+        at = torch.arange(frames.start, frames.stop, frames.step)
+        return F.normalize(self.first[at % len(self.first)] + self.second[at % len(self.second)], dim=1)
+
+
+def step_that_holds(share: float, route: IndexedTraverse, chunk: int | Literal["route"]) -> float:
+    """The step of a spectral map that keeps so much of a route's variance, by some of its numbers."""
+    columns = torch.linspace(0, route.frame_shape[0] - 1, LOOKED_AT).long()
+    series = torch.cat([part[:, columns] for part in route.batches(ROWS)])
+    series -= series.mean(0)
+    parts = series.split(len(series) if chunk == "route" else chunk)
+    lines = torch.cat([spectrum(part.T).T for part in parts])
+    total = float(lines.square().sum())
+    low, high = 1e-3 * math.sqrt(total / lines.numel()), 2 * float(lines.abs().max())
+    for _ in range(HALVINGS):
+        step = math.sqrt(low * high)
+        lost = float((lines - step * quantise(lines, step)).square().sum())
+        low, high = (step, high) if 1 - lost / total > share else (low, step)
+    return low
