@@ -569,8 +569,8 @@ def run_bench(
         print(text_table(live_speed.live_table(live_speed.run_live(out))))
         note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
     elif what == "cluster":
-        print(text_table(bench.bench_table(cluster_speed.run_cluster(out))))
-        note = "difference: share of chunks that are not those of one process"
+        print(text_table(cluster_speed.cluster_table(cluster_speed.run_cluster(out))))
+        note = "other chunks: share that differ from those of one process; processor seconds of all processes"
     else:
         rows = bench.run_bench(what, out)
         print(text_table(bench.bench_table(rows)))

@@ -70,6 +70,7 @@ class Row(NamedTuple):
     our result. measured_rows: where only a part of the case was run: seconds and bytes are scaled up
     from it, seconds_first and peak_bytes are its own. skipped: why there are no figures. recall_at_1: share
     of queries that were found, where the case is to find places. file_bytes: of the file that it runs.
+    cpu_seconds: of all processors together, which other programs change little; the least of the repeats.
     """
 
     case: str
@@ -85,6 +86,7 @@ class Row(NamedTuple):
     skipped: str | None = None
     recall_at_1: float | None = None
     file_bytes: int | None = None
+    cpu_seconds: float | None = None
 
 
 def bench_matcher(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +47,7 @@ def run_cluster(out: Path, frames: int = 8192, repeats: int = 3) -> list[Row]:
         pictures = AerialRoad(frames=frames).batches(64)
         np.save(path, np.concatenate([(255 * one.permute(0, 2, 3, 1)).byte().numpy() for one in pictures]))
         route = read_array(path)
-        rows = _timed(_contenders(_coder(route), route, cluster), frames, cluster.workers, repeats)
+        rows = _timed(_contenders(_coder(route), route, cluster), frames, repeats)
     with whole_folder(out) as written:
         write_bench(written, rows)
     return rows
@@ -91,34 +93,65 @@ def _contenders(
     }
 
 
+def cluster_table(rows: Sequence[Row]) -> list[list[str]]:
+    """The figures as rows of text, the header first."""
+    head = ["", "seconds", "times as fast as the first", "processor seconds", "other chunks"]
+    first = rows[0].seconds or 0.0
+    return [
+        head,
+        *(
+            [
+                row.contender,
+                f"{row.seconds:.2f}",
+                f"{first / (row.seconds or 1):.2f}",
+                f"{row.cpu_seconds:.2f}",
+                f"{row.difference:.0%}",
+            ]
+            for row in rows
+        ),
+    ]
+
+
 def _timed(
-    contenders: dict[tuple[str, int], Callable[[], list[CodedChunk]]], frames: int, workers: int, repeats: int
+    contenders: dict[tuple[str, int], Callable[[], list[CodedChunk]]], frames: int, repeats: int
 ) -> list[Row]:
     seconds: dict[tuple[str, int], list[float]] = {key: [] for key in contenders}
+    busy: dict[tuple[str, int], list[float]] = {key: [] for key in contenders}
     sums: dict[tuple[str, int], list[int]] = {}
     for _ in range(1 + repeats):
         for key, make in contenders.items():
-            began = time.perf_counter()
+            began, spent = time.perf_counter(), processor_time()
             chunks = make()
             seconds[key].append(time.perf_counter() - began)
+            busy[key].append(processor_time() - spent)
             sums[key] = [one.stream.checksum for one in chunks]
     best = {key: min(times[1:]) for key, times in seconds.items()}
     first = next(iter(sums.values()))
     case = f"chunks of {frames} frames"
-    return [
-        Row(
-            case,
-            name,
-            time_,
-            seconds[name, threads][0],
-            time_ / min(best.values()),
-            threads=threads,
-            difference=_share_of_others(sums[name, threads], first),
-        )
-        for (name, threads), time_ in best.items()
-    ]
+    rows = []
+    for key, least in best.items():
+        name, threads = key
+        others = sum(a != b for a, b in zip(sums[key], first, strict=True)) / len(first)
+        ratio, cpu = least / min(best.values()), min(busy[key][1:])
+        row = Row(case, name, least, seconds[key][0], ratio, threads=threads, difference=others)
+        rows.append(row._replace(cpu_seconds=cpu))
+    return rows
 
 
-def _share_of_others(sums: Sequence[int], expected: Sequence[int]) -> float:
-    """The share of chunks that are other ones."""
-    return sum(a != b for a, b in zip(sums, expected, strict=True)) / len(expected)
+def processor_time() -> float:
+    """Seconds that this process, and all that are there and began with it, have computed; of Linux, else of
+    this one alone."""
+    parents: dict[int, int] = {}
+    ticks: dict[int, int] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError, ValueError, IndexError):  # it has ended
+            numbers = stat.read_text().rpartition(")")[2].split()
+            parents[int(stat.parent.name)] = int(numbers[1])
+            ticks[int(stat.parent.name)] = int(numbers[11]) + int(numbers[12])
+    if not ticks:
+        return time.process_time()
+    own, count = {os.getpid()}, 0
+    while len(own) > count:
+        count = len(own)
+        own |= {process for process, parent in parents.items() if parent in own}
+    return sum(ticks[process] for process in own if process in ticks) / os.sysconf("SC_CLK_TCK")
