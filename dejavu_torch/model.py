@@ -801,6 +801,10 @@ class DejaVu(nn.Module):
             self._searcher = Searcher(self.map, method)
         return self._searcher
 
+    def search_by(self, searcher: Searcher) -> None:
+        """Find best places by a searcher of the map that is made already, such as one of a cluster."""
+        self._searcher = searcher
+
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""
         return map(self.whitened, self._features(traverse, progress))

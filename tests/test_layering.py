@@ -47,7 +47,7 @@ ARROWS = {
     "streaming": "types data features database",
     "model": "types text data features periods database recognition motion streaming",
     "growth": "types data features database streaming model motion",
-    "cluster": "types text data database streaming",
+    "cluster": "types text data database recognition streaming",
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods database recognition motion model",
     "training": "types text memory resize data features periods database recognition motion model evaluation",

@@ -133,7 +133,8 @@ def run_learn(
     else:
         model = _map_to_append_to(append, model).to(where)
     if cluster is not None:
-        _check_cluster(cluster, model, device)
+        _check_cluster(cluster, device)
+        _check_chunks(cluster, model)
     _check_map_name(map)
     check_output_file(map)
     check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
@@ -183,6 +184,7 @@ def run_localize(
     speeds: list[float] | None = None,
     filter: bool = False,
     moves: list[float] | None = None,
+    cluster: str | None = None,
     device: str = "cpu",
     features: nn.Module | None = None,
 ) -> None:
@@ -203,12 +205,18 @@ def run_localize(
             --threshold are -log probability, and what is more likely than not is accepted
         moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
             if not given
+        cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
         device: what computes: cpu, cuda, cuda:1 or mps
         features: class of the map's features, if not ours
     """
     where = device_of(device)
     check_output_file(out)
     check_not_read(out, map, source)
+    if cluster is not None:
+        _check_cluster(cluster, device)
+        if filter or sequence != 1:
+            together = "--filter" if filter else f"--sequence {sequence}"
+            raise InputError(f"--cluster {cluster} and {together}; expected one of them")
     model = _load_map(map, features).to(where)
     if corners is not None:
         if as_is or model.velocity is None or model.step is None:
@@ -235,7 +243,8 @@ def run_localize(
     if top is not None:
         candidates = model.candidate_batches(query, top, APART, "localizing", matcher)
         matches = (batch.as_match(threshold) for batch in candidates)
-    total, accepted = _write_matches(out, matches, query, model, top)
+    with _searching(cluster, model):
+        total, accepted = _write_matches(out, matches, query, model, top)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
     elif threshold is None and model.precision is None:
@@ -692,18 +701,20 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         )
 
 
-def _check_cluster(cluster: str, model: DejaVu, device: str) -> None:
+def _check_cluster(cluster: str, device: str) -> None:
     """Refuse early what no cluster does."""
     from dejavu_torch.cluster.session import check_installed
 
     if device != "cpu":
         raise InputError(f"--cluster {cluster} and --device {device}; expected one of them")
-    if getattr(model.mapper, "chunk", "route") == "route":
-        seen = (
-            f"--cluster {cluster} makes chunks, into which a {type(model.mapper).__name__} divides no route"
-        )
-        raise InputError(f"{seen}; expected a spectral map of --mapper.chunk places each, such as 1000")
     check_installed()
+
+
+def _check_chunks(cluster: str, model: DejaVu) -> None:
+    """Refuse to divide among workers what is made as one."""
+    if getattr(model.mapper, "chunk", "route") == "route":
+        seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none here"
+        raise InputError(f"{seen}; expected a spectral map of --mapper.chunk places each, such as 1000")
 
 
 @contextmanager
@@ -717,6 +728,20 @@ def _making(cluster: str | None) -> Iterator[Callable[..., Made]]:
 
     with Cluster(cluster) as workers:
         yield partial(code_on, workers)
+
+
+@contextmanager
+def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
+    """In the block the map is divided among the workers of a cluster, if there is one."""
+    if cluster is None:
+        yield
+        return
+    from dejavu_torch.cluster.searching import ClusterSearcher
+    from dejavu_torch.cluster.session import Cluster
+
+    with Cluster(cluster) as workers:
+        model.search_by(ClusterSearcher(workers, model.map))
+        yield
 
 
 def _check_map_name(path: Path) -> None:

@@ -119,8 +119,13 @@ class Cluster:
         except self.ray.exceptions.RayTaskError:  # an error of ours
             raise
         except self.ray.exceptions.RayError as error:
-            seen = f"its worker died, {RETRIES + 1} times ({one_line(error)[:100]})"
+            seen = f"its worker died, {RETRIES + 1} times ({error_line(error)})"
             return Failure(f"{seen}; expected workers that live, and memory for them", self.address)
+
+
+def error_line(error: Exception) -> str:
+    """What Ray says of itself at length, in few words."""
+    return one_line(error)[:100]
 
 
 def processors() -> int:

@@ -15,17 +15,21 @@ from types import ModuleType
 import pytest
 import torch
 from command_line import fails, frames, write_images
-from helpers import Stream, refused
+from helpers import Fixed, Stream, refused, template_model
 from torch import Tensor, nn
 
 from dejavu_torch.cluster import session
 from dejavu_torch.cluster.learning import code_on
+from dejavu_torch.cluster.searching import ClusterSearcher
 from dejavu_torch.cluster.session import Cluster
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.features.views import Views
+from dejavu_torch.growth import merge
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
-from dejavu_torch.types import Traverse
+from dejavu_torch.types import FrequencyLayer, Traverse
 
 CHUNK, PLACES = 50, 620
 FEATURES = """
@@ -151,10 +155,63 @@ def test_what_cannot_be_made_is_named_and_only_that_is_made_again(
     assert dealt == [range(8, 10)]
 
 
+def found_by(model: DejaVu, queries: Tensor, searcher: ClusterSearcher | None = None) -> list[Tensor]:
+    if searcher is not None:
+        model.search_by(searcher)
+    match, best = model.localize(queries), model.candidates(queries, 4, apart=3)
+    assert searcher is None or model.searcher() is searcher
+    return [match.index, match.score, *best, match.accepted]
+
+
+@pytest.mark.parametrize("kind", ["route", "merged"])
+def test_parts_of_a_map_on_workers_find_what_the_whole_does(kind: str, cluster: Cluster) -> None:
+    # more than a block of a scan, with ties between the chunks of one part, and of both
+    again = torch.cat([route() * (1 + i / 9) for i in range(64 // 8)], 1)[:500].repeat(20, 1)
+    models = [DejaVu(None, "none", SpectralMapper(None, 0.3, chunk=CHUNK)).learn(again)]
+    if kind == "merged":
+        models = [*models, DejaVu(None, "none", SpectralMapper(None, 0.2, chunk=40)).learn(again[:600])]
+    model = models[0] if kind == "route" else merge(models, ["one", "two"])
+    queries = torch.cat([again[:90:7], again[480:700:9] + 0.1, again[:500:31]])
+    whole = found_by(model, queries)
+    assert int((whole[2][:, 1] - whole[2][:, 0]).remainder(500).eq(0).sum()) > 20
+    searcher = ClusterSearcher(cluster, model.map)
+    assert len(searcher.actors) == 2
+    assert all(map(torch.equal, found_by(model, queries, searcher), whole))
+    one = [column[3:4] for column in whole]  # scored another way
+    assert all(map(torch.equal, found_by(model, queries[3:4], searcher)[:1], one[:1]))
+    if kind == "route":
+        os.kill(cluster.ray.get(searcher.actors[0].process.remote()), signal.SIGKILL)
+        assert all(map(torch.equal, found_by(model, queries, searcher), whole))
+
+
+def test_probabilities_are_those_of_the_whole_map(cluster: Cluster) -> None:
+    torch.manual_seed(0)
+    views = Views(ArrayTraverse(route() + 0.3 * torch.randn(PLACES, 8)), torch.arange(PLACES))
+    model = DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK), precision=0.9).learn(route())
+    model.calibrate(None, views)
+    queries = route()[::5] + 0.4 * torch.randn(PLACES // 5, 8)
+    whole = model.localize(queries)
+    model.search_by(ClusterSearcher(cluster, model.map))
+    found = model.localize(queries)
+    assert whole.probability is not None
+    assert found.probability is not None
+    assert torch.equal(found.probability, whole.probability)
+    assert torch.equal(found.accepted, whole.accepted)
+    assert 0 < int(whole.accepted.sum()) < len(queries)
+    with refused("templates", "spectral"):
+        ClusterSearcher(
+            cluster, template_model(Fixed(FrequencyLayer(7, 7, 0, 70, (0,)))).learn(route()[:70]).map
+        )
+
+
 def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ("learn", "sim:aerial?frames=64", "--map", tmp_path / "map.safetensors")
     chunked = (*command, "--mapper.chunk", "50")
     assert "--mapper.chunk" in fails(capsys, *command, "--cluster", "auto")
+    assert "--device" in fails(capsys, *chunked, "--cluster", "auto", "--device", "cuda")
+    found = ("localize", "map.safetensors", "sim:aerial", "--out", tmp_path / "m.csv", "--cluster", "auto")
+    assert "--filter" in fails(capsys, *found, "--filter")
+    assert "--sequence 5" in fails(capsys, *found, "--sequence", "5")
     assert "TemplateMapper" in fails(capsys, *command, "--config", "local_maxima", "--cluster", "auto")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "ray", None)

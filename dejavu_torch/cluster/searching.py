@@ -1,0 +1,163 @@
+"""The best places of queries on a map whose parts are on the workers of a cluster."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from functools import reduce
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.cluster.session import RETRIES, Cluster, error_line
+from dejavu_torch.database.merged import MergedMap
+from dejavu_torch.database.place_map import PlaceMap
+from dejavu_torch.database.spectral import BLOCK, CodedChunk, SpectralMap
+from dejavu_torch.recognition.search import (
+    SCORES_AT_ONCE,
+    Best,
+    Search,
+    Searched,
+    Searcher,
+    improved,
+    merged,
+    none_yet,
+)
+from dejavu_torch.types import InputError
+
+
+class Part(NamedTuple):
+    """Chunks of a spectral map that follow each other, as they go to a worker.
+
+    start: the place of the whole map that comes first. chunks, mean, settings: as of `SpectralMap.of_chunks`.
+    audible: of the map that they are of.
+    """
+
+    start: int
+    chunks: list[CodedChunk]
+    mean: Tensor
+    settings: dict[str, Any]
+    audible: float
+
+    @property
+    def places(self) -> int:
+        """How many there are."""
+        return sum(chunk.places for chunk in self.chunks)
+
+
+class ClusterSearcher(Searcher):
+    """As `Searcher` by a scan, parts of the map being decoded and scored by one worker each.
+
+    Args:
+        cluster: its workers hold the parts; one that dies is started again. route: a spectral map, or one
+            merged of several.
+
+    Shape: queries (Q,K), n -> Best of (Q,n).
+
+    Convention: scores are those of a scan here, to the bit, since parts begin where its blocks do; so are the
+        places, ties included.
+
+    Raises:
+        InputError: a map of another kind; a worker that does not come back.
+    """
+
+    def __init__(self, cluster: Cluster, route: PlaceMap) -> None:
+        super().__init__(route, "scan")
+        self.cluster = cluster
+        self.maps = _maps(route)
+        sizes = [0] * cluster.workers
+        dealt: list[list[tuple[int, Part]]] = [[] for _ in sizes]
+        most = -(-route.places // cluster.workers)
+        first = 0
+        for number, one in enumerate(self.maps):
+            for part in _parts(one, most, first):
+                least = sizes.index(min(sizes))
+                dealt[least].append((number, part))
+                sizes[least] += part.places
+            first += one.places
+        ray = cluster.ray
+        actor = ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Worker)
+        self.sent = [
+            [ray.put(parts)] for parts in dealt if parts
+        ]  # a worker that is started again needs them
+        self.actors = [actor.remote(parts) for parts in self.sent]
+        self.told = Searched("scan", chunks=sum(len(one.chunks) for one in self.maps))
+
+    def fits(self, route: PlaceMap, method: Search) -> bool:
+        return route is self.route
+
+    @torch.no_grad()
+    def __call__(self, queries: Tensor, n: int) -> Best:
+        n = min(n, self.route.places)
+        self.told = self.told._replace(queries=self.told.queries + len(queries))
+        found = []
+        longest = max(one.block_places for one in self.maps)
+        for some in queries.split(max(1, SCORES_AT_ONCE // longest)):
+            ways = [one.rebuilds(len(some)) for one in self.maps]
+            try:
+                asked = [actor.best.remote(some.numpy(), n, ways) for actor in self.actors]
+                answers = self.cluster.ray.get(asked)
+            except self.cluster.ray.exceptions.RayError as error:
+                seen = f"a worker died with its part of the map ({error_line(error)})"
+                raise InputError(f"{seen}; expected workers that live, and memory for it") from error
+            parts = [Best(*(torch.from_numpy(column.copy()) for column in one)) for one in answers]
+            found.append(reduce(merged, parts))
+        return Best(*(torch.cat(column) for column in zip(*found, strict=True)))
+
+
+class _Worker:
+    """Holds parts of maps: each with the number of the map that it is of."""
+
+    def __init__(self, sent: list[Any]) -> None:
+        import ray
+
+        torch.set_num_threads(1)
+        parts: list[tuple[int, Part]] = ray.get(sent[0])
+        self.parts = [(number, part.start, _map_of(part)) for number, part in parts]
+
+    def process(self) -> int:
+        """The number of this process."""
+        return os.getpid()
+
+    @torch.no_grad()
+    def best(self, queries: Any, n: int, rebuild: list[bool]) -> tuple[Any, Any]:
+        """The n best places on them, see `Best`; rebuild: of each map, see `SpectralMap.score_blocks`."""
+        some = torch.from_numpy(queries.copy())
+        found = none_yet(some, n)
+        for number, first, route in self.parts:
+            for start, scores in route.score_blocks(some, rebuild=rebuild[number]):
+                found = improved(found, scores, first + start)
+        return found.score.numpy(), found.index.numpy()
+
+
+def _map_of(part: Part) -> SpectralMap:
+    route = SpectralMap.of_chunks(part.chunks, part.mean, **part.settings)
+    route.audible = part.audible
+    return route
+
+
+def _maps(route: PlaceMap) -> list[SpectralMap]:
+    """The spectral maps that a map is, one behind the other."""
+    if isinstance(route, MergedMap):
+        return [part for name in route.names for part in _maps(route.part(name))]
+    if not isinstance(route, SpectralMap):
+        raise InputError(
+            f"a map of kind {route.kind!r} is not divided among workers; expected a spectral one"
+        )
+    return [route]
+
+
+def _parts(route: SpectralMap, most: int, first: int) -> Iterator[Part]:
+    """Parts of about `most` places at most, divided where the blocks of a scan are."""
+    coded, settings, mean = route.coded(), route.settings(), route.mean.cpu()
+    together = max(1, BLOCK // max(1, route.dimension * max(one.places for one in coded)))
+    blocks = [coded[i : i + together] for i in range(0, len(coded), together)]
+    held: list[CodedChunk] = []
+    for block in blocks:
+        if held and sum(one.places for one in [*held, *block]) > most:
+            yield Part(first, held, mean, settings, route.audible)
+            first += sum(one.places for one in held)
+            held = []
+        held = held + block
+    yield Part(first, held, mean, settings, route.audible)
