@@ -78,10 +78,8 @@ class ClusterSearcher(Searcher):
             first += one.places
         ray = cluster.ray
         actor = ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Worker)
-        self.sent = [
-            [ray.put(parts)] for parts in dealt if parts
-        ]  # a worker that is started again needs them
-        self.actors = [actor.remote(parts) for parts in self.sent]
+        self.sent = [[ray.put(parts)] for parts in dealt if parts]
+        self.actors = [actor.remote() for _ in self.sent]
         self.told = Searched("scan", chunks=sum(len(one.chunks) for one in self.maps))
 
     def fits(self, route: PlaceMap, method: Search) -> bool:
@@ -96,7 +94,8 @@ class ClusterSearcher(Searcher):
         for some in queries.split(max(1, SCORES_AT_ONCE // longest)):
             ways = [one.rebuilds(len(some)) for one in self.maps]
             try:
-                asked = [actor.best.remote(some.numpy(), n, ways) for actor in self.actors]
+                pairs = zip(self.actors, self.sent, strict=True)
+                asked = [actor.best.remote(sent, some.numpy(), n, ways) for actor, sent in pairs]
                 answers = self.cluster.ray.get(asked)
             except self.cluster.ray.exceptions.RayError as error:
                 seen = f"a worker died with its part of the map ({error_line(error)})"
@@ -109,20 +108,25 @@ class ClusterSearcher(Searcher):
 class _Worker:
     """Holds parts of maps: each with the number of the map that it is of."""
 
-    def __init__(self, sent: list[Any]) -> None:
-        import ray
-
+    def __init__(self) -> None:
         torch.set_num_threads(1)
-        parts: list[tuple[int, Part]] = ray.get(sent[0])
-        self.parts = [(number, part.start, _map_of(part)) for number, part in parts]
+        self.parts: list[tuple[int, int, SpectralMap]] = []
 
     def process(self) -> int:
         """The number of this process."""
         return os.getpid()
 
     @torch.no_grad()
-    def best(self, queries: Any, n: int, rebuild: list[bool]) -> tuple[Any, Any]:
-        """The n best places on them, see `Best`; rebuild: of each map, see `SpectralMap.score_blocks`."""
+    def best(self, sent: list[Any], queries: Any, n: int, rebuild: list[bool]) -> tuple[Any, Any]:
+        """The n best places on the parts that were sent, the same ones each time; see `Best`.
+
+        Args:
+            rebuild: of each map, see `SpectralMap.score_blocks`.
+        """
+        if not self.parts:  # or the worker was started again
+            import ray
+
+            self.parts = [(number, part.start, _map_of(part)) for number, part in ray.get(sent[0])]
         some = torch.from_numpy(queries.copy())
         found = none_yet(some, n)
         for number, first, route in self.parts:
