@@ -15,7 +15,6 @@ from dejavu_torch.types import InputError
 
 GROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
 OWN = Path("/proc/self/cgroup")  # in which of them the process is
-IN_MEMORY = 2**29  # bytes of a tensor, at most
 CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back where memory is short
 
 
@@ -41,7 +40,7 @@ def check_room(needed: float, what: str) -> None:
         raise InputError(f"{what} takes {_told(needed)}; expected at most the {_told(free)} free")
 
 
-def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEMORY) -> Tensor:
+def empty(rows: int, columns: int, device: torch.device, in_memory: int = 2**29) -> Tensor:
     """Room for a tensor that may be larger than the memory: then on the CPU, and in a temporary file.
 
     Args:

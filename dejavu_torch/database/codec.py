@@ -24,7 +24,7 @@ Ints = NDArray[np.integer[Any]]
 
 ESCAPE = -128  # stands for a level that int8 does not hold
 LEVELS_PER_BYTE, LEVELS_AT_LEAST = 2**13, 2**22  # of a stream, at most
-LEVEL = 16  # bytes that a level takes while it is decoded
+LEVEL, COLUMN = 4, 2**10  # bytes that a level takes while it is decoded, and a column besides
 MOST = 15  # a magnitude counts for no more in what is near
 REACH = 128  # rows that are near
 
@@ -141,7 +141,7 @@ def check_claim(rows: int, columns: int) -> None:
     Raises:
         InputError: naming both.
     """
-    if min(rows, columns) < 1 or rows * columns * LEVEL > free_memory():
+    if min(rows, columns) < 1 or (rows * LEVEL + COLUMN) * columns > free_memory():
         raise InputError(
             f"the map claims {rows} x {columns} levels; expected at least one, and what fits into the memory"
         )

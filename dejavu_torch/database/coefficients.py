@@ -70,7 +70,8 @@ def levels_of(coefficients: Coefficients, width: int) -> Tensor:
 
 def coded_levels(coefficients: Coefficients, width: int) -> tuple[Tensor, Tensor]:
     """The inverse of `coefficients_of`: (W,K) int8 and (E,) int32."""
-    return to_int8(levels_of(coefficients, width).to(torch.int32))
+    small, escapes = to_int8(coefficients.level.to(torch.int32))
+    return levels_of(coefficients._replace(level=small), width), escapes
 
 
 def lines_of(counts: Tensor, total: int) -> Tensor:

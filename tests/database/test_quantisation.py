@@ -1,0 +1,140 @@
+"""The lines of a long route, made and gone through in blocks, and the step that is found for them."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from test_spectral import held, route
+from torch import Tensor
+
+from dejavu_torch import memory
+from dejavu_torch.database import quantisation
+from dejavu_torch.database.quantisation import CLOSE, HALVINGS, RouteLines, _close_step
+from dejavu_torch.database.spectral import SpectralMapper
+
+SETTINGS: list[dict[str, Any]] = [
+    {},
+    {"chunk": 700, "resolution": 4.0},
+    {"transform": "dct", "resolution": 4.0},
+]
+
+
+@pytest.fixture
+def in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every route is a long one; its lines are in a file."""
+    monkeypatch.setattr(quantisation, "AT_ONCE", 0)
+    monkeypatch.setattr(quantisation, "BLOCK", 1000)
+    monkeypatch.setattr(quantisation, "COLUMNS", 5000)
+    monkeypatch.setattr(quantisation, "empty", lambda *size: memory.empty(*size, in_memory=0))
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_in_blocks_a_map_of_a_step_holds_the_same(
+    settings: dict[str, Any], request: pytest.FixtureRequest
+) -> None:
+    descriptors = route(2000, 24)
+    whole = SpectralMapper(None, step=0.1, **settings)(descriptors)
+    request.getfixturevalue("in_blocks")
+    parts = SpectralMapper(None, step=0.1, **settings)(descriptors)
+    assert torch.equal(parts.mean, whole.mean)
+    differ = (parts.levels != whole.levels).sum()  # sums of floats in another order
+    assert differ <= 1e-3 * (whole.levels != 0).sum()
+    assert torch.allclose(held(parts), held(whole), atol=0.02)
+
+
+@pytest.mark.usefixtures("in_blocks")
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("budget", [0.7, 4.0])
+def test_in_blocks_the_route_is_within_the_budget(settings: dict[str, Any], budget: float) -> None:
+    descriptors = route(2000, 24)
+    learned = SpectralMapper(budget, **settings)(descriptors)
+    assert 0.98 * budget <= learned.summary().route_bytes / 2000 <= budget
+    error = (held(learned) - descriptors).square().mean()
+    assert error < (0.7 if budget < 1 else 0.1) * descriptors.var()
+
+
+@pytest.mark.usefixtures("in_blocks")
+def test_descriptors_may_be_halves_in_a_file(tmp_path: Path) -> None:
+    descriptors = route(900, 24).half()
+    descriptors.numpy().tofile(tmp_path / "d")
+    mapped = torch.from_numpy(np.memmap(tmp_path / "d", np.float16, "c", shape=(900, 24)))
+    learned, own = SpectralMapper(3.0)(mapped), SpectralMapper(3.0)(descriptors.float())
+    assert torch.equal(learned.levels, own.levels)
+    assert torch.equal(learned.steps, own.steps)
+
+
+@pytest.mark.usefixtures("in_blocks")
+def test_in_blocks_too_it_is_told_what_would_hold_half_of_the_route() -> None:
+    noise = torch.randn(900, 24)
+    learned = SpectralMapper(0.2)(noise)
+    assert learned.needed is not None
+    enough = SpectralMapper(learned.needed * 1.05)(noise)
+    assert 0.45 < 1 - float((held(enough) - noise).square().sum() / noise.square().sum()) < 0.6
+
+
+@pytest.mark.usefixtures("in_blocks")
+def test_in_blocks_what_is_alike_is_refused() -> None:
+    with refused("900", "alike"):
+        SpectralMapper()(torch.ones(900, 24))
+
+
+def test_lines_and_their_scale_are_those_of_each_chunk() -> None:
+    descriptors = route(300, 5)
+    lines = RouteLines(descriptors, [200, 100], "dft")
+    centred = descriptors - lines.mean.float()
+    assert torch.allclose(lines.lines[200:].square().sum(), centred[200:].square().sum())
+    assert math.isclose(lines.scale, float(centred.square().mean().sqrt()), rel_tol=1e-5)
+    fine, coarse = lines.steps
+    assert lines.held(fine) > 0.999
+    assert not any(small.any() for small, _ in lines.levels(coarse))
+
+
+@given(st.floats(0.2, 3), st.floats(1e-3, 0.9), st.floats(0, 5))
+def test_a_close_step_is_found_in_few_tries(power: float, share: float, end: float) -> None:
+    """Of costs that fall by a power, and to nothing at the end, as those of lines do."""
+    tried = []
+
+    def cost(step: float) -> int:
+        tried.append(step)
+        return round(1e9 * max(0.0, step**-power - 100**-power) ** (1 + end / 5))
+
+    room = share * cost(1)
+    step = _close_step(cost, room, 1, 100)
+    assert CLOSE * room <= cost(step) <= room
+    assert len(tried) < 2 * HALVINGS
+
+
+def test_no_step_is_finer_than_the_finest() -> None:
+    assert _close_step(lambda step: round(1e6 / step), 2e6, 1, 100) == 1
+
+
+class TestRoomInAFile:
+    def test_it_is_written_and_read(self) -> None:
+        spilled: Tensor = memory.empty(1000, 3, torch.device("cpu"), in_memory=0)
+        own = torch.randn(1000, 3)
+        spilled[:] = own
+        assert torch.equal(spilled, own)
+
+    def test_a_full_disk_is_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(os, "posix_fallocate", full)
+        with refused("1000 x 3", "No space left", "TMPDIR"):
+            memory.empty(1000, 3, torch.device("cpu"), in_memory=0)
+
+    def test_no_folder_for_it_is_told(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+        with refused("temporary file", "TMPDIR"):
+            memory.empty(1000, 3, torch.device("cpu"), in_memory=0)
