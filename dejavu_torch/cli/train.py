@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import shlex
 import warnings
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ import torch
 from jsonargparse import Namespace
 from lightning_fabric.plugins import CheckpointIO
 from lightning_fabric.utilities.exceptions import MisconfigurationException
+from lightning_fabric.utilities.rank_zero import _get_rank
 from pytorch_lightning import LightningModule, Trainer
 from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -166,9 +168,17 @@ class TrainCLI(LightningCLI):
             if (number and not least <= value <= most) or (value is None and name not in MAY_BE_NULL):
                 raise InputError(f"{name} is {value}; expected a number {expected}")
         counts = {name: chosen["trainer"][name] for name in ("devices", "num_nodes")}
-        if _several(counts["devices"]) or counts["num_nodes"] != 1:  # they would wait for each other forever
-            told = ", ".join(f"trainer.{name} is {value}" for name, value in counts.items())
-            raise InputError(f"a training runs on one device: {told:.99}; expected 1 of each")
+        strategy, told = (
+            chosen["trainer"]["strategy"],
+            ", ".join(f"trainer.{k} is {v}" for k, v in counts.items()),
+        )
+        if (_several(counts["devices"]) or counts["num_nodes"] != 1) and strategy not in ("auto", "ddp"):
+            raise InputError(f"{told:.99}, trainer.strategy is {strategy!s:.40}; expected 1 of each, or ddp")
+        if counts["num_nodes"] != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
+            raise InputError(  # they would wait for each other forever
+                f"{told:.99}, and nothing tells where the other machines are; expected MASTER_ADDR, "
+                "MASTER_PORT and NODE_RANK in the environment, as torchrun and SLURM set them"
+            )
 
     def _parse_ckpt_path(self) -> None:
         """Settings come from the config alone: Lightning would take some from the checkpoint, and import the
@@ -255,7 +265,7 @@ class TrainCLI(LightningCLI):
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, MapExport):
                     print_written(callback, self.datamodule, self.words)
-            last = self._last_checkpoint()
+            last = self._last_checkpoint() if self.trainer.is_global_zero else None
             if self.trainer.interrupted and last is not None and not refused:
                 print(f"to go on: {shlex.join(['dejavu', 'train', *self.words, '--ckpt_path', str(last)])}")
 
@@ -308,6 +318,8 @@ class TrainCLI(LightningCLI):
 
     def after_validate(self) -> None:
         """Say what the figures are of, and what to do next."""
+        if not self.trainer.is_global_zero:
+            return
         checkpoint = self.config_init[self.subcommand]["ckpt_path"]
         written = Path(self.trainer.default_root_dir) / self._written
         print(f"figures of {checkpoint}")
@@ -337,12 +349,17 @@ class ConfigFile(SaveConfigCallback):
 
     def __init__(self, parser: LightningArgumentParser, config: Any, **_: Any) -> None:
         super().__init__(parser, config, save_to_log_dir=False)
+        self.folder = Path()
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Where the figures lie is a question to all processes, of which one writes."""
+        self.folder = Path(trainer.log_dir or trainer.default_root_dir)
+        super().setup(trainer, pl_module, stage)
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Write it."""
-        folder = Path(trainer.log_dir or trainer.default_root_dir)
-        make_output_folder(folder)
-        with whole_file(folder / self.config_filename) as temporary:
+        make_output_folder(self.folder)
+        with whole_file(self.folder / self.config_filename) as temporary:
             # with what is null, as the fourth argument says, whose name changed
             self.parser.save(self.config, temporary, "yaml", False, overwrite=True, multifile=False)
 
@@ -413,6 +430,8 @@ def run_train(arguments: Sequence[str]) -> None:
     """
     for name in ("pytorch_lightning", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    if _get_rank():  # one process speaks for all
+        log.setLevel(logging.ERROR)
     for message in QUIET:
         warnings.filterwarnings("ignore", f".*{message}.*")
     try:
@@ -425,6 +444,10 @@ def run_train(arguments: Sequence[str]) -> None:
             seed_everything_default=0,
             save_config_callback=ConfigFile,
         )
+    except InputError:
+        if _get_rank():  # the first process says it
+            raise SystemExit(2) from None
+        raise
     except RuntimeError as error:
         if "Early stopping conditioned" not in str(error):
             raise

@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.files import LARGEST
@@ -66,23 +66,51 @@ class StoredFrames(Dataset[Batch]):
         return Batch(as_frames(chosen), GroundTruth(*(part[index] for part in self.truth)))
 
 
-class Clips(Sampler[list[int]]):
+class InOrder(DistributedSampler[list[int]]):
+    """All frames once, in batches; of several processes each takes a stretch, and none is repeated.
+
+    Args:
+        count: frames. process: this one's number, of so many `processes`.
+    """
+
+    def __init__(self, count: int, batch_size: int, process: int = 0, processes: int = 1) -> None:
+        super().__init__(cast(Any, range(count)), processes, process, shuffle=False)
+        own = torch.arange(count).tensor_split(processes)[process]
+        self.batches = [part.tolist() for part in own.split(batch_size)]
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return iter(self.batches)
+
+
+class Clips(DistributedSampler[list[int]]):
     """Each frame about once an epoch, in clips of consecutive frames from all over the route.
 
     Args:
         lengths: frames of each traverse; no clip crosses from one to the next.
         batch_size: frames of a batch. clip: frames of a clip; a last clip that is shorter is left out.
+        process: this one's number, of so many `processes`, each of which takes its part of a batch.
     """
 
-    def __init__(self, lengths: list[int], batch_size: int, clip: int) -> None:
+    def __init__(
+        self, lengths: list[int], batch_size: int, clip: int, process: int = 0, processes: int = 1
+    ) -> None:
+        super().__init__(cast(Any, range(sum(lengths))), processes, process)  # which Lightning leaves alone
         self.lengths, self.clip = lengths, clip
         self.drawn_at: Tensor | None = None  # the state of the random numbers ahead of the present order
         self.drawn_to: Tensor | None = None  # and behind it
         self.replayed: tuple[Tensor, int] | None = None  # such a state, and batches of it that are done
-        self.clips = min(batch_size // clip, sum(length // clip for length in lengths))
+        every = sum(length // clip for length in lengths)
+        self.clips = min(batch_size // clip, every) // processes  # of a process's part of a batch
+        if not self.clips:
+            raise InputError(
+                f"there are {every} clips of {clip} frames and {processes} processes; expected one for each"
+            )
 
     def __len__(self) -> int:
-        return sum(length // self.clip for length in self.lengths) // self.clips
+        return sum(length // self.clip for length in self.lengths) // (self.clips * self.num_replicas)
 
     def __iter__(self) -> Iterator[list[int]]:
         if self.replayed is None:
@@ -105,8 +133,8 @@ class Clips(Sampler[list[int]]):
         order = torch.cat(starts)
         order = order[torch.randperm(len(order))]
         frames = order[:, None] + torch.arange(self.clip)
-        batches = frames.split(self.clips)[: len(self)]  # an incomplete one is left out
-        return [batch.flatten().tolist() for batch in batches]
+        batches = frames.split(self.clips * self.num_replicas)[: len(self)]  # an incomplete one is left out
+        return [batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches]
 
 
 class RouteData(LightningDataModule):
@@ -343,16 +371,26 @@ class RouteData(LightningDataModule):
             )
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Frames of the reference and of the second traverse, as they are stored."""
+        """Frames of the reference and of the second traverse, as they are stored; this process's part."""
+        loader = self.training_batches(*self._processes)
+        cast(Clips, loader.sampler).replayed, self.replayed = self.replayed, None
+        return loader
+
+    @property
+    def _processes(self) -> tuple[int, int]:
+        """The number of this process in the training, and how many there are."""
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+
+    def training_batches(self, process: int = 0, processes: int = 1) -> DataLoader[Batch]:
+        """Batches of all processes of the training; their parts for one of so many."""
         sets = [self.sets[name] for name in ("reference", "second") if name in self.sets]
         parts = [part for one in sets for part in one.parts]
         lengths = [len(part) for part in parts]
         if max(lengths) < self.clip:
             raise InputError(f"clip is {self.clip} and the route has {max(lengths)} frames; expected fewer")
         frames = StoredFrames(parts, _joined([one.truth.positives for one in sets]))
-        clips = Clips(lengths, self.batch_size, self.clip)
-        clips.replayed, self.replayed = self.replayed, None
-        return _loader(frames, clips)
+        batch_size = self.batch_size * self._processes[1]
+        return _loader(frames, Clips(lengths, batch_size, self.clip, process, processes))
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """The validation traverse, or the reference."""
@@ -363,12 +401,12 @@ class RouteData(LightningDataModule):
         return self._in_order("query")
 
     def _in_order(self, name: str) -> DataLoader[Batch]:
-        frames = torch.arange(len(self.sets[name])).split(self.batch_size)
-        return _loader(self.sets[name], [part.tolist() for part in frames])
+        frames = self.sets[name]
+        return _loader(frames, InOrder(len(frames), self.batch_size, *self._processes))
 
     def augmented(self, frames: Tensor, clip: int) -> Tensor:
         """Frames (B,C,H,W), clip after clip, as on another day; features (B,D) as they are."""
-        if frames.ndim != 4:
+        if frames.ndim != 4 or not self.augmentation.acts:
             return frames
         self.augmentation.train()
         with torch.autocast(frames.device.type, enabled=False):

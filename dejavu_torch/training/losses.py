@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.database.template_map import TemplateMap, weight_per_feature
+from dejavu_torch.training.processes import mean_of_all
 from dejavu_torch.types import InputError, Plan
 
 
@@ -64,7 +65,7 @@ def place_cross_entropy(
     steps.scatter_add_(1, (places - tolerance).clamp(min=0), known)
     steps.scatter_add_(1, (places + tolerance + 1).clamp(max=n), -known)
     surprise = _surprise(scores, steps.cumsum(1)[:, :n] > 0, temperature)
-    return PlaceLoss(surprise.sum() / max(1, len(surprise)), queries - len(surprise))
+    return PlaceLoss(mean_of_all(surprise), queries - len(surprise))
 
 
 def phase_cross_entropy(
@@ -102,8 +103,7 @@ def phase_cross_entropy(
         hits = torch.zeros(block.shape, dtype=torch.int32, device=block.device)
         hits.scatter_add_(1, layer.phase(places), covered.int())
         surprise.append(_surprise(block, hits > 0, temperature))
-    every = torch.cat(surprise)
-    return every.sum() / max(1, len(every))
+    return mean_of_all(torch.cat(surprise))
 
 
 def laplace_bits(levels: Tensor, widths: Tensor) -> Tensor:

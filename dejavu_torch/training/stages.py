@@ -16,6 +16,7 @@ from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.text import one_line
 from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames
 from dejavu_torch.training.losses import Losses, place_cross_entropy
+from dejavu_torch.training.processes import noise_like, own_part, own_random
 from dejavu_torch.training.rate import STEP, bands_of, coded_proxies
 from dejavu_torch.types import InputError
 
@@ -125,9 +126,10 @@ class DescriptorStage(Stage):
 
     def losses_to(self, proxies: Tensor, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         """The losses of a batch, to proxies (W,K)."""
-        frames = task.data.augmented(batch.frames, task.data.clip)
-        descriptors = to_length(descriptor_of(task)(frames).float())
-        noisy = descriptors + NOISE * torch.randn_like(descriptors)
+        with own_random(task.global_step):
+            frames = task.data.augmented(batch.frames, task.data.clip)
+            descriptors = to_length(descriptor_of(task)(frames).float())
+        noisy = descriptors + NOISE * noise_like(descriptors)
         distances = phase_distances(noisy, proxies, "cosine")
         distances = nn.functional.pad(distances, (0, 1), value=math.inf)  # between two routes
         scores, temperature = distances.index_select(1, self.stretch), self.log_temperature.exp()
@@ -209,12 +211,15 @@ class CodeStage(Stage):
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         if task.views is None:
-            frames, positives = task.data.augmented(batch.frames, task.data.clip), batch.truth.positives
-            features = features_of(frames, task.dejavu.describe, "the batch")
+            positives = batch.truth.positives
+            with own_random(task.global_step):
+                frames = task.data.augmented(batch.frames, task.data.clip)
+                features = features_of(frames, task.dejavu.describe, "the batch")
         else:
             n, device = len(task.views.descriptors), task.views.descriptors.device
-            drawn = torch.randint(n, (BATCH,), device=device)
-            features = embedding_of(task).code(task.views.descriptors[drawn])
+            drawn = own_part(torch.randint(n, (BATCH,), device=device))
+            with own_random(task.global_step):
+                features = embedding_of(task).code(task.views.descriptors[drawn])
             positives = task.views.positives[drawn]
         distances = task.route.distances(features)
         temperature, tolerance = task.log_temperature.exp(), task.data.tolerance
@@ -301,7 +306,7 @@ def views_of(task: PlaceRecognitionTask, rounds: int, most: int) -> Iterator[Vie
         rounds: times that each frame is shown. most: views in all, but for one of each frame.
     """
     data, describe = task.data, descriptor_of(task)
-    loader = data.train_dataloader()
+    loader = data.training_batches()
     rounds = min(rounds, most // len(cast(StoredFrames, loader.dataset))) if data.augmentation.acts else 1
     with in_mode(task.dejavu.features, False):
         for _ in range(max(1, rounds)):

@@ -39,6 +39,7 @@ from dejavu_torch.training.checkpoint import (
 from dejavu_torch.training.datamodule import Batch, Clips, RouteData
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
+from dejavu_torch.training.processes import average_gradients, averaged, share, shared_statistics
 from dejavu_torch.training.stages import (
     CodeStage,
     RateStage,
@@ -237,6 +238,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         """
         if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             self.trainer.strategy.checkpoint_io = CheckpointFiles()
+        share(self, self.trainer)
         reference = self.data.sets["reference"]
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
@@ -409,17 +411,32 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
-        total, parts, left_out = self.stage.losses(self, batch)
-        if not total.isfinite():
-            seen = ", ".join(f"{name} {float(part.detach()):g}" for name, part in parts.items())
+        with shared_statistics(self.dejavu.features):
+            total, parts, left_out = self.stage.losses(self, batch)
+        figures = averaged(torch.stack([total, *parts.values()]).detach())
+        parts = dict(zip(parts, figures[1:], strict=True))
+        if not figures[0].isfinite():
+            seen = ", ".join(f"{name} {float(part):g}" for name, part in parts.items())
             raise InputError(
-                f"the loss is {float(total.detach())} at step {self.global_step} ({seen}); expected a finite "
+                f"the loss is {float(figures[0])} at step {self.global_step} ({seen}); expected a finite "
                 "number: try a lower lr, or 32-bit precision"
             )
-        self.log_dict({f"train/{name}": part.detach() for name, part in parts.items()})
-        self.log("train/left_out", float(left_out), reduce_fx="sum", on_step=False, on_epoch=True)
-        self.log("train/loss", total.detach(), prog_bar=True)
+        self.log_dict({f"train/{name}": part for name, part in parts.items()})
+        self.log(
+            "train/left_out",
+            float(left_out),
+            reduce_fx="sum",
+            on_step=False,
+            on_epoch=True,
+            sync_dist=self.trainer.world_size > 1,
+        )
+        self.log("train/loss", figures[0], prog_bar=True)
         return total
+
+    def on_after_backward(self) -> None:
+        """The gradients of all processes, ahead of their scaling and clipping."""
+        for optimizer in self.trainer.optimizers:
+            average_gradients(p for group in optimizer.param_groups for p in group["params"])
 
     def train(self, mode: bool = True) -> PlaceRecognitionTask:
         """As nn.Module's, but what is frozen keeps its running statistics."""
@@ -463,7 +480,8 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.metric.reset()
             stage = "test" if self.trainer.testing else "val"
             suffix = "" if self.trainer.testing or "validation" in self.data.sets else "_augmented"
-            self.log_dict({f"{stage}/{name}{suffix}": value.float() for name, value in figures.items()})
+            named = {f"{stage}/{name}{suffix}": value.float() for name, value in figures.items()}
+            self.log_dict(named, sync_dist=self.trainer.world_size > 1)
 
     on_test_epoch_start, test_step = on_validation_epoch_start, validation_step
     on_test_epoch_end = on_validation_epoch_end

@@ -65,14 +65,21 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
         ),
         ("fit", ["--trainer.max_steps", "-2"], ["trainer.max_steps is -2", "-1 for no end"]),
         *(
-            (command, ["--trainer.devices", "2"], ["runs on one device", "devices is 2"])
-            for command in ("fit", "export")
+            (
+                command,
+                ["--trainer.devices", devices, "--trainer.strategy", "fsdp"],
+                [f"devices is {devices}", "strategy is fsdp", "or ddp"],
+            )
+            for command, devices in (
+                ("fit", "2"),
+                ("export", "2"),
+                ("fit", "[0, 1]"),
+                ("fit", "0,1"),
+                ("fit", "-1"),
+            )
         ),
-        ("fit", ["--trainer.devices", "[0,1]"], ["runs on one device", "devices is [0, 1]"]),
-        ("fit", ["--trainer.devices", "0,1"], ["runs on one device", "devices is 0,1"]),
-        ("fit", ["--trainer.devices", "-1"], ["runs on one device", "devices is -1"]),
         ("fit", ["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
-        ("fit", ["--trainer.num_nodes", "2"], ["runs on one device", "num_nodes is 2"]),
+        ("fit", ["--trainer.num_nodes", "2"], ["num_nodes is 2", "MASTER_ADDR"]),
         ("fit", ["--model.backbone", "mine.Hungry"], ["not enough memory: it ran out"]),
         ("fit", ["--seed_everything", str(2**63)], ["seed_everything", "expected whole numbers of at most"]),
         ("fit", ["--data.batch_size", str(2**63)], ["data.batch_size", "expected whole numbers of at most"]),
