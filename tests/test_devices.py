@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from contextlib import nullcontext
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
@@ -12,17 +14,22 @@ from torch import Tensor
 
 from dejavu_torch import (
     DejaVu,
+    FrequencyLayer,
     ImposedPeriods,
     LiveLocalizer,
     PlaceFilter,
     Preprocess,
     SequenceMatcher,
     SpectralMapper,
+    SpectrogramAnalysis,
+    TemplateMap,
     TemplateMapper,
     Whitening,
     open_source,
 )
 from dejavu_torch.cli.device import device_of
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.database.place_map import Mapper
 from dejavu_torch.recognition.candidates import best_candidates
 from dejavu_torch.types import SequenceModel
 
@@ -62,31 +69,105 @@ def test_a_frame_stays_on_its_device(kind: str, frames: Tensor, monkeypatch: pyt
         torch.zeros(1) + scores[0, :1]
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+# on the CPU as well, so that the tests themselves run everywhere
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+GPU = pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])
+DEVICES = ["cpu", GPU]
+
+
+@pytest.fixture(autouse=True)
+def whole_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Convolutions of a GPU have 10 bits of each number unless they are told otherwise."""
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+
+
+LEARNED: dict[str, Mapper] = {
+    "templates": TemplateMapper(ImposedPeriods([3, 4, 5], bin=4)),
+    "found": TemplateMapper(SpectrogramAnalysis(window=30, strongest=2), reduction="sum", temperature=3.0),
+    "spectral": SpectralMapper(None, step=1e-4),  # so fine that what rounding moves by a step is not seen
+    "chunks": SpectralMapper(None, step=1e-4, chunk=16, transform="dct", metric="l2"),
+}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("kind", LEARNED)
+def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str, frames: Tensor) -> None:
+    maps = [DejaVu(whitening="none", mapper=LEARNED[kind]).to(one).learn(frames) for one in ("cpu", device)]
+    query = frames[3:40:4] * 0.9 + 0.02
+    scores, found = (model(query.to(model.map.positions.device)) for model in maps)
+    assert found.device.type == device
+    torch.testing.assert_close(found.cpu(), scores, rtol=1e-4, atol=1e-4)
+    matches = [model.localize(query) for model in maps]
+    torch.testing.assert_close(matches[1].score, matches[0].score, rtol=1e-4, atol=1e-4)
+    assert matches[0].index.tolist() == matches[1].index.tolist()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Tensor) -> None:
+    whitening = Whitening(numbers=8, views=2, bits=16)
+    models = [DejaVu(whitening=copy.deepcopy(whitening)).to(one).learn(frames) for one in ("cpu", device)]
+    known = [model.whitened(model.describe(frames.to(model.map.positions.device))).cpu() for model in models]
+    # up to the signs of its numbers, and what 16 bits round
+    torch.testing.assert_close(known[1] @ known[1].T, known[0] @ known[0].T, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, frames: Tensor) -> None:
+    traverse = ArrayTraverse(frames)
+    models = [DejaVu(whitening="none", mapper=LEARNED["spectral"]).to(one) for one in ("cpu", device)]
+    for model in models:
+        model.learn(traverse).calibrate(traverse)
+    expected, found = (model.calibration for model in models)
+    assert expected is not None
+    assert found is not None
+    assert expected.single is not None
+    for one, other in zip(expected, found, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            assert tuple(other) == pytest.approx(tuple(one), rel=1e-2)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_layers_are_searched_on_a_gpu(device: str) -> None:
+    plan = tuple(FrequencyLayer(Fraction(p), p, 5, 60_000, (j,)) for j, p in enumerate((210, 286)))
+    generator = torch.Generator().manual_seed(0)
+    blocks = [torch.rand(layer.phases, 1, generator=generator) for layer in plan]
+    queries = torch.rand(4, 2, generator=generator).to(device)
+    route = TemplateMap(plan, blocks, 60_000, 2).to(device)
+    found = route.lowest(queries)
+    assert found is not None
+    score, place = found
+    assert place.device.type == device
+    assert torch.equal(score, route.scores(queries).amin(1))
+    assert torch.equal(route.scores(queries).gather(1, place[:, None])[:, 0], score)
+
+
+@pytest.mark.parametrize("device", [GPU])
 @pytest.mark.parametrize("sequence", SEQUENCES)
 @pytest.mark.parametrize("kind", models())
-def test_a_gpu_finds_what_the_cpu_finds(kind: str, sequence: SequenceModel | None, frames: Tensor) -> None:
+def test_a_gpu_finds_what_the_cpu_finds(
+    kind: str, sequence: SequenceModel | None, device: str, frames: Tensor
+) -> None:
     here = models()[kind].learn(frames)
-    there = models()[kind].to("cuda").learn(frames)
+    there = models()[kind].to(device).learn(frames)
     assert {tensor.device.type for tensor in there.state_dict().values() if isinstance(tensor, Tensor)} == {
-        "cuda"
+        device
     }
     expected = here.localize(frames, sequence=sequence)
     there.load_state_dict(here.state_dict())  # learned alike but for rounding
     match = there.localize(frames, sequence=sequence)
     assert match.score.device.type == "cpu"
-    torch.testing.assert_close(match.score, expected.score, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(match.score, expected.score, rtol=1e-4, atol=1e-4)
     localizer = LiveLocalizer(there, sequence)
     found = [localizer(frame).score for frame in frames]
-    assert found == pytest.approx(expected.score.tolist(), rel=1e-3, abs=1e-4)
+    assert found == pytest.approx(expected.score.tolist(), rel=1e-4, abs=1e-4)
     assert localizer.scores is not None
-    assert localizer.scores.is_cuda
+    assert localizer.scores.device.type == device
 
 
 @pytest.mark.gpu
 @pytest.mark.slow
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@CUDA
 def test_commands_run_on_a_gpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, query = "sim:aerial?frames=200", "sim:aerial?frames=200&traverse=1"
     run("learn", source, "--map", tmp_path / "map.safetensors", "--device", "cuda")

@@ -200,7 +200,7 @@ def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = Fal
                 index = best_match(found).index
                 right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & is_there
                 there = torch.full_like(right, is_there)
-                kinds[kind].append((evidence[known].cpu(), right[known].cpu(), there[known].cpu()))
+                kinds[kind].append((evidence.cpu()[known.cpu()], right[known].cpu(), there[known].cpu()))
     if not kinds["single"]:
         raise InputError("there are no queries to calibrate by; expected some")
     platts: list[Platt | None] = []

@@ -90,11 +90,9 @@ def own_part(values: Tensor) -> Tensor:
 
 
 def noise_like(values: Tensor) -> Tensor:
-    """Normal noise on the rows of this process, drawn for those of all."""
-    if processes() == 1:
-        return torch.randn_like(values)
+    """Normal noise on the rows of this process, drawn for those of all, of the CPU's random numbers."""
     shape = (processes() * len(values), *values.shape[1:])
-    return own_part(torch.randn(shape, dtype=values.dtype, device=values.device))
+    return own_part(torch.randn(shape, dtype=values.dtype)).to(values.device)
 
 
 @contextmanager

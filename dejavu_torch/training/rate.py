@@ -78,6 +78,6 @@ def coded_proxies(
         raise InputError(f"the widths are {tuple(log_widths.shape)}; expected ({expected},)")
     wanted = lines / lines.square().mean().clamp(min=LEAST).sqrt() / log_step.exp()
     levels = wanted + (quantise(wanted.detach(), 1.0) - wanted).detach()
-    noisy = wanted + torch.rand_like(wanted) - 0.5 if noise else wanted
+    noisy = wanted + torch.rand(wanted.shape, dtype=wanted.dtype).to(wanted) - 0.5 if noise else wanted
     widths = log_widths.exp().unflatten(0, (-1, lines.shape[1]))[band]
     return Coded(from_spectrum(levels.T, transform).T, laplace_bits(noisy, widths).sum())

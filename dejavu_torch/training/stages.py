@@ -113,7 +113,7 @@ class DescriptorStage(Stage):
 
     def make(self, stretches: int, dimension: int, task: PlaceRecognitionTask) -> None:
         """Proxies to start from."""
-        self.proxies = nn.Parameter(torch.randn(stretches, dimension, device=task.device))
+        self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
 
     def end(self, task: PlaceRecognitionTask) -> None:
         self.proxies = nn.Parameter(self.proxies.detach()[:0])  # no later checkpoint needs them
@@ -162,7 +162,7 @@ class RateStage(DescriptorStage):
 
     def make(self, stretches: int, dimension: int, task: PlaceRecognitionTask) -> None:
         bands = int(bands_of(stretches, _transform(task)).max()) + 1
-        self.proxies = nn.Parameter(torch.randn(stretches, dimension, device=task.device))
+        self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
         self.log_widths = nn.Parameter(torch.zeros(bands * dimension, device=task.device))
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
@@ -217,7 +217,7 @@ class CodeStage(Stage):
                 features = features_of(frames, task.dejavu.describe, "the batch")
         else:
             n, device = len(task.views.descriptors), task.views.descriptors.device
-            drawn = own_part(torch.randint(n, (BATCH,), device=device))
+            drawn = own_part(torch.randint(n, (BATCH,))).to(device)
             with own_random(task.global_step):
                 features = embedding_of(task).code(task.views.descriptors[drawn])
             positives = task.views.positives[drawn]
