@@ -27,6 +27,7 @@ from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
 from dejavu_torch.database.schema import checked, checked_fields
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.database.spectrum import Transform
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.database.weights import BITS, is_rounded, packed, round_weights, unpacked
@@ -272,6 +273,13 @@ class DejaVu(nn.Module):
         route.needed = fit.needed
         self._say_reached(route, taken)
         return self._take(route, traverse, names, positions)
+
+    def coder(
+        self, frames: int, chunk: int, mean: Tensor, step: float, transform: Transform, resolution: float
+    ) -> ChunkCoder:
+        """What makes chunks of so many frames that are described as the model does; see its arguments."""
+        makers = self.pipeline, self.whitening, self._at_once
+        return ChunkCoder(*makers, frames, chunk, mean, step, transform, resolution)
 
     def _fit(
         self,

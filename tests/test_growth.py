@@ -14,7 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch import HOG, DejaVu, PlaceFilter, Preprocess, SequenceMatcher, SpectralMapper, growth
+from dejavu_torch import (
+    HOG,
+    DejaVu,
+    PlaceFilter,
+    Preprocess,
+    SequenceMatcher,
+    SpectralMapper,
+    growth,
+    open_source,
+)
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.database.mapfile import read_map, write_map
@@ -199,6 +208,26 @@ def test_only_a_chunk_of_descriptors_is_held(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(coder, "code_chunk", lambda part, *rest: sizes.append(len(part)) or code(part, *rest))
     append(model, walk(1000, seed=2))
     assert sizes == [*[64] * 15, 40]
+
+
+def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("dejavu_torch.streaming.sample.SAMPLE", 60)
+    route = open_source("sim:aerial?frames=130")
+    mapper = SpectralMapper(5.0, chunk=40)
+    whole = DejaVu(whitening=Whitening(views=1), mapper=mapper, batch_size=16).learn(route)
+    whole.save(tmp_path / "whole")
+    part = DejaVu.load(tmp_path / "whole")
+    one = spectral(part)
+    part.map = SpectralMap.of_chunks(one.coded()[:2], one.mean, **one.settings())
+    sizes = []
+    code = coder.code_chunk
+    monkeypatch.setattr(coder, "code_chunk", lambda rows, *rest: sizes.append(len(rows)) or code(rows, *rest))
+    append(part, open_source("sim:aerial?frames=130&start=80"))
+    assert sizes == [40, 10]  # a chunk of descriptors at a time
+    part.save(tmp_path / "part")
+    assert (tmp_path / "part").read_bytes() == (tmp_path / "whole").read_bytes()
 
 
 # what is refused leaves the map as it was
