@@ -27,7 +27,6 @@ from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
 from dejavu_torch.database.schema import checked, checked_fields
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
-from dejavu_torch.database.spectrum import Transform
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.database.weights import BITS, is_rounded, packed, round_weights, unpacked
@@ -273,13 +272,6 @@ class DejaVu(nn.Module):
         route.needed = fit.needed
         self._say_reached(route, taken)
         return self._take(route, traverse, names, positions)
-
-    def coder(
-        self, frames: int, chunk: int, mean: Tensor, step: float, transform: Transform, resolution: float
-    ) -> ChunkCoder:
-        """What makes chunks of so many frames that are described as the model does; see its arguments."""
-        makers = self.pipeline, self.whitening, self._at_once
-        return ChunkCoder(*makers, frames, chunk, mean, step, transform, resolution)
 
     def _fit(
         self,
@@ -529,7 +521,10 @@ class DejaVu(nn.Module):
         return self
 
     def calibrate(
-        self, reference: Traverse | Tensor | None, views: Views | None = None, start: int = 0
+        self,
+        reference: Traverse | Tensor | None,
+        views: Views | None = None,
+        places: Tensor | None = None,
     ) -> DejaVu:
         """Find out how probably answers are right that stand out so much; `Match.probability` then tells it.
 
@@ -539,7 +534,8 @@ class DejaVu(nn.Module):
                 whitening, which has seen the plain ones.
             views: frames of another traverse of the same places instead, which tell of its own changes;
                 those that show no place are left out.
-            start: the place that the reference's first frame is, as where it was appended to a map.
+            places: (n,) int64, which place each frame of the reference shows, -1 for none, as where it was
+                appended to other places; None is frame i at place i.
 
         Returns:
             self, with `self.calibration`.
@@ -561,8 +557,9 @@ class DejaVu(nn.Module):
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
-            stretches = Stretches(as_traverse(reference), self.map.places - start, strengths)
-            views, length = Views(stretches, start + stretches.places), stretches.stretch
+            places = torch.arange(self.map.places) if places is None else places
+            stretches = Stretches(as_traverse(reference), len(places), strengths)
+            views, length = Views(stretches, places[stretches.places]), stretches.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
         name = views.traverse.name
@@ -580,14 +577,16 @@ class DejaVu(nn.Module):
             raise InputError(f"calibrating by {name}: {error}") from error
         return self
 
-    def calibrate_if_possible(self, reference: Traverse, views: Views | None = None, start: int = 0) -> None:
+    def calibrate_if_possible(
+        self, reference: Traverse, views: Views | None = None, places: Tensor | None = None
+    ) -> None:
         """As `calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
         reference."""
         if views is not None:
             self.calibrate(reference, views)
         elif self.calibration is None and len(reference.frame_shape) == 3 and self.map.summary().covered:
             try:
-                self.calibrate(reference, start=start)
+                self.calibrate(reference, places=places)
             except InputError as error:
                 log.warning("the map is not calibrated: %s", error)
 

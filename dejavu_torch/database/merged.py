@@ -82,6 +82,8 @@ class MergedMap(PlaceMap):
         ]
         if moved:
             self.positions = torch.cat(moved)
+        if self.parts:
+            self.count_visits(torch.cat([part.visit_counts for part in self._parts]))
 
     @property
     def _parts(self) -> list[SpectralMap]:
