@@ -1,4 +1,4 @@
-"""Maps that grow: places appended behind those that there are, and maps of several routes merged."""
+"""Maps that grow: places appended, further visits averaged in, and maps of several routes merged."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.names import names_of
 from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.database.mapfile import digests
 from dejavu_torch.database.merged import MergedMap, MergedMapper
 from dejavu_torch.database.recipe import difference, recipe_of
-from dejavu_torch.database.spectral import CodedChunk, SpectralMap
+from dejavu_torch.database.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.features.extract import feature_batches
-from dejavu_torch.model import REGISTRY, DejaVu
+from dejavu_torch.features.views import Views
+from dejavu_torch.model import REGISTRY, DejaVu, check_sizes
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.streaming.coder import Made, code_here
 from dejavu_torch.streaming.work import WorkFolder, all_chunks
@@ -37,11 +39,12 @@ def append(
     progress: bool = False,
     work: Path | None = None,
     make: Callable[..., Made] = code_here,
+    visits: Views | None = None,
 ) -> DejaVu:
     """Add the places of a traverse behind those of a model's map, which stay as they are.
 
     Whitening, mean and step of the lines stay; the new places are coded in chunks of their own. Nothing is
-    forgotten but the calibration, which is of fewer places: see `DejaVu.calibrate` and its `start`.
+    forgotten but the calibration, which is of fewer places: see `DejaVu.calibrate` and its `places`.
 
     Args:
         model: its map is spectral, learned with a `chunk` of so many places.
@@ -49,6 +52,8 @@ def append(
             the ground it is resampled likewise, and its first frame is the next place.
         progress: show a progress bar on a terminal.
         work, make: as of `DejaVu.learn`.
+        visits: frames of another traverse of its places, averaged in ahead of the coding, see `learn_mean`;
+            `work` and `make` then play no part.
 
     Returns:
         The model. What is refused leaves it as it was.
@@ -70,17 +75,24 @@ def append(
     route = growing(model)
     added = model.resample(as_traverse(traverse), model.step, progress)
     _check_alike(model, added)
-    before = route.coded()
-    places = added.count()
+    before, places = route.coded(), added.count()
     frames = len(added.positions) if isinstance(added, ResampledTraverse) else places
     _check_count(route.places + places, model.step is not None)
-    coder = model.chunk_coder(places, route, route.mean, before[-1].step)
-    folder = None
-    if work is not None:
-        sums = [part.stream.checksum for part in before]
-        folder = WorkFolder(work, model.run_key(added, places) | digests(map=sums))
-    chunks = all_chunks(coder, added, folder, make, "learning" if progress else None)
+    text, counts = "learning" if progress else None, torch.ones(places, dtype=torch.int64)
+    if visits is None:
+        coder = model.chunk_coder(places, route, route.mean, before[-1].step)
+        folder = None
+        if work is not None:
+            sums = [part.stream.checksum for part in before]
+            folder = WorkFolder(work, model.run_key(added, places) | digests(map=sums))
+        chunks = all_chunks(coder, added, folder, make, text)
+    else:
+        _check_alike(model, visits.traverse)
+        means, counts = _mean(model, model.extract_all(added, text).float(), counts, visits, progress)
+        coding = route.mean, before[-1].step, route.transform, route.resolution
+        chunks = [code_chunk(part, *coding) for part in means.split(int(route.chunk))]
     grown = with_chunks(route, [*before, *chunks])
+    grown.count_visits(torch.cat([route.visit_counts, counts.to(route.visits.device)]))
     if isinstance(added, ResampledTraverse):
         behind = positions_behind(added.positions, route.places).to(route.positions.device)
         grown.positions = torch.cat([route.positions, behind])
@@ -91,6 +103,167 @@ def append(
     )
     model.map, model.frame_names, model.calibration = grown, names, None
     return model
+
+
+def learn_mean(
+    model: DejaVu,
+    traverse: Traverse | Tensor,
+    visits: Views,
+    progress: bool = False,
+    second: Views | None = None,
+) -> DejaVu:
+    """As `DejaVu.learn`, of the mean of several visits to each place: what changes between them cancels out.
+
+    Args:
+        visits: frames of another traverse and the places that they show, as `DejaVu.places_shown` finds them.
+            A place that k of them show is the mean of k + 1 descriptors.
+        traverse, progress, second: as of `DejaVu.learn`. Whitening learns from these, not from `visits`.
+
+    Returns:
+        The model; `map.visit_counts` says how many visits each place is the mean of.
+
+    Raises:
+        InputError: as `DejaVu.learn`, a mapper of templates, which are means already, or visits that do not
+            fit.
+
+    Example:
+        >>> wave = torch.sin(torch.arange(200.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
+        >>> again = Views(as_traverse(wave[50:] + 0.1), torch.arange(50, 200))
+        >>> learn_mean(DejaVu(whitening="none"), wave, again).map.visits
+        tensor([[ 50,   1],
+                [150,   2]], dtype=torch.int32)
+    """
+    if not isinstance(model.mapper, SpectralMapper):
+        seen = f"{type(model.mapper).__name__} makes templates, which are means of many places already"
+        raise InputError(f"{seen}; expected a SpectralMapper to average visits for")
+    reference = model.resample(as_traverse(traverse), progress=progress)
+    check_sizes(model, reference, visits.traverse)
+    before = None if model.whitening is None else model.whitening.state_dict()
+    try:
+        text = "learning" if progress else None
+        descriptors = model.describe_reference(reference, second, text).float()
+        once = torch.ones(len(descriptors), dtype=torch.int64)
+        means, counts = _mean(model, descriptors, once, visits, progress)
+        model.learn_features(means, reference)
+    except InputError:  # the map that there was is of its own whitening
+        if model.whitening is not None and before is not None:
+            model.whitening.load_state_dict(before)
+        raise
+    model.map.count_visits(counts)
+    return model
+
+
+@torch.no_grad()
+def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
+    """Average another visit into a map that is there: decoded, averaged and coded again at the same step.
+
+    A chunk that no frame shows stays as it is. What the coding left out is not there to be averaged: where
+    the traverses are at hand, `learn_mean` of them makes a better map.
+
+    Args:
+        model: its map is spectral. visits: as `shown_on_map` finds them. progress: show a progress bar on a
+            terminal.
+
+    Returns:
+        How many places are the mean of more visits than before. The calibration is gone: it was of another
+        map.
+
+    Raises:
+        InputError: no spectral map of one route, or visits that do not fit.
+    """
+    route = one_route(model)
+    _check_alike(model, visits.traverse)
+    described = _described(model, visits, route.dimension, route.places, progress)
+    before, chunks, counts = route.coded(), [], route.visit_counts.cpu()
+    seen = torch.zeros_like(counts)
+    for g, (start, stop) in enumerate(route.chunks):
+        inside = ((visits.places >= start) & (visits.places < stop)).nonzero()[:, 0]
+        if not len(inside):
+            chunks.append(before[g])
+            continue
+        places = visits.places[inside] - start
+        rows = described[inside].to(route.mean.device)
+        means = _with_visits(route.rebuilt(g), counts[start:stop], rows, places)
+        seen[start:stop] += places.bincount(minlength=stop - start)
+        coding = route.mean, before[g].step, route.transform, route.resolution
+        chunks.append(code_chunk(means, *coding))
+    made = with_chunks(route, chunks)
+    made.positions = route.positions
+    made.count_visits((counts + seen).to(route.visits.device))
+    made.check()
+    model.map, model.calibration = made, None
+    return int((seen > 0).sum())
+
+
+def shown_on_map(model: DejaVu, traverse: Traverse, truth: str | None = None) -> Views:
+    """As `DejaVu.places_shown`, of a map whose reference is not at hand.
+
+    Args:
+        truth: None is frame i at place i, where there are as many and places are frames.
+
+    Raises:
+        InputError: nothing says which places the frames show, or they show none.
+    """
+    route = one_route(model)
+    traverse = model.resample(traverse, model.step)
+    frames, shown = len(route.positions) or route.places, traverse.count()
+    resampled = model.step is not None
+    numbers = traverse.frame if isinstance(traverse, ResampledTraverse) else shown
+    if truth is not None:
+        found = find_ground_truth(truth, None, source_of(traverse), frames, numbers, False, resampled)
+        assert found is not None
+        places = route.place_of(found.positives[:, 0])
+        if not (places >= 0).any():
+            raise InputError(f"no frame of {traverse.name} shows a place of the map; expected some")
+        return Views(traverse, places)
+    if resampled or frames != shown:
+        seen = f"{traverse.name} has {shown} frames and the map {frames}{' at even steps' * resampled}"
+        raise InputError(
+            f"{seen}; expected as many, frame i being place i, or a truth that says what they show"
+        )
+    return Views(traverse, torch.arange(shown))
+
+
+def _mean(
+    model: DejaVu, descriptors: Tensor, counts: Tensor, visits: Views, progress: bool
+) -> tuple[Tensor, Tensor]:
+    """Descriptors (N,K) averaged with those of visits, and of how many each then is the mean."""
+    places, dimension = descriptors.shape
+    shown = visits.places >= 0
+    rows = _described(model, visits, dimension, places, progress)[shown].to(descriptors.device)
+    at = visits.places[shown]
+    return _with_visits(descriptors, counts, rows, at), counts + at.bincount(minlength=places)
+
+
+def _with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> Tensor:
+    """Means (N,K) of so many visits each, and of further ones (n,K) to places (n,) as well."""
+    before = counts.to(means)[:, None]
+    more = places.bincount(minlength=len(means)).to(means)[:, None]
+    sums = (means * before).index_add(0, places.to(means.device), rows.to(means))
+    return torch.where(more > 0, sums / (before + more), means)
+
+
+def _described(model: DejaVu, visits: Views, dimension: int, places: int, progress: bool) -> Tensor:
+    """Descriptors (n,K) of all frames of a visit to some of so many places."""
+    name, last = visits.traverse.name, int(visits.places.max())
+    if last >= places:
+        raise InputError(f"{name} shows place {last}; expected one of {places}")
+    rows = model.extract_all(visits.traverse, "averaging" if progress else None)
+    if rows.shape != (len(visits.places), dimension):
+        seen = f"{name} gives descriptors {tuple(rows.shape)} of {len(visits.places)} places"
+        raise InputError(f"{seen}; expected one of {dimension} numbers for each")
+    if not bool(rows.isfinite().all()):
+        raise InputError(f"{name} gives NaN or infinite descriptors; expected finite numbers")
+    return rows
+
+
+def one_route(model: DejaVu) -> SpectralMap:
+    """The map of a model, which visits can be averaged into."""
+    route = model.map
+    if not isinstance(route, SpectralMap) or not route.places:
+        seen = f"a map of kind {route.kind!r}" if route.places else "no map"
+        raise InputError(f"there is {seen}; expected one of kind {SpectralMap.kind!r} to average visits into")
+    return route
 
 
 def growing(model: DejaVu) -> SpectralMap:

@@ -523,7 +523,10 @@ class DejaVu(nn.Module):
         return self
 
     def calibrate(
-        self, reference: Traverse | Tensor | None, views: Views | None = None, start: int = 0
+        self,
+        reference: Traverse | Tensor | None,
+        views: Views | None = None,
+        places: Tensor | None = None,
     ) -> DejaVu:
         """Find out how probably answers are right that stand out so much; `Match.probability` then tells it.
 
@@ -533,7 +536,8 @@ class DejaVu(nn.Module):
                 whitening, which has seen the plain ones.
             views: frames of another traverse of the same places instead, which tell of its own changes;
                 those that show no place are left out, and of very many all but evenly spaced stretches.
-            start: the place that the reference's first frame is, as where it was appended to a map.
+            places: (n,) int64, which place each frame of the reference shows, -1 for none, as where it was
+                appended to other places; None is frame i at place i.
 
         Returns:
             self, with `self.calibration`.
@@ -555,9 +559,9 @@ class DejaVu(nn.Module):
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
-            among = self.map.places
-            stretches = Stretches(as_traverse(reference), among - start, strengths, places=among)
-            views, length = Views(stretches, start + stretches.places), stretches.stretch
+            places = torch.arange(self.map.places) if places is None else places
+            stretches = Stretches(as_traverse(reference), len(places), strengths, places=self.map.places)
+            views, length = Views(stretches, places[stretches.places]), stretches.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
         name = views.traverse.name
@@ -577,14 +581,16 @@ class DejaVu(nn.Module):
             raise InputError(f"calibrating by {name}: {error}") from error
         return self
 
-    def calibrate_if_possible(self, reference: Traverse, views: Views | None = None, start: int = 0) -> None:
+    def calibrate_if_possible(
+        self, reference: Traverse, views: Views | None = None, places: Tensor | None = None
+    ) -> None:
         """As `calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
         reference."""
         if views is not None:
             self.calibrate(reference, views)
         elif self.calibration is None and len(reference.frame_shape) == 3 and self.map.summary().covered:
             try:
-                self.calibrate(reference, start=start)
+                self.calibrate(reference, places=places)
             except InputError as error:
                 log.warning("the map is not calibrated: %s", error)
 

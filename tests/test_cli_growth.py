@@ -244,3 +244,90 @@ def test_a_route_that_no_answer_is_on_is_told(
     run("evaluate", tmp_path / "r.csv", "--truth", "0", "--route", "b", "--out", tmp_path / "e")
     assert "no answer is on route b; it has answers on first, other" in caplog.text
     assert report_of(tmp_path / "e")["recall_at_1"] == 0
+
+
+# further visits averaged in
+
+
+def test_a_second_traverse_is_averaged_in_before_coding(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "m.safetensors"
+    run("learn", ROUTE, "--average", f"{ROUTE}&traverse=1", "--map", out, *CHUNKS)
+    assert "each place is the mean of" in capsys.readouterr().out
+    model = DejaVu.load(out)
+    counts = model.map.visit_counts
+    assert (int(counts.sum()), len(counts)) == (256, 128)  # the sims carry their positions
+    assert model.calibration is not None
+    run("info", out)
+    assert f"{counts.double().mean():.3g} visits" in capsys.readouterr().out
+    run("learn", ROUTE, "--average", f"{ROUTE}&traverse=1", "--average_truth", "0", "--map", out, *CHUNKS)
+    assert DejaVu.load(out).map.visits.tolist() == [[128, 2]]
+
+
+def test_a_visit_is_averaged_into_a_map_that_is_there(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, out = folder / "first.safetensors", tmp_path / "m.safetensors"
+    before = first.read_bytes()
+    run("learn", "--append", first, "--average", f"{FIRST}&traverse=1", "--map", out)
+    told = capsys.readouterr().out
+    assert f"64 of the 64 places of {first}: decoded, averaged and coded again at the same step" in told
+    assert "mean of 2 visits" in told
+    model = DejaVu.load(out)
+    assert (model.map.places, model.map.visits.tolist()) == (64, [[64, 2]])
+    assert model.calibration is not None
+    another = ("--calibration", f"{FIRST}&traverse=2", "--precision", ".9")
+    run("learn", "--append", first, "--average", f"{FIRST}&traverse=1", "--map", out, *another)
+    assert DejaVu.load(out).precision == 0.9
+    assert first.read_bytes() == before
+    run(
+        "learn",
+        NEXT,
+        "--append",
+        first,
+        "--average",
+        f"{NEXT}&traverse=1",
+        "--average_truth",
+        "0",
+        "--map",
+        out,
+    )
+    assert DejaVu.load(out).map.visits.tolist() == [[64, 1], [64, 2]]
+    whole = tmp_path / "whole.safetensors"
+    run("learn", folder / "d.npy", "--map", whole, "--calibration", "none", "--whitening", "none")
+    run("learn", "--append", whole, "--average", folder / "d.npy")  # a map of one chunk can be averaged
+    assert DejaVu.load(whole).map.visits.tolist() == [[96, 2]]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("d.npy --map m.safetensors --average d.npy", ["--average d.npy is what is learned"]),
+        ("d.npy --map m.safetensors --average_truth 0", ["--average_truth 0", "--average SOURCE"]),
+        ("d.npy --map m.safetensors --average a.npy", ["a.npy", "40 frames", "96"]),
+        ("d.npy --map m.safetensors --average wide.npy --average_truth 0", ["wide.npy", "5 features"]),
+        (f"d.npy --map m.safetensors --average {ROUTE} --calibration {ROUTE}", ["of --average"]),
+        ("d.npy --map m.safetensors --config local_maxima --average e.npy", ["TemplateMapper"]),
+        ("--map m.safetensors --average d.npy", ["required: source"]),
+        ("--append f.safetensors --average wide.npy", ["wide.npy has 9 frames", "96"]),
+        ("--append f.safetensors --average a.npy --average_truth 0", ["a.npy holds frames"]),
+        ("--append templates.safetensors --average d.npy", ["templates.safetensors", "'templates'"]),
+        ("--append both.safetensors --average d.npy", ["both.safetensors", "'merged'"]),
+        ("--append f.safetensors --average d.npy --map d.npy", ["--map d.npy"]),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_averaged(
+    folder: Path,
+    merged: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: str,
+    said: list[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    np.save(folder / "e.npy", np.load(folder / "d.npy"))
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    error = fails(capsys, "learn", *words.split())
+    assert [one for one in said if one not in error] == [], error
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

@@ -14,13 +14,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch import HOG, DejaVu, PlaceFilter, Preprocess, SequenceMatcher, SpectralMapper, growth
+from dejavu_torch import (
+    HOG,
+    DejaVu,
+    PlaceFilter,
+    Preprocess,
+    SequenceMatcher,
+    SpectralMapper,
+    growth,
+    open_source,
+)
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.database.mapfile import read_map, write_map
 from dejavu_torch.database.spectral import SpectralMap, code_chunk
+from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.growth import append, merge
+from dejavu_torch.growth import append, average, learn_mean, merge, shown_on_map
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.streaming import coder
 from dejavu_torch.types import Traverse
@@ -143,7 +153,7 @@ def test_a_calibration_goes_and_comes_again_from_the_new_places() -> None:
     model.calibrate(frames[:80])
     append(model, frames[80:])
     assert model.calibration is None
-    model.calibrate(frames[80:], start=80)
+    model.calibrate(frames[80:], places=torch.arange(80, 120))
     assert model.calibration is not None
     assert model.calibration.single is not None
     matched = model.localize(frames)
@@ -151,7 +161,7 @@ def test_a_calibration_goes_and_comes_again_from_the_new_places() -> None:
     assert torch.equal(matched.accepted, matched.probability >= 0.9)
     assert matched.accepted.float().mean() > 0.5
     right = model.calibration
-    model.calibrate(frames[80:])  # as if those frames were the first places
+    model.calibrate(frames[80:], places=torch.arange(40))  # as if those frames were the first places
     lower = model.localize(frames).probability
     assert lower is not None
     assert (model.calibration != right, lower.mean() < matched.probability.mean() - 0.3) == (True, True)
@@ -199,6 +209,26 @@ def test_only_a_chunk_of_descriptors_is_held(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(coder, "code_chunk", lambda part, *rest: sizes.append(len(part)) or code(part, *rest))
     append(model, walk(1000, seed=2))
     assert sizes == [*[64] * 15, 40]
+
+
+def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("dejavu_torch.streaming.sample.SAMPLE", 60)
+    route = open_source("sim:aerial?frames=130")
+    mapper = SpectralMapper(5.0, chunk=40)
+    whole = DejaVu(whitening=Whitening(views=1), mapper=mapper, batch_size=16).learn(route)
+    whole.save(tmp_path / "whole")
+    part = DejaVu.load(tmp_path / "whole")
+    one = spectral(part)
+    part.map = SpectralMap.of_chunks(one.coded()[:2], one.mean, **one.settings())
+    sizes = []
+    code = coder.code_chunk
+    monkeypatch.setattr(coder, "code_chunk", lambda rows, *rest: sizes.append(len(rows)) or code(rows, *rest))
+    append(part, open_source("sim:aerial?frames=130&start=80"))
+    assert sizes == [40, 10]  # a chunk of descriptors at a time
+    part.save(tmp_path / "part")
+    assert (tmp_path / "part").read_bytes() == (tmp_path / "whole").read_bytes()
 
 
 # what is refused leaves the map as it was
@@ -452,3 +482,167 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was(tmp_path: Path)
         DejaVu.load(tmp_path / "bad.safetensors")
     with refused("made of maps"):
         merged.learn(walk(90))
+
+
+# further visits averaged in
+
+
+def noisy(route: Tensor, seed: int, noise: float = 0.3) -> Tensor:
+    return route + noise * torch.randn(route.shape, generator=torch.Generator().manual_seed(seed))
+
+
+def by_hand(route: Tensor, counts: list[int], rows: Tensor, places: list[int]) -> Tensor:
+    """The mean of each place's descriptor, so many times, and of each further one, in a loop."""
+    sums, numbers = [row * n for row, n in zip(route, counts, strict=True)], list(counts)
+    for row, place in zip(rows, places, strict=True):
+        if place >= 0:
+            sums[place], numbers[place] = sums[place] + row, numbers[place] + 1
+    return torch.stack([total / n for total, n in zip(sums, numbers, strict=True)])
+
+
+def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
+    route, more = walk(120), noisy(walk(150), 1)
+    places = [*range(-10, 0), *range(20, 120), *[60] * 40]
+    model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50))
+    learn_mean(model, route, Views(ArrayTraverse(more, "more"), torch.tensor(places).clamp(min=-1)))
+    means = by_hand(route, [1] * 120, more, places)
+    whole = SpectralMapper(6.0, chunk=50)(means)
+    assert spectral(model).steps.tolist() == pytest.approx(whole.steps.tolist(), rel=1e-3)
+    rebuilt = torch.cat([spectral(model).rebuilt(g) for g in range(3)])
+    assert (rebuilt - means).abs().mean() < 2 * float(whole.steps[0])
+    counts = [1] * 20 + [2] * 40 + [42] + [2] * 59
+    assert model.map.visit_counts.tolist() == counts
+    assert model.map.visits.tolist() == [[20, 1], [40, 2], [1, 42], [59, 2]]
+    model.save(tmp_path / "m")
+    loaded = DejaVu.load(tmp_path / "m")
+    assert torch.equal(loaded.map.visits, model.map.visits)
+    assert loaded.summary().route["visits"] == 4 * 8
+    assert loaded.summary().map_bytes == (tmp_path / "m").stat().st_size
+    fresh = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50))
+    fresh.load_state_dict(loaded.state_dict())
+    assert fresh.map.visit_counts.tolist() == counts
+    fresh.load_state_dict(learned(route, 50).state_dict())  # of one visit
+    assert fresh.map.visit_counts.tolist() == [1] * 120
+
+
+def test_places_of_one_visit_take_no_bytes(tmp_path: Path) -> None:
+    learned(walk(100)).save(tmp_path / "m")
+    assert "map.visits" not in read_map(tmp_path / "m").tensors
+
+
+@pytest.mark.parametrize("chunk", [50, "route"])
+def test_a_visit_is_averaged_into_a_map(chunk: int | str) -> None:
+    route, more = walk(150), noisy(walk(60), 1)
+    model = learned(route, chunk, resolution=4.0)
+    one = spectral(model)
+    before, coded = torch.cat([one.rebuilt(g) for g in range(len(one.chunks))]), one.coded()
+    shown = [*range(5, 45), *[-1] * 10, *range(5, 15)]
+    visits = Views(ArrayTraverse(more, "more"), torch.tensor(shown))
+    assert average(model, visits) == 40
+    means = by_hand(before, [1] * 150, more, shown)
+    settings = one.mean, coded[0].step, one.transform, one.resolution
+    expected = [code_chunk(part, *settings) for part in means.split(50 if chunk == 50 else 150)]
+    if chunk == 50:
+        expected[1:] = coded[1:]  # nothing was seen there: not coded again
+    same = SpectralMap.of_chunks(expected, one.mean, **one.settings())
+    query = walk(4, seed=5)
+    assert torch.allclose(model.map.scores(query), same.scores(query), atol=1e-5)
+    assert model.map.visits.tolist() == [[5, 1], [10, 3], [30, 2], [105, 1]]
+    average(model, visits)  # weighed by the visits before
+    assert model.map.visits.tolist() == [[5, 1], [10, 5], [30, 3], [105, 1]]
+    means = by_hand(means, [1] * 5 + [3] * 10 + [2] * 30 + [1] * 105, more, shown)
+    assert (spectral(model).rebuilt(0)[:45] - means[:45]).abs().mean() < 2 * coded[0].step
+
+
+def test_averaging_makes_what_is_found_again_surer() -> None:
+    route = walk(400)
+    visits = [noisy(route, seed) for seed in range(4)]
+    query = noisy(route, 9)
+    here = torch.arange(400)
+    plain = learned(visits[0], 100)
+    mean = learned(visits[0], 100)
+    for seen in visits[1:]:
+        average(mean, shown_on_map(mean, ArrayTraverse(seen, "seen")))
+    whole = DejaVu(whitening="none", mapper=SpectralMapper(4.0, chunk=100))
+    learn_mean(whole, visits[0], Views(ArrayTraverse(torch.cat(visits[1:]), "all"), here.repeat(3)))
+    right = [float((m.localize(query).index - here).abs().le(3).float().mean()) for m in (plain, mean, whole)]
+    assert right[1] > right[0] + 0.03
+    assert right[2] > right[0] + 0.03
+    assert mean.map.visit_counts.tolist() == whole.map.visit_counts.tolist() == [4] * 400
+
+
+def test_counts_follow_where_a_map_grows(tmp_path: Path) -> None:
+    route = walk(200)
+    model = learned(route[:100], 50)
+    rest = ArrayTraverse(noisy(route[100:], 2), "rest")
+    append(model, route[100:], visits=Views(rest, torch.arange(100)))
+    assert model.map.visits.tolist() == [[100, 1], [100, 2]]
+    first = spectral(model)
+    settings = first.mean, float(first.steps[0]), first.transform, first.resolution
+    means = (route[100:] + noisy(route[100:], 2)) / 2
+    expected = SpectralMap.of_chunks(
+        [code_chunk(part, *settings) for part in means.split(50)], first.mean, **first.settings()
+    )
+    query = walk(3, seed=4)
+    assert torch.allclose(model.map.scores(query)[:, 100:], expected.scores(query), atol=1e-5)
+    append(model, route)
+    model.map.extend(route[:50])
+    assert model.map.visits.tolist() == [[100, 1], [100, 2], [250, 1]]
+    both = merge([model, learned(route, 50)], ["a", "b"])
+    assert both.map.visits.tolist() == [[100, 1], [100, 2], [450, 1]]
+    both.save(tmp_path / "m")
+    assert DejaVu.load(tmp_path / "m").map.visits.tolist() == both.map.visits.tolist()
+
+
+def test_which_places_a_visit_shows(tmp_path: Path) -> None:
+    model, again = learned(walk(100)), ArrayTraverse(walk(100, seed=1), "again")
+    few = ArrayTraverse(walk(30), "few")
+    assert shown_on_map(model, again).places.tolist() == list(range(100))
+    assert shown_on_map(model, few, "80").places.tolist() == [*range(80, 100), *[-1] * 10]
+    (tmp_path / "t.csv").write_text("query,place\n0,7\n3,9\n")
+    assert shown_on_map(model, few, str(tmp_path / "t.csv")).places[:5].tolist() == [7, -1, -1, 9, -1]
+    with refused("few has 30 frames", "the map 100", "truth"):
+        shown_on_map(model, few)
+    moved = DejaVu(HOG(), "none", SpectralMapper(200.0, chunk=20), velocity=camera())
+    route = ArrayTraverse(footage(REFERENCE), "route")
+    moved.learn(route)
+    with refused("at even steps"):
+        shown_on_map(moved, route)
+    views = shown_on_map(moved, route, "0")
+    assert (views.places - torch.arange(101)).abs().max() <= 1
+    assert average(moved, views) == len(views.places.unique())
+    assert (int(moved.map.visit_counts.sum()), len(moved.map.positions)) == (202, len(REFERENCE))
+
+
+def test_visits_that_cannot_be_averaged() -> None:
+    model = learned(walk(90), "route")
+    before, templates = model.map, template_model(whitening="none")
+    at = torch.arange(90)
+    for rows, places, words in (
+        (walk(90), at + 1, ("shows place 90", "one of 90")),
+        (walk(80), at, ("(80, 6) of 90 places",)),
+        (torch.rand(90, 7), at, ("7",)),
+        (torch.full((90, 6), math.nan), at, ("NaN",)),
+        (torch.rand(90, 1, 9, 9), at, ("frames",)),
+    ):
+        visits = Views(ArrayTraverse(rows, "more"), places)
+        with refused(*words):
+            average(model, visits)
+        assert model.map is before
+        with refused(*words):
+            learn_mean(model, walk(90), visits)
+        assert model.map is before
+    good = Views(ArrayTraverse(walk(90), "more"), at)
+    with refused("TemplateMapper", "SpectralMapper"):
+        learn_mean(templates, walk(90), good)
+    with refused("'templates'", "'spectral'"):
+        average(templates.learn(walk(90)), good)
+    with refused("no map"):
+        average(DejaVu(), good)
+    route = learned(walk(90)).map
+    route.visits = torch.tensor([[89, 2]], dtype=torch.int32)
+    with refused("visits of 89 places", "90"):
+        route.check()
+    route.visits = torch.tensor([[90, 0]], dtype=torch.int32)
+    with refused("at least 1"):
+        route.check()

@@ -24,6 +24,7 @@ ROUTES = (ROOT / "docs" / "real_routes.md").read_text()
 SPECTRAL = (ROOT / "docs" / "spectral_maps.md").read_text()
 SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
 REJECTION = (ROOT / "docs" / "rejection.md").read_text()
+GROWING = (ROOT / "docs" / "growing.md").read_text()
 STORAGE = (ROOT / "docs" / "storage.md").read_text()
 LIVE = (ROOT / "docs" / "live.md").read_text()
 PRETRAINED = (ROOT / "docs" / "pretrained.md").read_text()
@@ -102,8 +103,11 @@ def understand(line: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE, LIVE, REJECTION],
-    ids=["README", "training", "real_routes", "spectral_maps", "sequences", "storage", "live", "rejection"],
+    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE, LIVE, REJECTION, GROWING],
+    ids=[
+        *("README", "training", "real_routes", "spectral_maps", "sequences", "storage", "live", "rejection"),
+        "growing",
+    ],
 )
 def test_every_command_shown_is_understood(text: str) -> None:
     shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
@@ -96,6 +96,8 @@ def run_learn(
     *,
     map: Path | None = None,
     append: Path | None = None,
+    average: str | None = None,
+    average_truth: str | None = None,
     seed: int = 0,
     second: str | None = None,
     second_truth: str | None = None,
@@ -115,6 +117,9 @@ def run_learn(
         map: map file to write (.safetensors)
         append: map file behind whose places those of the source come; it is written again unless --map names
             another file
+        average: a further traverse of the source's places, averaged in before they are coded; without a
+            source of those of --append, which are decoded, averaged and coded again at the same step
+        average_truth: which places it shows, as --truth of `dejavu compare`
         seed: of the whitening, where it has none of its own
         second: another traverse of the same places, from which whitening learns what a visit changes
         second_truth: which places it shows, as --truth of `dejavu compare`
@@ -131,39 +136,61 @@ def run_learn(
     if append is None:
         model.to(where)
     else:
-        model = _map_to_append_to(append, model).to(where)
+        model = _map_to_append_to(append, model, len(sources) > 0).to(where)
     if cluster is not None:
         _check_cluster(cluster, device)
         _check_chunks(cluster, model)
+        if average is not None:
+            raise InputError(f"--cluster {cluster} with --average {average}; expected one of them")
     _check_map_name(map)
     check_output_file(map)
     check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
+    check_not_read(map, average, average_truth)
     if calibration == NO_CALIBRATION and model.precision is not None:
         raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
     _set_seed(model, seed)
-    traverse = chained([open_source(source) for source in sources])
-    traverse = model.resample(traverse, model.step, progress=True)
-    _print_steps(traverse)
-    traverse, views = _with_second(model, traverse, second, second_truth)
-    if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
-        seen = f"--precision {model.precision}: {traverse.name} has no frames to calibrate by"
-        raise InputError(f"{seen}; expected --calibration SOURCE")
-    traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
-    start, work = model.map.places, work_folder_of(map)
+    _check_average(average, average_truth, sources, calibration)
+    visits: Views | None = None
+    if sources:
+        traverse = model.resample(chained([open_source(one) for one in sources]), model.step, progress=True)
+        _print_steps(traverse)
+        traverse, views = _with_second(model, traverse, second, second_truth)
+        if average is not None:
+            visits = model.places_shown(traverse, open_source(average), average_truth)
+        _check_calibration(model, traverse, calibration)
+        traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
+    else:
+        visits = growth.shown_on_map(model, open_source(str(average)), average_truth)
+        traverse, views = visits.traverse, None
+        _check_calibration(model, traverse, calibration)
+        known = None
+        if calibration not in UNREAD:
+            known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
+    places: Tensor | None = None  # that the traverse shows, where it is not from the first on
+    done, start, work = "", model.map.places, work_folder_of(map)
     with _making(cluster) as make:
-        if append is None:
-            model.learn(traverse, progress=True, second=views, work=work, make=make)
-        else:
-            growth.append(model, traverse, progress=True, work=work, make=make)
+        if append is not None and sources:
+            growth.append(model, traverse, progress=True, work=work, make=make, visits=visits)
+            places = torch.arange(start, model.map.places)
             known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
+            done = f"{len(places)} places behind the {start} of {append}; written to {map}"
+        elif append is not None:
+            assert visits is not None
+            count, places = growth.average(model, visits, progress=True), visits.places
+            done = f"{count} of the {start} places of {append}"
+            done += ": decoded, averaged and coded again at the same step"
+        elif visits is not None:
+            growth.learn_mean(model, traverse, visits, progress=True, second=views)
+        else:
+            model.learn(traverse, progress=True, second=views, work=work, make=make)
     if calibration != NO_CALIBRATION:
-        model.calibrate_if_possible(traverse, known, start)
+        model.calibrate_if_possible(traverse, known, places)
     model.check_precision(None)
     model.save(map)
     remove_work(work)
     print_map(model)
-    if append is not None:
-        _say(f"{model.map.places - start} places behind the {start} of {append}; written to {map}")
+    if done:
+        _say(done)
     if model.map.summary().covered:
         _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
     else:
@@ -767,16 +794,17 @@ def _check_map_name(path: Path) -> None:
         raise InputError(f"--map {path} is no name of a map; expected {expected}")
 
 
-def _map_to_append_to(path: Path, given: DejaVu) -> DejaVu:
+def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
     """The map of a file, which can grow, and accepts what the options say.
 
     Args:
         given: what the options say; of its features only what a file cannot bring counts.
+        places: whether places are to be appended, not only visits averaged in.
     """
     default = recipe_of(given.features, REGISTRY) == recipe_of(HOG(), REGISTRY)
     model = _load_map(path, None if default else given.features)
     try:
-        growth.growing(model)
+        (growth.growing if places else growth.one_route)(model)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     _accept_by(model, given.threshold, given.precision)
@@ -912,6 +940,27 @@ def _with_calibration(
     return reference, model.places_shown(reference, traverse, truth)
 
 
+def _check_calibration(model: DejaVu, traverse: Traverse, calibration: str | None) -> None:
+    """Refuse a precision that nothing will tell of."""
+    if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
+        seen = f"--precision {model.precision}: {traverse.name} has no frames to calibrate by"
+        raise InputError(f"{seen}; expected --calibration SOURCE")
+
+
+def _check_average(
+    average: str | None, truth: str | None, sources: Sequence[str], calibration: str | None
+) -> None:
+    """Refuse to average a traverse with itself, or to calibrate by what a map has been averaged with."""
+    if average is None:
+        if truth is not None:
+            raise InputError(f"--average_truth {truth} is of no traverse; expected --average SOURCE with it")
+        return
+    if average in sources:
+        raise InputError(f"--average {average} is what is learned; expected another traverse of its places")
+    if average == calibration:
+        raise InputError(f"--calibration {calibration} is that of --average; expected a further traverse")
+
+
 def _check_top(top: int, model: DejaVu) -> None:
     """Refuse to accept several places of a query by the probability of one."""
     if model.precision is not None:
@@ -942,6 +991,9 @@ def print_map(model: DejaVu) -> None:
     print(summary)
     for line in route_lines(model.map):
         _say(line)
+    if len(model.map.visits):
+        counts = model.map.visit_counts.double()
+        print(f"each place is the mean of {counts.mean():.3g} visits ({counts.min():g} to {counts.max():g})")
     whitening = model.whitening
     if whitening is not None:
         numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))

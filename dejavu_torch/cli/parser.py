@@ -254,7 +254,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
                 raise UsageError(f"--{one}: {there} has its own settings; expected one or the other")
         if name == "learn":
             needed = {
-                "source": arguments["sources"] or None,
+                "source": arguments["sources"] or (arguments["append"] and arguments["average"]) or None,
                 "--map": arguments["map"] or arguments["append"],
             }
             missing = ", ".join(one for one, value in needed.items() if value is None)

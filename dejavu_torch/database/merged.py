@@ -82,6 +82,8 @@ class MergedMap(PlaceMap):
         ]
         if moved:
             self.positions = torch.cat(moved)
+        if self.parts:
+            self.count_visits(torch.cat([part.visit_counts for part in self._parts]))
 
     @property
     def _parts(self) -> list[SpectralMap]:
@@ -104,19 +106,23 @@ class MergedMap(PlaceMap):
 
     def scores(self, queries: Tensor) -> Tensor:
         """Scores of all places: (Q,K) -> (Q,N)."""
-        return torch.cat([part.scores(queries) for part in self._parts], 1)
+        return self.scores_between(queries, 0, self.places)
 
     def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
         """See `PlaceMap`: from the parts that hold these places."""
-        return torch.cat(
-            [
-                part.scores_between(queries, max(0, start - first), min(part.places, stop - first))
-                for first, part in zip(self._starts, self._parts, strict=False)
-                if start < first + part.places and stop > first
-            ]
-            or [queries.new_zeros(len(queries), 0)],
-            1,
-        )
+        found = [scores for _, scores in self.score_blocks(queries, start, stop)]
+        return torch.cat(found, 1) if found else queries.new_zeros(len(queries), 0)
+
+    def score_blocks(
+        self, queries: Tensor, start: int = 0, stop: int | None = None
+    ) -> Iterator[tuple[int, Tensor]]:
+        """See `PlaceMap`: those of each part."""
+        stop = self.places if stop is None else stop
+        for first, part in zip(self._starts, self._parts, strict=False):
+            own = max(0, start - first), min(part.places, stop - first)
+            if own[0] < own[1]:
+                for at, scores in part.score_blocks(queries, *own):
+                    yield first + at, scores
 
     def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """See `PlaceMap`: along trajectories, route by route."""

@@ -37,6 +37,8 @@ class PlaceMap(nn.Module, ABC):
         places: N, the number of places. dimension: D, features per frame. Plain ints.
         positions: (F,) float32, how many even steps each reference frame lies from the first place, where
             frames were resampled (section IV-B); (0,) where place i is reference frame i.
+        visits: (V,2) int32, runs of places and how many visits each of these is the mean of; (0,2) where all
+            are of one.
         routes: of a merged map, in order; () for one route. Places and frames then count through all of them,
             and `route_of` and `own_frame_of` tell the route of a place and the frame of that route.
 
@@ -51,11 +53,13 @@ class PlaceMap(nn.Module, ABC):
     state: ClassVar[Any] = dict[str, Any]
     routes: tuple[Route, ...] = ()
     positions: Tensor
+    visits: Tensor
 
     def __init__(self, places: int = 0, dimension: int = 0) -> None:
         super().__init__()
         self.places, self.dimension = places, dimension
         self.register_buffer("positions", torch.zeros(0))
+        self.register_buffer("visits", torch.zeros(0, 2, dtype=torch.int32), persistent=False)
 
     @abstractmethod
     def scores(self, queries: Tensor) -> Tensor:
@@ -126,6 +130,20 @@ class PlaceMap(nn.Module, ABC):
         """The reference frame that each place shows; -1, no place, stays -1. int64 of any shape."""
         return look_up(shown_frames(self.positions), places) if len(self.positions) else places
 
+    @property
+    def visit_counts(self) -> Tensor:
+        """(N,) int64, how many visits each place is the mean of."""
+        if not len(self.visits):
+            return torch.ones(self.places, dtype=torch.int64, device=self.visits.device)
+        runs, counts = self.visits.long().unbind(1)
+        return counts.repeat_interleave(runs)
+
+    def count_visits(self, counts: Tensor) -> None:
+        """Keep how many visits each place is the mean of, (N,) int64."""
+        values, runs = counts.unique_consecutive(return_counts=True)
+        once = bool((values == 1).all())
+        self.visits = torch.stack([runs, values], 1).int()[: 0 if once else None]
+
     def route_of(self, places: Tensor) -> Tensor:
         """The number of the route that each place is on; -1, no place, stays -1. int64 of any shape."""
         ends = torch.tensor([route.places for route in self.routes], device=places.device).cumsum(0)
@@ -173,6 +191,13 @@ class PlaceMap(nn.Module, ABC):
             positions.ndim == 1 and positions.is_floating_point() and positions.isfinite().all()
         ):
             problem = f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)"
+        visits = self.visits
+        if not problem and (
+            visits.shape[1:] != (2,) or visits.dtype != torch.int32 or bool((visits < 1).any())
+        ):
+            problem = f"visits {tuple(visits.shape)} {visits.dtype}; expected int32 (V,2) of at least 1"
+        if not problem and len(visits) and int(visits[:, 0].sum()) != self.places:
+            problem = f"visits of {int(visits[:, 0].sum())} places; expected {self.places}"
         if not problem and len(positions) and count_places(positions) != self.places:
             problem = f"positions of {count_places(positions)} places; expected {self.places}"
         if problem:
@@ -209,6 +234,8 @@ class PlaceMap(nn.Module, ABC):
         try:
             if prefix + EXTRA in state_dict:  # before any tensor is touched
                 self.set_extra_state(state_dict[prefix + EXTRA])
+                if "visits" not in self._non_persistent_buffers_set:
+                    state_dict.setdefault(f"{prefix}visits", self.visits[:0])
             self._take_shapes(state_dict, prefix)
             super()._load_from_state_dict(state_dict, prefix, *args)
             self.loaded()
@@ -229,7 +256,8 @@ class PlaceMap(nn.Module, ABC):
 
     def packed(self) -> dict[str, Tensor]:
         """The tensors that a file holds of the map; a kind that compresses them says how."""
-        return {name: value for name, value in self.state_dict().items() if isinstance(value, Tensor)}
+        kept = {name: value for name, value in self.state_dict().items() if isinstance(value, Tensor)}
+        return kept if len(self.visits) else {k: v for k, v in kept.items() if k != "visits"}
 
     def unpacked(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """The state's tensors, from what `packed` gave.
@@ -246,7 +274,7 @@ class PlaceMap(nn.Module, ABC):
             InputError: tensors or a state that do not fit.
         """
         state = {**self.unpacked(tensors), EXTRA: extra}
-        missing = self.state_dict().keys() - state.keys()
+        missing = self.state_dict().keys() - state.keys() - {"visits"}
         if missing:
             raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
         self.load_state_dict(state)

@@ -217,6 +217,7 @@ class SpectralMap(PlaceMap):
         for (name, nothing), value in zip(empty.items(), given, strict=True):
             self.register_buffer(name, nothing if value is None else value)
         self.register_buffer("norms", torch.zeros(0), persistent=False)
+        self.register_buffer("visits", self.visits)
         self.loaded()
         self.check()
 
@@ -516,7 +517,9 @@ class SpectralMap(PlaceMap):
         self.counts, self.feature, self.level = joined([own, *parts])
         self.lengths = torch.cat([self.lengths, self.lengths.new_tensor([len(part) for part in added])])
         self.steps = torch.cat([self.steps, self.steps[-1:].expand(len(added))])
+        counts = torch.cat([self.visit_counts, self.lengths.new_ones(len(features))])
         self.places += len(features)
+        self.count_visits(counts)
         self.loaded()
         self._streams[: len(streams)] = streams
         self.check()
@@ -592,7 +595,7 @@ class SpectralMap(PlaceMap):
             energy = value.new_zeros(stop - start).index_add(0, line, value.square())
             chunks.append(ChunkSummary(start, stop, self._periods(energy), (), Fraction(0), ()))
         packed = self.packed() if self.places else {}
-        names = {"streams": "lines", "mean": "mean", "positions": "positions"}
+        names = {"streams": "lines", "mean": "mean", "positions": "positions", "visits": "visits"}
         route = {own: packed[name].nbytes for name, own in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         others = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)

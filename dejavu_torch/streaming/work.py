@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.output import make_output_folder, whole_file
+from dejavu_torch.data.output import make_output_folder, remove_empty_folders, whole_file
 from dejavu_torch.database.codec import Stream
 from dejavu_torch.database.mapfile import read_map, write_map
 from dejavu_torch.database.spectral import CodedChunk
@@ -59,8 +59,12 @@ class WorkFolder:
                 ) from error
         else:
             make_output_folder(path)
-            with whole_file(path / KEY) as file:
-                file.write_text(json.dumps(key))
+            try:
+                with whole_file(path / KEY) as file:
+                    file.write_text(json.dumps(key))
+            except BaseException:  # as on a full disk
+                remove_empty_folders(path)
+                raise
             known = dict(key)
         if known != key:
             known = known if isinstance(known, dict) else {}
