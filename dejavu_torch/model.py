@@ -791,6 +791,11 @@ class DejaVu(nn.Module):
         sequence = matching.sequence
         alone = not matching.lengths and matching.platt is None and order is None
         if sequence is not None and alone:  # not all scores may be needed
+            best = sequence.best(parts, self.map) if matching.ranks == 1 and matching.look is None else None
+            if best is not None:
+                return (
+                    Found(Candidates(place[:, None].cpu(), score[:, None].cpu())) for score, place in best
+                )
             return matching._replace(sequence=None).stream(self.map.sequences(parts, sequence))
         scores: Iterator[Tensor] = map(self.map.scores, parts)
         if order is not None:

@@ -116,13 +116,17 @@ class MergedMap(PlaceMap):
     def score_blocks(
         self, queries: Tensor, start: int = 0, stop: int | None = None
     ) -> Iterator[tuple[int, Tensor]]:
-        """See `PlaceMap`: those of each part."""
+        """See `PlaceMap`: the blocks of each part."""
         stop = self.places if stop is None else stop
         for first, part in zip(self._starts, self._parts, strict=False):
-            own = max(0, start - first), min(part.places, stop - first)
-            if own[0] < own[1]:
-                for at, scores in part.score_blocks(queries, *own):
-                    yield first + at, scores
+            if start < first + part.places and stop > first:
+                own = max(0, start - first), min(part.places, stop - first)
+                for begins, scores in part.score_blocks(queries, *own):
+                    yield first + begins, scores
+
+    @property
+    def block_places(self) -> int:
+        return max((part.block_places for part in self._parts), default=1)
 
     def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """See `PlaceMap`: along trajectories, route by route."""

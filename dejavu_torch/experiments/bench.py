@@ -419,8 +419,8 @@ def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> lis
     """
     if what not in BENCHES:
         raise InputError(
-            f"bench {what!r} is unknown; expected {', '.join(BENCHES)}, live, train, memory, cluster, storage "
-            "or scale"
+            f"bench {what!r} is unknown; expected {', '.join(BENCHES)}, live, train, memory, "
+            "cluster, storage or scale"
         )
     check_output_folder(out)  # before the long work
     rows = BENCHES[what](frames, repeats)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
 from dejavu_torch.database import spectral
+from dejavu_torch.database.merged import MergedMap
 from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.database.template_map import TemplateMapper
@@ -134,7 +135,7 @@ def test_no_score_is_below_its_bound(metric: str, transform: str) -> None:
 
 @pytest.mark.parametrize("metric", METRICS)
 def test_bounds_find_what_a_scan_finds_in_ten_thousand_cases(metric: str) -> None:
-    """With both metrics: 10 maps each, of smooth routes and of noise, 250 queries, the best and the 12 best."""
+    """With both metrics: 10 maps each, of smooth routes and of noise, 250 queries, the 1 and 12 best."""
     spared = []
     for seed in range(10):
         smooth = (0.0, 0.9, 0.99, 0.999)[seed % 4]
@@ -241,6 +242,14 @@ def test_no_block_of_scores_is_as_long_as_the_route(monkeypatch: pytest.MonkeyPa
     assert model.localize(route[:300]).index.shape == (300,)
     assert max(seen) <= 300
     assert sum(seen) % 4000 == 0  # for each batch of queries
+
+
+def test_a_merged_map_is_searched_block_by_block() -> None:
+    parts = [SpectralMapper(None, 0.5, 50)(walk(places, seed=places)) for places in (200, 130)]
+    route, queries = MergedMap(parts, ["out", "back"]), walk(130, seed=130)
+    assert_equal(scan(route, queries, 9), by_sorting(route.scores(queries), 9))
+    assert [start for start, _ in route.score_blocks(queries, 190, 210)] == [190, 200]
+    assert route.block_places == max(part.block_places for part in parts)
 
 
 def test_a_search_is_kept_until_the_map_changes() -> None:
