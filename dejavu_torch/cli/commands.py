@@ -509,30 +509,46 @@ def run_bench(
     places: Sequence[int] = (),
     steps: int | None = None,
     seeds: Sequence[int] = (),
+    device: str = "cpu",
 ) -> None:
     """Set this package beside what a user would pick instead: its speed, memory, or accuracy over bytes.
 
     Args:
         what: matcher (time of HOG, L1 distances, sequences, filters), live (time of single frames on 100000
-            places), train (seconds of a training, and accuracy), memory (of learning and localizing) or
-            storage (accuracy over bytes)
+            places), train (seconds of a training, and accuracy), memory (of learning and localizing),
+            storage (accuracy over bytes) or scale (all of these over the number of places, up to 10^6)
         sources: of storage and train, pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
         map: of storage, a map of the REFERENCE to set beside the others
         codebooks: of storage, another route, where codebooks and a whitening are learned that count nothing
         whitening: of storage, a map whose whitening describes all routes; each learns its own if not given
         places: of storage, frames of the built-in sim:aerial; 3072 and 10000 if not given. Of memory, frames
-            that are learned; 1000, 10000 and 50000 if not given
+            that are learned; 1000, 10000 and 50000 if not given. Of scale, 10000, 100000 and 1000000
         steps: of train, those of each training; 600 if not given
         seeds: of train, a training each; 0, 1 and 2 if not given
+        device: of scale, what localizes: as of `dejavu localize`
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench, footprint, frontier, live_speed
+    from dejavu_torch.experiments import bench, footprint, frontier, live_speed, scale
 
     for file in (out, out / "bench.json", out / "bench.png"):
         check_not_read(file, *sources, codebooks)
     if what != "train" and (steps is not None or seeds):
         raise InputError(f"bench {what} takes no steps or seeds; bench train does")
+    if what != "scale" and device != "cpu":
+        raise InputError(f"bench {what} takes no device; bench scale does")
+    if what == "scale":
+        if sources or map or codebooks or whitening:
+            raise InputError(
+                "bench scale takes no sources, maps, codebooks or whitening; expected places, device"
+            )
+        scaled = scale.run_scale(out, places, str(device_of(device)), progress=True)
+        for title, table in scale.scale_tables(scaled):
+            print(title, text_table(table), "", sep="\n")
+        _say(
+            f"recall within {scale.TOLERANCE} places; localized on one thread; next: open {out / 'bench.png'}"
+        )
+        return
     if what == "storage":
         given = None if map is None else _load_map(map)
         shared = None if whitening is None else DejaVu.load(whitening)

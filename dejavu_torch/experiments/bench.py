@@ -417,7 +417,7 @@ def run_bench(what: str, out: Path, frames: int = 2000, repeats: int = 3) -> lis
     """
     if what not in BENCHES:
         raise InputError(
-            f"bench {what!r} is unknown; expected {', '.join(BENCHES)}, live, train, memory or storage"
+            f"bench {what!r} is unknown; expected {', '.join(BENCHES)}, live, train, memory, storage or scale"
         )
     check_output_folder(out)  # before the long work
     rows = BENCHES[what](frames, repeats)

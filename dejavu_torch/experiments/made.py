@@ -73,8 +73,9 @@ def _filters(series: Tensor) -> Tensor:
     reach = min(REACH, 1 << (count // 4).bit_length() - 1)
     window = torch.hann_window(2 * reach)[:, None]
     starts = range(0, count - 2 * reach + 1, reach)
-    power = sum(torch.fft.rfft(series[s : s + 2 * reach] * window, dim=0).abs().square() for s in starts)
-    filters = torch.fft.irfft(torch.as_tensor(power).sqrt(), dim=0).roll(reach, 0) * window
+    spectra = (torch.fft.rfft(series[s : s + 2 * reach] * window, dim=0).abs().square() for s in starts)
+    power: Tensor = sum(spectra, torch.zeros(()))
+    filters: Tensor = torch.fft.irfft(power.sqrt(), dim=0).roll(reach, 0) * window
     # white noise in, as much variance out as was there
     scaled: Tensor = filters * (series.std(0) / torch.linalg.vector_norm(filters, dim=0).clamp(min=1e-12))
     return scaled

@@ -27,10 +27,12 @@ from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.score_plots import plot_growth
-from dejavu_torch.experiments.bench import peak_memory
+from dejavu_torch.experiments.bench import Row, peak_memory
 from dejavu_torch.experiments.footprint import give_back, in_process
 from dejavu_torch.experiments.made import Likeness, MadeRoute, likeness
 from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tiles_of
+from dejavu_torch.experiments.template_search import PLACES as TEMPLATES
+from dejavu_torch.experiments.template_search import bench_templates
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match
@@ -188,7 +190,7 @@ class Faiss(Contender):
 
 
 class Interpolated(Contender):
-    """Every k-th descriptor in int8 and straight lines between them, in so many bytes."""
+    """Every k-th descriptor in int8 and straight lines between them, in so many bytes per place."""
 
     def __init__(self, room: float) -> None:
         self.room = room
@@ -197,7 +199,7 @@ class Interpolated(Contender):
         from dejavu_torch.evaluation.baselines import as_int8, keyframes
 
         each = len(next(route.batches(1))[0])
-        k = max(1, math.ceil((route.length - 1) / max(1, self.room // each - 1)))
+        k = max(1, math.ceil((route.length - 1) / max(1, self.room * route.length // each - 1)))
         chosen = keyframes(route.length, k)
         rows = torch.cat([route.read(range(i, i + 1)) for i in chosen.tolist()])
         scale = rows.abs().max() / 127
@@ -461,7 +463,7 @@ def bench_scale(
     Yields:
         Rows of the cases `places=N`: up to `RENDERED` places `sim:aerial`, beyond it descriptors that are
         made to be like it, see `MadeRoute`; `made=N`: such descriptors at a size that is drawn as well;
-        `repeat=N`: ground that repeats, see `TiledRoute`.
+        `repeat=N`: ground that repeats, see `TiledRoute`; `templates=N`: see `bench_templates`.
 
     Raises:
         InputError: too few places, or more than the ground that repeats has.
@@ -471,18 +473,38 @@ def bench_scale(
     if sizes[0] < FEWEST or sizes[-1] > longest:
         raise InputError(f"bench scale got places {sizes}; expected {FEWEST} to {longest} each")
     threads = torch.get_num_threads()
-
+    made = min((n for n in sizes if n > RENDERED), default=None)  # ahead of which they are checked
     with temporary_folder(Path(tempfile.gettempdir())) as path:
         folder = Folder(path, sizes, progress)
         folder.draw()
+        if sizes[0] <= LONGEST["repeat"]:
+            folder.draw_again(max([n for n in sizes if n <= RENDERED], default=0))
         for n in sizes:
+            if n == made:
+                yield from _case(folder, f"made={CHECKED}", "made", CHECKED, threads, device)
             yield from _case(folder, f"places={n}", "drawn" if n <= RENDERED else "made", n, threads, device)
-        if sizes[-1] > RENDERED:
-            yield from _case(folder, f"made={CHECKED}", "made", CHECKED, threads, device)
-        repeated = [n for n in sizes if n <= LONGEST["repeat"]]
-        folder.draw_again(max([n for n in repeated if n <= RENDERED], default=0))
-        for n in repeated:
-            yield from _repeating(folder, n, threads, device)
+            if n <= LONGEST["repeat"]:
+                yield from _repeating(folder, n, threads, device)
+    for found in bench_templates(sizes if places else TEMPLATES):
+        yield from map(_of_templates, found)
+
+
+def _of_templates(row: Row) -> ScaleRow:
+    """A row of template search: a query by itself takes as long as one of many."""
+    places = int(row.case.partition("=")[2])
+    size = row.file_bytes
+    return ScaleRow(
+        row.case,
+        row.contender,
+        places,
+        row.seconds,
+        row.seconds,
+        row.peak_bytes,
+        route_bytes=size,
+        bytes_per_place=None if size is None else size / places,
+        threads=row.threads,
+        skipped=row.skipped,
+    )
 
 
 def _case(
