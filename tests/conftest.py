@@ -53,6 +53,7 @@ FEW_VIEWS = {
         "test_faults",
         "test_readme",
         "test_footprint",
+        "test_scale",
         "test_cli_networks",
         "test_pretrained",
     ),

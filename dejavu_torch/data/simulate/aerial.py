@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import torch
@@ -250,6 +250,7 @@ def paint_route(frames: int, seed: int = 0) -> Tensor:
     return F.avg_pool2d(canvas.pixels.clamp(0, 1), scale)
 
 
+@lru_cache(1)  # all flights over them share them, and they are small
 def paint_tiles(seed: int = 0) -> tuple[Tensor, Tensor]:
     """Paint the two tiles of ground that repeats: one lies above the middle of the road, one below.
 

@@ -1,0 +1,290 @@
+"""`dejavu bench scale`: what is made and kept, what is measured of it, and what is written."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from command_line import fails, run
+from helpers import all_of, refused
+from torch import Tensor
+
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.evaluation.baselines import as_int8, interpolated
+from dejavu_torch.experiments import scale
+from dejavu_torch.experiments.made import BLOCK, Likeness, MadeRoute, likeness
+from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tiles_of
+from dejavu_torch.experiments.scale import (
+    CONTENDERS,
+    FIXED,
+    FLOWN,
+    ONE_CHUNK,
+    PLACED,
+    REPEATED,
+    Faiss,
+    Interpolated,
+    Mapped,
+    ScaleRow,
+    Task,
+    exponents,
+    scale_tables,
+    spread,
+)
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.model import DejaVu
+
+
+def smooth(count: int, numbers: int, seed: int = 0) -> Tensor:
+    """Descriptors of length 1 that change little from place to place."""
+    noise = torch.randn(count + 15, numbers, generator=torch.Generator().manual_seed(seed))
+    return F.normalize(F.avg_pool1d(noise.T[None], 16, 1)[0].T, dim=1)
+
+
+@pytest.fixture(scope="module")
+def like() -> Likeness:
+    """Of a route whose numbers 0 to 3 are seen again as 0.8 of them, 4 to 7 as 0.4, with noise."""
+    route, shown = smooth(6000, 8), torch.arange(0, 6000, 2)
+    kept = torch.tensor([0.8] * 4 + [0.4] * 4)
+    noise = torch.randn(len(shown), 8, generator=torch.Generator().manual_seed(1))
+    return likeness(route, kept * route[shown] + 0.1 * noise, shown)
+
+
+def test_what_is_left_of_each_number_is_measured(like: Likeness) -> None:
+    assert torch.allclose(like.rho, torch.tensor([0.8] * 4 + [0.4] * 4), atol=0.03)
+    assert torch.allclose(like.spread.T @ like.spread, 0.01 * torch.eye(8), atol=0.002)
+    assert float(like.sizes.square().mean()) == pytest.approx(1, abs=0.01)
+
+
+def test_any_part_of_a_made_route_is_made_by_itself(like: Likeness) -> None:
+    length = 2 * BLOCK + 100
+    whole = all_of(MadeRoute(like, length), 1000)
+    assert whole.shape == (length, 8)
+    (part,) = MadeRoute(like, length).between(BLOCK - 30, BLOCK + 30)
+    assert torch.equal(part, whole[BLOCK - 30 : BLOCK + 30])
+    assert torch.equal(MadeRoute(like, length).read(range(5, 9000 - 900, 1000)), whole[5:8100:1000])
+    assert not torch.allclose(all_of(MadeRoute(like, 64, seed=1)), whole[:64])
+
+
+def test_a_made_route_is_like_the_one_that_was_measured(like: Likeness) -> None:
+    route, made = smooth(6000, 8), all_of(MadeRoute(like, 6000), 1000)
+    assert torch.linalg.vector_norm(made, dim=1).allclose(torch.ones(6000))
+    for apart in (1, 4, 8, 40):  # the triangle of a moving mean, and nothing beyond it
+        own, theirs = (float((x[apart:] * x[:-apart]).sum(1).mean()) for x in (made, route))
+        assert own == pytest.approx(theirs, abs=0.06)
+    assert torch.allclose(made.T @ made / 6000, route.T @ route / 6000, atol=0.04)
+
+
+def test_made_queries_are_like_those_that_were_measured(like: Likeness) -> None:
+    route, shown = MadeRoute(like, 6000), torch.arange(0, 6000, 2)
+    again, own = route.seen_again(shown), all_of(route)[shown]
+    # scaled to length 1: what is left is told by the ratio of the two halves
+    rho = ((again - again.mean(0)) * (own - own.mean(0))).mean(0) / own.var(0)
+    assert float(rho[:4].mean() / rho[4:].mean()) == pytest.approx(2, abs=0.3)
+    assert torch.equal(again, MadeRoute(like, 6000).seen_again(shown))
+
+
+def test_too_little_to_measure_is_refused() -> None:
+    with refused("4 places", "16"):
+        likeness(smooth(4, 3), smooth(4, 3), torch.arange(4))
+
+
+@pytest.fixture(scope="module")
+def tiled() -> tuple[DejaVu, dict[str, Tensor]]:
+    """A descriptor of ground that repeats, and its tiles."""
+    model = DejaVu(whitening=Whitening(numbers=16))
+    assert model.whitening is not None
+    road = AerialRoad(frames=200, ground="repeat", noise=0, drift=0, yaw=0)
+    features = torch.cat([model.describe(part) for part in road.batches(64)])
+    noise = torch.randn(features.shape, generator=torch.Generator().manual_seed(0))
+    model.whitening.learn(features, [(features + 0.02 * noise, torch.arange(200))])
+    return model, tiles_of(model)
+
+
+def test_descriptors_of_tiles_are_those_of_the_frames(tiled: tuple[DejaVu, dict[str, Tensor]]) -> None:
+    model, tiles = tiled
+    road = AerialRoad(frames=math.lcm(*TILES), ground="repeat", noise=0, drift=0, yaw=0)
+    at = range(100, 10**6, 99_991)
+    own = TiledRoute(**tiles, length=road.length).read(at)
+    drawn = model.whitened(model.describe(road.read(at)))
+    assert (own * drawn).sum(1).min() > 0.97  # the light moves a few gradients to another bin
+    elsewhere = (own @ drawn.T).fill_diagonal_(0)
+    assert elsewhere.max() < (own * drawn).sum(1).min()
+
+
+def test_a_step_holds_the_share_that_is_asked_for() -> None:
+    route = smooth(2000, 32)
+    for chunk in ("route", 500):
+        step = step_that_holds(0.8, ArrayTraverse(route), chunk)  # type: ignore[arg-type]
+        kept = SpectralMapper(None, step=step, chunk=chunk)(route)  # type: ignore[arg-type]
+        back = torch.cat([kept.rebuilt(g) for g in range(len(kept.chunks))])
+        lost = (back - route).square().sum() / (route - route.mean(0)).square().sum()
+        assert float(lost) == pytest.approx(0.2, abs=0.02)
+
+
+def test_interpolated_frames_are_those_of_the_baseline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scale, "ROWS", 64)  # several pieces
+    route, queries = smooth(501, 12), smooth(501, 12, seed=1)[:50]
+    size = Interpolated(12 * 30 / 501).learn(ArrayTraverse(route), tmp_path / "kept")
+    back, k, keys = interpolated(as_int8(route), 12 * 30)
+    assert size == 12 * keys <= 12 * 30
+    expected = (queries @ F.normalize(back, dim=1).T).max(1)
+    found = Interpolated(0).load(tmp_path / "kept", "cpu")(queries)
+    assert k > 1
+    assert torch.allclose(-found.score, expected.values, atol=1e-2)
+    assert ((found.place - expected.indices).abs() <= 1).double().mean() > 0.9
+
+
+@pytest.mark.parametrize("factory", ["Flat", "IVF{cells},PQ4np", "HNSW16,Flat"])
+def test_an_index_finds_the_nearest_and_tells_its_bytes(factory: str, tmp_path: Path) -> None:
+    pytest.importorskip("faiss")
+    route = smooth(1200, 16)
+    size = Faiss(factory).learn(ArrayTraverse(route), tmp_path / "kept")
+    found = Faiss(factory).load(tmp_path / "kept", "cpu")(route[::50])
+    assert ((found.place - torch.arange(0, 1200, 50)).abs() <= 5).double().mean() > 0.9
+    code = 4 if "PQ" in factory else 64
+    assert code * 1200 <= size <= (code + 200) * 1200
+    if factory != "HNSW16,Flat":
+        assert size <= code * 1200 + 1000
+
+
+def test_a_null_tells_the_frames_that_it_shuffled(tmp_path: Path) -> None:
+    route = smooth(600, 16)
+    null = Mapped(8.0, "route", shuffled=True)
+    null.learn(ArrayTraverse(route), tmp_path / "kept")
+    found = null.load(tmp_path / "kept", "cpu")(route[::20])
+    assert ((found.place - torch.arange(0, 600, 20)).abs() <= 5).double().mean() > 0.9
+
+
+def in_this_process(module: str, arguments: Any) -> dict[str, Any]:
+    """In the place of `in_process`; what is given goes through JSON, as there."""
+    what, task, folder = json.loads(json.dumps(arguments))
+    threads = torch.get_num_threads()
+    try:
+        facts: dict[str, Any] = getattr(scale, what)(Task(*task), Path(folder))
+    except Exception as error:
+        return {"skipped": str(error)}
+    finally:
+        torch.set_num_threads(threads)
+    return facts
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scale, "in_process", in_this_process)
+    for name, value in {
+        "RENDERED": 600,
+        "SHUFFLED": 600,
+        "CHECKED": 520,
+        "QUERIES": 40,
+        "CHUNK": 128,
+        "BATCH": 20,
+    }.items():
+        monkeypatch.setattr(scale, name, value)
+    kept = ("dejavu 4 B", "null 4 B", "faiss flat")
+    for name in list(PLACED):
+        if name not in kept:
+            monkeypatch.delitem(PLACED, name)
+
+
+def test_rows_of_all_cases_are_written(
+    small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("bench", "scale", "--places", "600", "900", "--out", tmp_path)
+    written = json.loads((tmp_path / "bench.json").read_text())
+    rows = {(row["case"], row["contender"]): row for row in written["rows"]}
+    cases = [
+        "places=600",
+        "repeat=600",
+        "made=520",
+        "places=900",
+        "repeat=900",
+        "templates=600",
+        "templates=900",
+    ]
+    assert list(dict.fromkeys(case for case, _ in rows)) == cases
+    for case in ("places=600", "made=520", "places=900"):
+        ours = rows[case, "dejavu 4 B"]
+        assert 3.8 < ours["bytes_per_place"] <= 4.0
+        assert ours["recall_at_1"] > 0.8
+        assert ours["queries"] == 40
+        assert ours["ratio_to_ours"] == 1
+        assert min(ours[key] for key in ("seconds", "seconds_one", "learn_rate", "bytes")) > 0
+    assert "600" in rows["places=900", "null 4 B"]["skipped"]
+    assert rows["repeat=600", "null"]["bytes_per_place"] == pytest.approx(
+        rows["repeat=600", ONE_CHUNK]["bytes_per_place"], rel=0.02
+    )
+    assert "600" in rows["repeat=900", FLOWN]["skipped"]
+    assert set(REPEATED) <= {name for _, name in rows}
+    assert rows["templates=900", "dejavu two layers"]["seconds"] > 0
+    assert 0.5 < written["exponents"]["repeat"][FIXED]["route_bytes"] < 1.5
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    shown = capsys.readouterr().out
+    assert "places=600" in shown
+    assert "exponents" in shown
+
+
+def test_without_faiss_its_rows_say_so(small: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    np.save(tmp_path / "drawn.npy", smooth(600, 16).numpy())
+    row = scale.measured(Task("places=600", "faiss flat", "drawn", 600, 0, 1, "cpu"), tmp_path)
+    assert "faiss" in (row.skipped or "")
+    assert row.seconds is None
+
+
+def test_a_process_learns_and_another_localizes(tmp_path: Path) -> None:
+    route = smooth(600, 16)
+    np.save(tmp_path / "drawn.npy", route.numpy())
+    scale.save_file(
+        {"queries": route[::20].contiguous(), "truth": spread(600)[::20].contiguous()},
+        tmp_path / "places=600.safetensors",
+    )
+    row = scale.measured(Task("places=600", "dejavu 4 B", "drawn", 600, 0, 1, "cpu"), tmp_path)
+    assert row.skipped is None
+    assert row.recall_at_1 == 1
+    assert not list(tmp_path.glob("kept*"))
+
+
+def test_bad_sizes_are_refused_ahead_of_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for given, word in (
+        (("--places", "7"), "500"),
+        (("sim:aerial",), "takes no sources"),
+        (("--device", "tpu"), "tpu"),
+    ):
+        error = fails(capsys, "bench", "scale", *given, "--out", tmp_path / "out")
+        assert word in error
+    error = fails(capsys, "bench", "memory", "--device", "cuda", "--out", tmp_path / "out")
+    assert "takes no device" in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_queries_lie_evenly_along_the_route() -> None:
+    assert spread(10).tolist() == list(range(10))
+    assert len(spread(10**6)) == scale.QUERIES
+    assert int(spread(10**6)[-1]) == 10**6 - 10**6 // scale.QUERIES
+
+
+def test_exponents_and_tables() -> None:
+    rows = [
+        ScaleRow(f"{kind}={n}", "dejavu", n, seconds=1e-6 * n**power, route_bytes=7)
+        for kind, power in (("places", 0.5), ("repeat", 1.0))
+        for n in (100, 1000, 10_000)
+    ] + [ScaleRow("places=100", "faiss flat", 100, skipped="no faiss")]
+    found = exponents(rows)
+    assert found["places"]["dejavu"]["seconds"] == pytest.approx(0.5)
+    assert found["repeat"]["dejavu"] == pytest.approx({"seconds": 1, "route_bytes": 0}, abs=1e-9)
+    assert "faiss flat" not in found["places"]
+    tables = dict(scale_tables(rows))
+    assert tables["places=100"][2][0] == "faiss flat"
+    assert tables["places=100"][2][-1] == "skipped: no faiss"
+    assert set(CONTENDERS) == set(PLACED) | set(REPEATED)
