@@ -46,7 +46,8 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
-from dejavu_torch.recognition.matching import Found, Matching, found_lowest, joined
+from dejavu_torch.recognition.matching import Found, Matching, joined
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, Search, Searcher, check_scanned, check_search
 from dejavu_torch.streaming import sample as streaming
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread
 from dejavu_torch.streaming.sample import sample_of
@@ -64,7 +65,6 @@ from dejavu_torch.types import (
 
 log = logging.getLogger("dejavu_torch")
 
-SCORES_AT_ONCE = 2**24  # numbers of Q x N held at a time
 TRIAL_SCORES = 2**22  # of the queries of a trial at all places
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors on the device at a time
@@ -187,6 +187,7 @@ class DejaVu(nn.Module):
         self.frame_names: list[str] = []  # of the reference's frames; empty where they have none
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
+        self._searcher: Searcher | None = None
 
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
@@ -604,6 +605,7 @@ class DejaVu(nn.Module):
         queries: Traverse | Tensor,
         progress: str | None = None,
         sequence: SequenceModel | None = None,
+        search: Search = "auto",
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
@@ -612,6 +614,7 @@ class DejaVu(nn.Module):
             progress: text of a progress bar on a terminal; None is no bar.
             sequence: scores consecutive queries together, as `SequenceMatcher` and `PlaceFilter` do; None
                 takes each by itself.
+            search: how the best place of a single query is searched for, see `Searcher`.
 
         Shape: -> Match of (Q,) on the CPU.
 
@@ -620,18 +623,22 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        matches = self.matches(queries, progress, sequence)
+        matches = self.matches(queries, progress, sequence, search)
         return Match.joined(matches)
 
     def localize_descriptors(
-        self, descriptors: Tensor, sequence: SequenceModel | None = None, order: Tensor | None = None
+        self,
+        descriptors: Tensor,
+        sequence: SequenceModel | None = None,
+        order: Tensor | None = None,
+        search: Search = "auto",
     ) -> Match:
         """As `localize`, of descriptors (Q,K) as the map's own are: whitened where the model whitens.
 
         Args:
             order: (N,) which frame each place of a shuffled map is; the match then counts frames.
         """
-        found = self.found(descriptors, self.matching(sequence), order)
+        found = self.found(descriptors, self.matching(sequence, search), order)
         return found.match(self.threshold_of(sequence), self.precision)
 
     def found(self, descriptors: Tensor, matching: Matching, order: Tensor | None = None) -> Found:
@@ -644,16 +651,19 @@ class DejaVu(nn.Module):
         queries: Traverse | Tensor,
         progress: str | None = None,
         sequence: SequenceModel | None = None,
+        search: Search = "auto",
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
-        yield from self.matches_of(self._checked(queries, progress, sequence), sequence)
+        check_search(search, self.map)
+        yield from self.matches_of(self._checked(queries, progress, sequence), sequence, search=search)
 
     def matches_of(
         self,
         descriptors: Iterable[Tensor],
         sequence: SequenceModel | None = None,
         look: Callable[[Tensor], None] | None = None,
+        search: Search = "auto",
     ) -> Iterator[Match]:
         """As `matches`, of batches of descriptors (B,K); each is asked for when its match is.
 
@@ -662,7 +672,7 @@ class DejaVu(nn.Module):
         """
         self._require_map()
         self.check_precision(sequence)
-        threshold, matching = self.threshold_of(sequence), self.matching(sequence)
+        threshold, matching = self.threshold_of(sequence), self.matching(sequence, search)
         for part in self._found(descriptors, matching._replace(look=look)):
             yield part.match(threshold, self.precision)
 
@@ -672,11 +682,12 @@ class DejaVu(nn.Module):
         k: int,
         apart: int = 5,
         sequence: SequenceModel | None = None,
+        search: Search = "auto",
     ) -> Candidates:
         """The k best places of each query, no two of them near each other; the first is `localize`'s.
 
         Args:
-            queries, sequence: as of `localize`.
+            queries, sequence, search: as of `localize`.
             k: how many, from 1 to the number of places.
             apart: places, at least 0: any two candidates of a query differ by more.
 
@@ -690,7 +701,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        parts = list(self.candidate_batches(queries, k, apart, sequence=sequence))
+        parts = list(self.candidate_batches(queries, k, apart, sequence=sequence, search=search))
         return Candidates(*map(torch.cat, zip(*parts, strict=True)))
 
     def candidate_batches(
@@ -700,11 +711,13 @@ class DejaVu(nn.Module):
         apart: int = 5,
         progress: str | None = None,
         sequence: SequenceModel | None = None,
+        search: Search = "auto",
     ) -> Iterator[Candidates]:
         """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
         check_candidates(k, apart, self.map.places)
-        matching = Matching(sequence, ranks=k, apart=apart)
+        check_search(search, self.map)
+        matching = Matching(sequence, ranks=k, apart=apart, search=search)
         for part in self._found(self._checked(queries, progress, sequence), matching):
             yield part.candidates
 
@@ -723,10 +736,11 @@ class DejaVu(nn.Module):
                 self.check_queries(shape, features.shape[1], queries.name)
             yield self.whitened(features)
 
-    def matching(self, sequence: SequenceModel | None) -> Matching:
+    def matching(self, sequence: SequenceModel | None, search: Search = "auto") -> Matching:
         """A way to match queries, with probabilities where the map is calibrated for it."""
         calibration = self.calibration
-        return Matching(sequence, platt=None if calibration is None else calibration.of(sequence))
+        platt = None if calibration is None else calibration.of(sequence)
+        return Matching(sequence, platt=platt, search=search)
 
     def check_precision(self, sequence: SequenceModel | None) -> None:
         """Refuse a precision that nothing tells of.
@@ -758,12 +772,20 @@ class DejaVu(nn.Module):
             matching.sequence.check(None, self.map.places)
         at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
         device = self.map.positions.device  # many descriptors lie in a file
-        if matching.lowest and order is None:  # no score of another place is needed
-            return self._lowest(batches, at_once)
+        if matching.searches and order is None:  # no score of most other places is needed
+            searcher = self.searcher(matching.search)
+            parts = (part for descriptors in batches for part in descriptors.split(ROWS))
+            return (matching.search_for(part.to(device), searcher) for part in parts)
+        check_scanned(matching.search)
         parts = (part.to(device) for descriptors in batches for part in descriptors.split(at_once))
         sequence = matching.sequence
         alone = not matching.lengths and matching.platt is None and order is None
         if sequence is not None and alone:  # not all scores may be needed
+            best = sequence.best(parts, self.map) if matching.ranks == 1 and matching.look is None else None
+            if best is not None:
+                return (
+                    Found(Candidates(place[:, None].cpu(), score[:, None].cpu())) for score, place in best
+                )
             return matching._replace(sequence=None).stream(self.map.sequences(parts, sequence))
         scores: Iterator[Tensor] = map(self.map.scores, parts)
         if order is not None:
@@ -771,15 +793,14 @@ class DejaVu(nn.Module):
             scores = (part[:, place.to(part.device)] for part in scores)
         return matching.stream(scores)
 
-    def _lowest(self, batches: Iterable[Tensor], at_once: int) -> Iterator[Found]:
-        """The best place of each query, by the map's own way or from `at_once` queries' scores at a time."""
-        for part in (part for descriptors in batches for part in descriptors.split(ROWS)):
-            queries = part.to(self.map.positions.device)
-            lowest = self.map.lowest(queries)
-            if lowest is None:
-                yield from Matching().stream(map(self.map.scores, queries.split(at_once)))
-            else:
-                yield found_lowest(*lowest)
+    def searcher(self, method: Search = "auto") -> Searcher:
+        """What finds the best places on the map; kept, with what it made of the map, until that changes.
+
+        Its `told` says how the queries so far were searched for.
+        """
+        if self._searcher is None or not self._searcher.fits(self.map, method):
+            self._searcher = Searcher(self.map, method)
+        return self._searcher
 
     def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""

@@ -295,6 +295,13 @@ class SequenceModel(nn.Module, ABC):
         """
         return self.stream(map(route.scores, batches))
 
+    def best(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[tuple[Tensor, Tensor]] | None:
+        """What is best by the scores of `follow`, where that takes less than scores of all places, else None.
+
+        Shape: batches (B,D) -> (B,) scores and (B,) int64 places, -1 for none, each.
+        """
+        return None
+
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:
         """Refuse, or warn of, a number of queries or places that it makes no sense for.

@@ -58,6 +58,36 @@ def same_maps(first: Path, second: Path) -> bool:
 # what works
 
 
+def test_searches_of_localize(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("faiss")
+    path, out = tmp_path / "m.safetensors", tmp_path / "m.csv"
+    run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--whitening.views", "2")
+    found, told = {}, {}
+    for search in ("auto", "scan", "bound", "ivf"):
+        capsys.readouterr()
+        run("localize", path, SECOND, "--search", search, "--out", out)
+        told[search], found[search] = capsys.readouterr().out, places(out)
+    assert found["auto"] == found["scan"] == found["bound"]
+    assert "% of 3 chunks" in told["bound"]
+    assert "of 64 queries" in told["ivf"]
+    assert "search:" not in told["auto"] + told["scan"]
+    run("localize", path, SECOND, "--filter", "--out", out)
+    always = places(out)
+    run("localize", path, SECOND, "--filter", "--search_every", "8", "--out", out)
+    assert sum(a == b for a, b in zip(places(out), always, strict=True)) > 90
+    options = (("--search", "all"), ("--search", "ivf", "--filter"), ("--search_every", "8"))
+    for words, facts in zip(
+        options, (("all",), ("ivf", "scan"), ("--search_every 8", "--filter")), strict=True
+    ):
+        error = fails(capsys, "localize", path, SECOND, *words, "--out", out)
+        assert [fact for fact in facts if fact not in error] == []
+
+
+def places(path: Path) -> list[str]:
+    with path.open() as file:
+        return [row["place"] for row in csv.DictReader(file)]
+
+
 def test_two_processes_write_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", FEWEST)  # as it is in another process
     kinds = {"spectral": ("--whitening.views", "2"), "templates": TEMPLATES}

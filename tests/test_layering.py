@@ -42,7 +42,7 @@ ARROWS = {
     "features": "types resize",
     "periods": "types memory",
     "database": "types memory data periods",
-    "recognition": "types",
+    "recognition": "types database",
     "motion": "data memory types",
     "streaming": "types data features database",
     "model": "types text data features periods database recognition motion streaming",

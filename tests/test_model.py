@@ -358,7 +358,7 @@ def test_few_scores_are_held_at_once(monkeypatch: pytest.MonkeyPatch, at_once: i
     model = wave_model().learn(waves())
     query = waves()[::2] + torch.rand(36, 2)
     expected = model.localize(query)
-    monkeypatch.setattr("dejavu_torch.model.SCORES_AT_ONCE", at_once)
+    monkeypatch.setattr("dejavu_torch.recognition.search.SCORES_AT_ONCE", at_once)
     with Largest() as largest:
         found = model.localize(query)
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))

@@ -60,7 +60,7 @@ def test_the_first_candidate_is_what_localize_finds(
 ) -> None:
     queries = torch.rand(40, 6, generator=torch.Generator().manual_seed(1))
     index, score = model.candidates(queries, 5, apart=3)
-    monkeypatch.setattr("dejavu_torch.model.SCORES_AT_ONCE", at_once)
+    monkeypatch.setattr("dejavu_torch.recognition.search.SCORES_AT_ONCE", at_once)
     match = model.localize(queries)
     found = model.candidates(ArrayTraverse(queries), 5, apart=3)
     assert torch.equal(found.index, index)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -35,6 +35,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import NEVER
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.search import Search, check_scanned, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.streaming.coder import Made, code_here
 from dejavu_torch.streaming.work import remove_work, work_folder_of
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 NO_CALIBRATION = "none"
 UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
 COMPARED = ("map.safetensors", "matches.csv")  # beside a report of them
+SAMPLE = 64  # queries for which an inexact search is compared with a scan
 APART = 5  # places: any two candidates of a query are further apart
 
 
@@ -183,6 +185,8 @@ def run_localize(
     speeds: list[float] | None = None,
     filter: bool = False,
     moves: list[float] | None = None,
+    search_every: int | None = None,
+    search: Search = "auto",
     device: str = "cpu",
     features: nn.Module | None = None,
 ) -> None:
@@ -203,6 +207,11 @@ def run_localize(
             --threshold are -log probability, and what is more likely than not is accepted
         moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
             if not given
+        search_every: of the filter, queries from one search of all places to the next; in between only those
+            near the last place are scored; 1 if not given
+        search: of single queries: scan scores all places; bound, of a map with chunks, passes over those that
+            cannot be best, and finds the same; ivf, with faiss, scores about one place in 32 and may miss
+            some; auto takes scan or bound, by what the first queries show
         device: what computes: cpu, cuda, cuda:1 or mps
         features: class of the map's features, if not ours
     """
@@ -226,20 +235,27 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, progress=True)
         _print_steps(query)
-    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
+    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold, search_every)
     if matcher is not None:
         matcher.check(None, model.map.places)
+        check_scanned(search)
+    else:
+        check_search(search, model.map)
+        model.searcher(search).sample = SAMPLE
     model.check_precision(matcher)
     threshold = model.threshold_of(matcher)
-    matches = model.matches(query, "localizing", matcher)
+    matches = model.matches(query, "localizing", matcher, search)
     if top is not None:
-        candidates = model.candidate_batches(query, top, APART, "localizing", matcher)
+        candidates = model.candidate_batches(query, top, APART, "localizing", matcher, search)
         matches = (batch.as_match(threshold) for batch in candidates)
     total, accepted = _write_matches(out, matches, query, model, top)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
     elif threshold is None and model.precision is None:
         print("no threshold given or stored in the map: every query with a finite score is accepted")
+    told = model.searcher(search).told
+    if matcher is None and told.method in ("bound", "ivf"):
+        print(told)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
@@ -254,6 +270,7 @@ def run_live(
     sequence: int | None = None,
     speeds: list[float] | None = None,
     moves: list[float] | None = None,
+    search_every: int | None = None,
     threshold: float | None = None,
     precision: float | None = None,
     page: int | None = None,
@@ -277,6 +294,7 @@ def run_live(
         sequence: frames that are matched together in place of the filter; 1 takes each by itself
         speeds: as of `dejavu localize`
         moves: as of `dejavu localize`
+        search_every: as of `dejavu localize`
         threshold: accept a match whose score is below
         precision: accept instead what is at least as probably right, such as .99
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
@@ -303,7 +321,8 @@ def run_live(
     _accept_by(model, threshold, precision)
     if sequence is None:
         filter = True
-    matcher = _sequence_of(1 if sequence is None else sequence, speeds, filter, moves, APART, threshold)
+    length = 1 if sequence is None else sequence
+    matcher = _sequence_of(length, speeds, filter, moves, APART, threshold, search_every)
     model.check_precision(matcher)
     follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
 
@@ -613,6 +632,7 @@ def run_export(
         speeds: as of `dejavu localize`
         filter: as of `dejavu localize`, with a state likewise
         moves: as of `dejavu localize`
+        search_every: as of `dejavu localize`
         threshold: noted in the file; the map's own if not given
         features: class of the map's features, if not ours
     """
@@ -817,11 +837,12 @@ def _sequence_of(
     moves: list[float] | None,
     within: int,
     threshold: float | None,
+    search_every: int | None = None,
 ) -> SequenceModel | None:
     """What scores queries together: the filter, or a sum over so many; none for one.
 
     Args:
-        within, threshold: of the filter, which keeps its own where that is None.
+        within, threshold, search_every: of the filter, which keeps its own where that is None.
     """
     matcher = SequenceMatcher(length, (1.0,) if speeds is None else speeds)
     if filter and length > 1:
@@ -830,8 +851,12 @@ def _sequence_of(
         raise InputError(f"--speeds {speeds} without --sequence; expected --sequence T with them")
     if moves is not None and not filter:
         raise InputError(f"--moves {moves} without --filter; expected both")
+    if search_every is not None and not filter:
+        raise InputError(f"--search_every {search_every} without --filter; expected both")
     if filter:
-        chosen = PlaceFilter(within=within) if moves is None else PlaceFilter(moves, within=within)
+        settings: dict[str, Any] = {"moves": moves, "search_every": search_every}
+        given = {name: value for name, value in settings.items() if value is not None}
+        chosen = PlaceFilter(within=within, **given)
         chosen.threshold = chosen.threshold if threshold is None else threshold
         return chosen
     return None if length == 1 else matcher

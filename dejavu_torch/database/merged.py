@@ -118,6 +118,21 @@ class MergedMap(PlaceMap):
             1,
         )
 
+    def score_blocks(
+        self, queries: Tensor, start: int = 0, stop: int | None = None
+    ) -> Iterator[tuple[int, Tensor]]:
+        """See `PlaceMap`: the blocks of each part."""
+        stop = self.places if stop is None else stop
+        for first, part in zip(self._starts, self._parts, strict=False):
+            if start < first + part.places and stop > first:
+                own = max(0, start - first), min(part.places, stop - first)
+                for begins, scores in part.score_blocks(queries, *own):
+                    yield first + begins, scores
+
+    @property
+    def block_places(self) -> int:
+        return max((part.block_places for part in self._parts), default=1)
+
     def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
         """See `PlaceMap`: along trajectories, route by route."""
         if not sequence.shifts:

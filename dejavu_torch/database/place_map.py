@@ -92,6 +92,11 @@ class PlaceMap(nn.Module, ABC):
         """
         yield start, self.scores_between(queries, start, self.places if stop is None else stop)
 
+    @property
+    def block_places(self) -> int:
+        """Places of the largest block of `score_blocks`, about."""
+        return self.places
+
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
         """The lowest score of each query and its place, where that takes less than the scores of all places.
 

@@ -264,21 +264,21 @@ class SpectralMap(PlaceMap):
         """The chunks as the file holds them: what `of_chunks` makes the same map of."""
         chunks = []
         for g, (length, step) in enumerate(zip(self.lengths.tolist(), self.steps.tolist(), strict=True)):
-            stream, own = self._streams[g], self._of(range(g, g + 1))
+            stream, own = self._streams[g], self.coefficients(range(g, g + 1))
             if stream is None:
                 stream = self._streams[g] = encode(coded_levels(own, self.dimension)[0])
             escapes = own.level[own.level.to(torch.int32).abs() > 127]
             chunks.append(CodedChunk(length, step, stream, escapes.to(torch.int32).cpu()))
         return chunks
 
-    def _of(self, chunks: range) -> Coefficients:
-        """The coefficients of chunks."""
+    def coefficients(self, chunks: range) -> Coefficients:
+        """Those of chunks one behind the other."""
         some = slice(self.bounds[chunks.start], self.bounds[chunks.stop])
         return Coefficients(self.counts[self._span(chunks)], self.feature[some], self.level[some])
 
     def lines(self, chunk: int) -> Lines:
         """The coefficients of a chunk, by line and feature."""
-        counts, feature, level = self._of(range(chunk, chunk + 1))
+        counts, feature, level = self.coefficients(range(chunk, chunk + 1))
         value = level * self.steps[chunk]
         return Lines(lines_of(counts, len(level)).long(), feature.long(), value)
 
@@ -363,7 +363,7 @@ class SpectralMap(PlaceMap):
         All of them at a time unless the chunk is long.
         """
         length, (slot, factor, one) = self._length(chunks.start), self._slots(chunks)
-        counts, feature, level = self._of(chunks)
+        counts, feature, level = self.coefficients(chunks)
         line = lines_of(counts, level.shape[0])
         size, places = len(chunks) * one.count, len(chunks) * length
         mean = self.mean.to(factor) * (math.sqrt(length) * one.factor[0])  # of line 0
@@ -388,7 +388,7 @@ class SpectralMap(PlaceMap):
         """
         length, (slot, factor, one) = self._length(chunks.start), self._slots(chunks)
         size = len(chunks) * one.count
-        own = self._of(chunks)
+        own = self.coefficients(chunks)
         lines = compiled_sums(queries, own, slot, factor, size)
         if lines is None:
             line = lines_of(own.counts, own.level.shape[0])
@@ -421,9 +421,13 @@ class SpectralMap(PlaceMap):
         return torch.cat([scores for _, scores in self.score_blocks(queries, start, stop)], 1)
 
     def score_blocks(
-        self, queries: Tensor, start: int = 0, stop: int | None = None
+        self, queries: Tensor, start: int = 0, stop: int | None = None, rebuild: bool | None = None
     ) -> Iterator[tuple[int, Tensor]]:
-        """See `PlaceMap`: of runs of equally long chunks, as many as the processor's cache has room for."""
+        """See `PlaceMap`: of runs of equally long chunks, as many as the processor's cache has room for.
+
+        Args:
+            rebuild: whether by descriptors that are rebuilt; None does what is faster, see `rebuilds`.
+        """
         stop = self.places if stop is None else stop
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
             raise InputError(
@@ -433,15 +437,9 @@ class SpectralMap(PlaceMap):
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
-        # an exported program keeps one way, which must not hang on the number of queries
-        exported = torch.compiler.is_compiling()
-        rebuild = not exported and self.rebuilds(queries.shape[0])
-        rows = self.dimension
-        if not (exported or rebuild):
-            rows = queries.shape[0] * (1 + len(self.level) // max(1, self.places))
-        for chunks in self._runs(self._inside(start, stop), max(1, rows)):
+        for chunks, rebuilt in self._ways(queries.shape[0], self._inside(start, stop), rebuild):
             span = self._span(chunks)
-            if rebuild:
+            if rebuilt:
                 scores = self._rebuilt_scores(queries, chunks)
             elif self.metric == "cosine":
                 per_norm = self.per_norm(span.start, span.stop).to(queries)
@@ -454,6 +452,32 @@ class SpectralMap(PlaceMap):
                 scores = (scores + length.square()).clamp(min=0)
             low, high = max(start, span.start), min(stop, span.stop)
             yield low, scores[:, low - span.start : high - span.start]
+
+    def product_blocks(self, queries: Tensor) -> Iterator[Tensor]:
+        """Inner products with the descriptors of all places, by runs of equally long chunks: (Q,G,W) each."""
+        for chunks, rebuilt in self._ways(queries.shape[0], range(len(self.chunks))):
+            if rebuilt:
+                parts = (queries[:, some] @ part.to(queries) for some, part in self._series(chunks))
+                products = functools.reduce(torch.add, parts)
+            else:
+                products = self.products(queries, chunks)
+            yield products.unflatten(1, (len(chunks), -1))
+
+    @property
+    def block_places(self) -> int:
+        return max(self.longest, BLOCK // max(1, self.dimension))
+
+    def _ways(self, queries: int, chunks: range, rebuild: bool | None = None) -> Iterator[tuple[range, bool]]:
+        """Runs of these chunks for so many queries, and whether they are rebuilt."""
+        rows = self.dimension
+        if torch.compiler.is_compiling():  # a program keeps one way, whatever the number of queries
+            rebuild = False
+        else:
+            rebuild = self.rebuilds(queries) if rebuild is None else rebuild
+            if not rebuild:
+                rows = max(1, queries * (1 + len(self.level) // max(1, self.places)))
+        for run in self._runs(chunks, max(1, rows)):
+            yield run, rebuild
 
     def _rebuilt_scores(self, queries: Tensor, chunks: range) -> Tensor:
         """By rebuilding the descriptors, (Q,W G); of l2, but for the square of the query."""

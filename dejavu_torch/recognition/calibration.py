@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.recognition.candidates import best_candidates
+from dejavu_torch.recognition.candidates import Candidates, best_candidates
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import InputError, Scorer, SequenceModel
@@ -130,7 +130,11 @@ def evidence_of(scores: Tensor) -> Tensor:
 
     Minus its score, and `MARGIN` times how much lower it is than the best beyond `TOLERANCE` places.
     """
-    candidates = best_candidates(scores, min(2, scores.shape[1]), TOLERANCE)
+    return evidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE))
+
+
+def evidence(candidates: Candidates) -> Tensor:
+    """As `evidence_of`, by the two best places of each query that are more than `TOLERANCE` apart, (Q,2)."""
     best, second = candidates.score[:, 0], candidates.score[:, -1]
     margin = torch.where(second.isfinite(), second - best, 0)
     return torch.where(best.isfinite(), MARGIN * margin - best, -math.inf)

@@ -234,11 +234,18 @@ class PlaceFilter(SequenceModel):
         if self.search_every == 1:
             yield from super().follow(batches, route)
         else:
-            yield from self._near(batches, route)
+            yield from (torch.cat([near.row() for near in part]) for part in self._near(batches, route))
+
+    def best(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[tuple[Tensor, Tensor]] | None:
+        """See `SequenceModel`; between two searches a query takes time for its stretch of places alone."""
+        if self.search_every == 1:
+            return None
+        parts = (zip(*(near.best() for near in part), strict=True) for part in self._near(batches, route))
+        return ((torch.cat(score), torch.cat(place)) for score, place in parts)
 
     @torch.no_grad()
-    def _near(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
-        """As `follow`, without gradients."""
+    def _near(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[list[_Near]]:
+        """What each query of a batch is found by, without gradients."""
         places, start, since = route.places, 0, 0
         belief: Tensor | None = None
         search: tuple[Moments, Tensor] | None = None  # of the last: moments, and which places are covered
@@ -260,21 +267,21 @@ class PlaceFilter(SequenceModel):
                     moments, covered = search
                 since += 1
                 belief = self._updated(expected, self.evidence(scores, moments)[0])
-                row = self._row(belief, start, scores, places)
-                found.append(row.masked_fill(~covered, math.inf))
+                found.append(self._told(belief, start, scores, covered))
             if found:
-                yield torch.cat(found)
+                yield found
 
-    def _row(self, belief: Tensor, start: int, scores: Tensor, places: int) -> Tensor:
-        """As `unlikely`, of all places: (W+2,) and (1,W) -> (1,N)."""
+    def _told(self, belief: Tensor, start: int, scores: Tensor, covered: Tensor) -> _Near:
+        """As `unlikely`, of (W+2,) and (1,W); which of all places are covered is (1,N)."""
+        places = covered.shape[1]
         stop, smallest = start + scores.shape[1], torch.finfo(belief.dtype).tiny
         elsewhere = (self.within + 1) * belief[-2] / max(1, places - stop + start)
-        row = -elsewhere.clamp(smallest, 1).log().repeat(1, places)
+        elsewhere = -elsewhere.clamp(smallest, 1).log()
         left, right = min(self.within, start), min(self.within, places - stop)  # neighbours beside the W
         on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
-        near = torch.minimum(row[:, :1], self.unlikely(on, seen))
-        row[:, start - left : stop + right] = near.masked_fill(~seen.isfinite(), math.inf)
-        return row
+        near = torch.minimum(elsewhere, self.unlikely(on, seen))
+        open_ = seen.isfinite() & covered[:, start - left : stop + right]
+        return _Near(near.masked_fill(~open_, math.inf), start - left, elsewhere, covered)
 
     def _likely(self, belief: Tensor) -> range | None:
         """The stretch of a belief's places that hold most of it; None where it is not where the camera is."""
@@ -313,6 +320,33 @@ class PlaceFilter(SequenceModel):
             f"moves={moves}, jump={jump:.3g}, leave={leave:.3g}, enter={enter:.3g}, "
             f"sharpness={sharpness:.3g}, off_map={float(self.off_map):.3g}, within={self.within}"
         )
+
+
+class _Near(NamedTuple):
+    """-log of the probability of every place, most of which are alike.
+
+    scores: (1,W) of the places from `start` on. elsewhere: of each other place that is covered, which is at
+    least as much. covered: (1,N).
+    """
+
+    scores: Tensor
+    start: int
+    elsewhere: Tensor
+    covered: Tensor
+
+    def row(self) -> Tensor:
+        """(1,N)"""
+        row = self.elsewhere.repeat(self.covered.shape).masked_fill(~self.covered, math.inf)
+        row[:, self.start : self.start + self.scores.shape[1]] = self.scores
+        return row
+
+    def best(self) -> tuple[Tensor, Tensor]:
+        """The lowest score and its place, -1 for none: (1,), (1,) int64."""
+        score, place = self.scores.min(1)
+        place = place + self.start
+        if not bool(score < self.elsewhere):  # as good as all others
+            score, place = self.row().min(1)
+        return score, torch.where(score.isfinite(), place, -1)
 
 
 def _logits(*probabilities: float) -> Tensor:

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.recognition.calibration import Platt, Track, evidence_of
+from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, evidence, evidence_of
 from dejavu_torch.recognition.candidates import Candidates, best_candidates
+from dejavu_torch.recognition.search import Search, Searcher, enough
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
@@ -50,11 +51,6 @@ class Found(NamedTuple):
         )
 
 
-def found_lowest(score: Tensor, place: Tensor) -> Found:
-    """What is found by the best place of each query, -1 for none, and its score: (Q,), (Q,)."""
-    return Found(Candidates(place[:, None].cpu(), score[:, None].cpu()))
-
-
 class Matching(NamedTuple):
     """How queries are matched.
 
@@ -64,6 +60,8 @@ class Matching(NamedTuple):
     ranks: candidates of a query. apart: places, any two of them differ by more.
     platt: makes probabilities of how single queries stand out, or the track of a filter; None makes none.
     look: is given the scores (B,N) that places are found by, as for a picture.
+    search: how the best places are searched for where single queries want no more than some of them; see
+        `Searcher`.
     """
 
     sequence: SequenceModel | None = None
@@ -72,6 +70,7 @@ class Matching(NamedTuple):
     apart: int = 0
     platt: Platt | None = None
     look: Callable[[Tensor], None] | None = None
+    search: Search = "auto"
 
     @property
     def single(self) -> bool:
@@ -81,9 +80,20 @@ class Matching(NamedTuple):
         )
 
     @property
-    def lowest(self) -> bool:
-        """Whether the best place of each query and its score are all that is wanted."""
-        return self.ranks == 1 and all(part is None for part in (self.sequence, self.platt, self.look))
+    def searches(self) -> bool:
+        """Whether some of the best places of each query are all that is wanted."""
+        return self.sequence is None and self.look is None
+
+    @torch.no_grad()
+    def search_for(self, queries: Tensor, searcher: Searcher) -> Found:
+        """What is found of descriptors (B,K) by a search, on the CPU: what `found` finds of all scores."""
+        places, platt = searcher.route.places, self.platt
+        wanted = [(self.ranks, self.apart)]
+        if platt is not None:
+            wanted.append((min(2, places), TOLERANCE))
+        best = searcher(queries, max(enough(*one) for one in wanted))
+        candidates, *beside = (Candidates(*(c.cpu() for c in best.candidates(*one))) for one in wanted)
+        return Found(candidates, probability=platt and platt.probability(evidence(*beside)))
 
     def found(self, batches: Iterable[Tensor]) -> Found:
         """What is found by scores (B,N) of single queries, batches one behind the other.
@@ -95,14 +105,14 @@ class Matching(NamedTuple):
     @torch.no_grad()
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Found]:
         """As `found`, a part of the queries at a time, on the CPU and without gradients."""
-        for scores, sums, evidence in self._parts(batches):
+        for scores, sums, stood_out in self._parts(batches):
             if self.look is not None:
                 self.look(scores)
             candidates = best_candidates(scores, self.ranks, self.apart)
             yield Found(
                 Candidates(*(column.cpu() for column in candidates)),
                 {length: best_match(part).map(Tensor.cpu) for length, part in sums.items()},
-                None if self.platt is None or evidence is None else self.platt.probability(evidence),
+                None if self.platt is None or stood_out is None else self.platt.probability(stood_out),
             )
 
     def _parts(self, batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, dict[int, Tensor], Tensor | None]]:

@@ -306,6 +306,26 @@ def test_convention_2_a_place_that_nothing_covers_is_not_reported_by_a_filter() 
         assert torch.equal(found.isinf(), scores.isinf())
 
 
+def test_the_best_place_of_a_neighbourhood_is_that_of_all_scores() -> None:
+    for shown in ([*range(20, 120)], [-1] * 60, [*range(240, 299)], [*range(0, 40), *range(150, 190)]):
+        scores = standing_out(300, shown)
+        scores[torch.arange(len(shown)), torch.tensor(shown).clamp(min=0)] -= 3
+        scores[:, 200:220] = math.inf
+        filter_, batches = PlaceFilter(search_every=20), scores.split(7)
+        rows = torch.cat(list(filter_.follow(batches, Watched(300))))
+        found = filter_.best(batches, Watched(300))
+        assert found is not None
+        score, place = (torch.cat(column) for column in zip(*found, strict=True))
+        assert torch.equal(score, rows.amin(1))
+        assert torch.equal(place, rows.argmin(1))
+    closed = torch.full((5, 30), math.inf)
+    found = PlaceFilter(search_every=3).best([closed], Watched(30))
+    assert found is not None
+    assert next(found)[1].tolist() == [-1] * 5
+    assert PlaceFilter().best([closed], Watched(30)) is None
+    assert SequenceMatcher(3).best([closed], Watched(30)) is None
+
+
 @pytest.mark.parametrize("model", [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3)])
 def test_an_empty_batch_changes_nothing(model: SequenceModel) -> None:
     scores = standing_out(50, [*range(12)])

@@ -1,0 +1,295 @@
+"""Searches find what the scores of all places say."""
+
+from __future__ import annotations
+
+import builtins
+import math
+from typing import Any
+
+import pytest
+import torch
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
+from dejavu_torch.database import spectral
+from dejavu_torch.database.merged import MergedMap
+from dejavu_torch.database.place_map import PlaceMap
+from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.periods.imposed import ImposedPeriods
+from dejavu_torch.recognition import search
+from dejavu_torch.recognition.calibration import Calibration, Platt, evidence_of
+from dejavu_torch.recognition.candidates import best_candidates
+from dejavu_torch.recognition.search import Best, Bound, Searcher, enough, lowest, merged, scan
+
+METRICS = ("cosine", "l2")
+
+
+def walk(places: int, numbers: int = 6, seed: int = 0, smooth: float = 0.9) -> Tensor:
+    """Descriptors that change slowly, the more slowly the nearer `smooth` is to 1."""
+    draw = torch.randn(places, numbers, generator=torch.Generator().manual_seed(seed))
+    rows = [draw[0]]
+    for row in draw[1:]:
+        rows.append(smooth * rows[-1] + (1 - smooth**2) ** 0.5 * row)
+    return torch.stack(rows)
+
+
+def learned(places: int = 300, chunk: Any = 32, step: float = 0.5, **more: Any) -> SpectralMap:
+    metric = more.pop("metric", "cosine")
+    transform = more.pop("transform", "dft")
+    mapper = SpectralMapper(None, step, chunk, transform, metric)
+    return mapper(walk(places, **more))
+
+
+def by_sorting(scores: Tensor, n: int) -> Best:
+    score, index = scores.sort(dim=1, stable=True)
+    return Best(score[:, :n], index[:, :n])
+
+
+def assert_equal(found: Best, expected: Best) -> None:
+    assert torch.equal(found.score, expected.score)
+    finite = expected.score.isfinite()
+    assert torch.equal(found.index[finite], expected.index[finite])
+
+
+@given(
+    rows=st.integers(1, 4),
+    places=st.integers(1, 60),
+    values=st.integers(1, 9),
+    blocks=st.integers(1, 5),
+    n=st.integers(1, 70),
+    seed=st.integers(0, 999),
+)
+def test_the_best_of_blocks_are_those_of_all_scores(
+    rows: int, places: int, values: int, blocks: int, n: int, seed: int
+) -> None:
+    """Of few different values, so that there are ties, and some places that nothing covers."""
+    draw = torch.Generator().manual_seed(seed)
+    scores = torch.randint(values, (rows, places), generator=draw).float()
+    scores[torch.rand(rows, places, generator=draw) < 0.2] = math.inf
+    expected = by_sorting(scores, min(n, places))
+    assert_equal(lowest(scores, min(n, places)), expected)
+
+    class Scored(PlaceMap):
+        kind = "scored"
+        settings = summary = disagreement = lambda self: {}  # type: ignore[assignment]
+        block_places = 7
+
+        def scores(self, queries: Tensor) -> Tensor:
+            return scores[queries[:, 0].long()]
+
+        def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> Any:
+            done = 0
+            for part in self.scores(queries).tensor_split(blocks, 1):
+                if part.shape[1]:
+                    yield done, part
+                done += part.shape[1]
+
+    found = scan(Scored(places, 1), torch.arange(rows)[:, None].float(), min(n, places))
+    assert_equal(found, expected)
+    shuffled = merged(*(Best(part[0], part[1]) for part in halves(expected, draw)))
+    assert torch.equal(shuffled.score, expected.score[:, : shuffled.score.shape[1]])
+
+
+def halves(best: Best, draw: torch.Generator) -> tuple[Best, Best]:
+    """A list of the best as two, each in a random order, the first the longer one."""
+    order = torch.randperm(best.score.shape[1], generator=draw)
+    cut = (len(order) + 1) // 2
+    first, second = order[:cut], order[cut:]
+    return Best(best.score[:, first], best.index[:, first]), Best(
+        best.score[:, second], best.index[:, second]
+    )
+
+
+@given(
+    places=st.integers(1, 80),
+    k=st.integers(1, 6),
+    apart=st.integers(0, 9),
+    values=st.integers(2, 30),
+    seed=st.integers(0, 999),
+)
+def test_candidates_are_those_of_all_scores(places: int, k: int, apart: int, values: int, seed: int) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    scores = torch.randint(values, (3, places), generator=draw).float()
+    scores[torch.rand(3, places, generator=draw) < 0.1] = math.inf
+    k = min(k, places)
+    found = lowest(scores, min(places, enough(k, apart))).candidates(k, apart)
+    expected = best_candidates(scores, k, apart)
+    assert torch.equal(found.index, expected.index)
+    assert torch.equal(found.score, expected.score)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_no_score_is_below_its_bound(metric: str, transform: str) -> None:
+    for seed, (chunk, step) in enumerate([(32, 2.0), (33, 0.7), (2, 0.1), (64, 0.3), (7, 0.5)]):
+        route = learned(200, chunk, step, metric=metric, transform=transform, seed=seed)
+        queries = torch.cat([walk(200, seed=seed)[::9], torch.randn(20, 6), torch.zeros(1, 6)])
+        scores, lower = route.scores(queries), Bound(route)(queries)
+        for g, (start, stop) in enumerate(route.chunks):
+            assert (lower[:, g] <= scores[:, start:stop].amin(1) + 1e-6).all()
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_bounds_find_what_a_scan_finds_in_ten_thousand_cases(metric: str) -> None:
+    """With both metrics: 10 maps each, of smooth routes and of noise, 250 queries, the 1 and 12 best."""
+    spared = []
+    for seed in range(10):
+        smooth = (0.0, 0.9, 0.99, 0.999)[seed % 4]
+        chunk, step = (16, 25, 64, 40)[seed // 4 % 4], (2.0, 0.7, 0.3)[seed % 3]
+        route = learned(300, chunk, step, metric=metric, seed=seed, smooth=smooth)
+        queries = torch.cat([walk(300, seed=seed, smooth=smooth)[::2], torch.randn(100, 6)])
+        queries[:150] += 0.1 * torch.randn(150, 6)
+        searcher = Searcher(route, "bound")
+        for n in (1, 12):
+            found, expected = searcher(queries, n), scan(route, queries, n)
+            torch.testing.assert_close(found.score, expected.score, rtol=1e-5, atol=1e-5)
+            other = found.index != expected.index  # equal but for rounding
+            assert (found.score - expected.score)[other].abs().max() < 1e-5 if other.any() else True
+            assert other.float().mean() < 0.01
+        spared.append(searcher.told.pruned)
+        assert searcher.told.queries == 500
+    assert max(spared) > 0.3  # type: ignore[type-var,operator]
+    assert all(0 <= one < 1 for one in spared)  # type: ignore[operator]
+
+
+def test_of_equal_places_bounds_find_the_lowest() -> None:
+    """Chunks that are all alike, and of descriptors that are 0."""
+    once = walk(32, smooth=0.5)
+    route = SpectralMapper(None, step=1e-3, chunk=32)(torch.cat([once] * 8))
+    found = Searcher(route, "bound")(once, 3)
+    assert torch.equal(found.index, scan(route, once, 3).index)
+    assert torch.equal(found.index[:, 0], torch.arange(32))
+    silent = SpectralMapper(None, step=3e-7, chunk=20)(torch.eye(4)[[0, 1, 2]].repeat(20, 1).double().float())
+    queries = -torch.rand(5, 4)
+    torch.testing.assert_close(Searcher(silent, "bound")(queries, 2).score, scan(silent, queries, 2).score)
+
+
+def test_auto_takes_bounds_where_they_spare_most_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "WORTH_BOUNDS", 1)
+    slow = walk(3200, smooth=0.9999)
+    smooth, noise = (SpectralMapper(None, 0.3, 32)(one) for one in (slow, walk(3200, smooth=0.0)))
+    for route, queries, method in ((smooth, slow[::100], "bound"), (noise, torch.randn(40, 6), "scan")):
+        searcher = Searcher(route)
+        found = searcher(queries, 1)
+        assert searcher.told.method == method
+        assert f"search: {method}" in str(searcher.told)
+        assert torch.allclose(found.score, route.scores(queries).amin(1, keepdim=True), atol=1e-5)
+    assert "chunks a query spared" in str(Searcher(smooth, "bound").told._replace(pruned=0.75))
+    assert "75%" in str(Searcher(smooth, "bound").told._replace(pruned=0.75))
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_lists_score_as_the_map_does(metric: str) -> None:
+    pytest.importorskip("faiss")
+    route = learned(2000, 100, metric=metric)
+    queries = walk(2000)[::40]
+    every = Searcher(route, "ivf", lists=20, probes=20)(queries, 7)
+    expected = scan(route, queries, 7)
+    torch.testing.assert_close(every.score, expected.score, rtol=1e-5, atol=1e-5)
+    few = Searcher(route, "ivf", lists=20, probes=2, sample=30)
+    found = few(queries, 7)
+    assert found.score.shape == (50, 7)
+    right = (found.index[:30, 0] == expected.index[:30, 0]).float().mean()
+    assert few.told.recall == pytest.approx(float(right), abs=1 / 30 + 1e-6)
+    assert few.told.sampled == 30
+    assert few.told.recall > 0.8
+    assert f"{few.told.recall:.1%} of 30 queries" in str(few.told)
+    few(queries, 1)
+    assert few.told.sampled == 30
+    with refused("0 probes"):
+        Searcher(route, "ivf", probes=0)(queries, 1)
+
+
+@pytest.mark.parametrize("settings", [{"chunk": 50}, {}, {"chunk": 50, "metric": "l2"}], ids=str)
+@pytest.mark.parametrize("blocks", [False, True])
+def test_a_calibrated_map_finds_the_same_without_all_scores(
+    settings: dict[str, Any], blocks: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if blocks:
+        monkeypatch.setattr(spectral, "BLOCK", 400)
+    route = walk(600)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, **settings)).learn(route)
+    platt = Platt(4.0, 1.0)
+    model.calibration = Calibration(platt, None)
+    queries = route[::7] + 0.2 * torch.randn(86, 6)
+    scores = model.map.scores(queries)
+    match = model.localize_descriptors(queries)
+    expected = platt.probability(evidence_of(scores))
+    assert match.probability is not None
+    torch.testing.assert_close(match.probability, expected, rtol=1e-5, atol=1e-5)
+    assert (match.index == scores.argmin(1)).float().mean() > 0.98
+    several = model.candidates(queries, 4, apart=6)
+    torch.testing.assert_close(several.score, best_candidates(scores, 4, 6).score, rtol=1e-5, atol=1e-5)
+
+
+def test_no_block_of_scores_is_as_long_as_the_route(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spectral, "BLOCK", 2**10)
+    route = walk(4000, 4)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(None, 0.5, 50)).learn(route)
+    seen: list[int] = []
+    make = SpectralMap.score_blocks
+
+    def watched(*args: Any) -> Any:
+        for start, scores in make(*args):
+            seen.append(scores.shape[1])
+            yield start, scores
+
+    monkeypatch.setattr(SpectralMap, "score_blocks", watched)
+    assert model.localize(route[:300]).index.shape == (300,)
+    assert max(seen) <= 300
+    assert sum(seen) % 4000 == 0  # for each batch of queries
+
+
+def test_a_merged_map_is_searched_block_by_block() -> None:
+    parts = [SpectralMapper(None, 0.5, 50)(walk(places, seed=places)) for places in (200, 130)]
+    route, queries = MergedMap(parts, ["out", "back"]), walk(130, seed=130)
+    assert_equal(scan(route, queries, 9), by_sorting(route.scores(queries), 9))
+    assert [start for start, _ in route.score_blocks(queries, 190, 210)] == [190, 200]
+    assert route.block_places == max(part.block_places for part in parts)
+
+
+def test_a_search_is_kept_until_the_map_changes() -> None:
+    route = walk(200)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50)).learn(route)
+    model.localize(route[:3], search="bound")
+    searcher = model.searcher("bound")
+    model.localize(route[:4], search="bound")
+    assert model.searcher("bound") is searcher
+    assert searcher.told.queries == 7
+    model.map.extend(walk(50, seed=5))
+    assert model.searcher("bound") is not searcher
+    assert torch.equal(model.localize(walk(50, seed=5), search="bound").index, torch.arange(200, 250))
+    scanned = model.searcher("scan")
+    model.learn(walk(200, seed=9))
+    assert model.searcher("scan") is not scanned
+
+
+def test_what_cannot_be_searched_so_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    wave = walk(128)
+    whole = DejaVu(whitening="none").learn(wave)
+    templates = DejaVu(mapper=TemplateMapper(ImposedPeriods((8, 9)))).learn(wave)
+    chunked = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=32)).learn(wave)
+    with refused("'all'", "auto, scan, bound, ivf"):
+        whole.localize(wave, search="all")  # type: ignore[arg-type]
+    with refused("'bound'", "one chunk", "auto or scan"):
+        whole.localize(wave, search="bound")
+    for method in ("bound", "ivf"):
+        with refused(method, "'templates'", "auto or scan"):
+            templates.candidates(wave, 2, search=method)  # type: ignore[arg-type]
+        for sequence in (SequenceMatcher(3), PlaceFilter()):
+            with refused(method, "all scores"):
+                chunked.localize(wave, sequence=sequence, search=method)  # type: ignore[arg-type]
+    loading = builtins.__import__
+
+    def without(name: str, *args: Any) -> Any:
+        if name == "faiss":
+            raise ImportError("No module named 'faiss'")
+        return loading(name, *args)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with refused("needs faiss", "dejavu_torch[bench]"):
+        chunked.localize(wave, search="ivf")
