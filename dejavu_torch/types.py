@@ -75,13 +75,21 @@ class Traverse(ABC):
             seen += len(batch)
 
     def select(self, frames: range, size: int) -> Iterator[Tensor]:
-        """The frames of an increasing range, at most `size` at a time; a traverse may end before it does."""
+        """The frames of an increasing range, `size` at a time; a traverse may end before it does.
+
+        Only the last batch is smaller: what is drawn for each batch must not hang on how frames are read.
+        """
         ahead = 0  # of the next frame that is wanted
+        held: list[Tensor] = []
         for part in self.between(frames.start, frames.stop):
-            kept = part[ahead :: frames.step]
+            held.append(part[ahead :: frames.step])
             ahead = (ahead - len(part)) % frames.step
-            if len(kept):
-                yield from kept.split(size)
+            if sum(map(len, held)) >= size:
+                *whole, last = torch.cat(held).split(size)
+                yield from whole
+                held = [last]
+        if any(map(len, held)):
+            yield torch.cat(held)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:

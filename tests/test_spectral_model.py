@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.views import AugmentedTraverse, Views
@@ -189,6 +190,13 @@ def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
         AugmentedTraverse(ArrayTraverse(torch.rand(9, 2), "nine"), 9, 1, 9, {})
     with refused("colour2", "occlusion"):
         AugmentedTraverse(reference, FRAMES, 1, 9, {"colour2": 1})
+
+
+def test_copies_are_the_same_however_frames_are_read() -> None:
+    frames = torch.rand(400, 1, 8, 8)
+    whole, part = ArrayTraverse(frames[10:310]), FrameRange(ArrayTraverse(frames), 10, 310)
+    own, other = (AugmentedTraverse(one, 300, copies=2, most=200, strengths={}) for one in (whole, part))
+    assert torch.equal(all_of(own), all_of(other))
 
 
 def test_networks_are_described_in_eval_mode() -> None:

@@ -244,20 +244,19 @@ def plot_growth(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]
 
     Args:
         panels: at least one: what is drawn -> contender -> places and figure. Names that start with "dejavu"
-            are ours.
+            are ours, those with "null" nulls.
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
+    kinds = [name.partition(" ")[0].rstrip(",") for name in names]
     figure, axes = canvas(2.4 * len(panels) + 1.1 * LINE * len(names), len(panels), squeeze=False)
-    others = [name for name in names if not name.startswith("dejavu")]
     for axis, (heading, lines) in zip(axes[:, 0], panels.items(), strict=True):
         for name, points in lines.items():
-            ours = name.startswith("dejavu")
-            order = (
-                [one for one in names if one.startswith("dejavu")].index(name) if ours else others.index(name)
-            )
-            style = ("-", "--", ":", "-.")[order % 4]
-            colour = _OURS if ours else f"C{order % 10}"
-            axis.loglog(*zip(*points, strict=True), style, color=colour, marker="o", markersize=3, label=name)
+            i = names.index(name)
+            order = kinds[:i].count(kinds[i])  # among its own kind
+            colour = {"dejavu": _OURS, "null": GREY}.get(kinds[i], f"C{1 + order % 9}")
+            style = ("-", "--", ":", "-.", (0, (1, 3)))[order % 5]
+            axis.loglog(*zip(*points, strict=True), color=colour, linestyle=style, marker="o", markersize=3)
+            axis.lines[-1].set_label(name)
         axis.set_title(heading, loc="left", fontsize=10, weight="bold")
         axis.grid(alpha=0.25)
     axes[-1, 0].set_xlabel("places")

@@ -33,7 +33,6 @@ from dejavu_torch.experiments.made import Likeness, MadeRoute, likeness
 from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tiles_of
 from dejavu_torch.experiments.template_search import PLACES as TEMPLATES
 from dejavu_torch.experiments.template_search import bench_templates
-from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match
 
@@ -41,7 +40,6 @@ PLACES = (10_000, 100_000, 1_000_000)
 FEWEST = 500
 RENDERED = 100_000  # places that are drawn; beyond them descriptors are made
 DESCRIBED = 10_000  # places that the whitening has seen
-SHIFT = (0.02, 0.08)  # of its copies: the second flight drifts sideways
 QUERIES, SINGLE, BATCH = 2000, 20, 256  # in all, those of them that are timed one by one, of a batch
 CHECKED = 10_000  # places at which made descriptors stand beside drawn ones
 SHUFFLED = 100_000  # places of a null at most
@@ -391,7 +389,7 @@ class Folder:
         self.path, self.progress = path, progress
         drawn = [n for n in sizes if n <= RENDERED]
         self.drawn = RENDERED if len(drawn) < len(sizes) else max(drawn)
-        self.model = DejaVu(whitening=Whitening(strengths={"shift": list(SHIFT)}))
+        self.model = DejaVu()
         self.second: AerialRoad
 
     def draw(self) -> None:
@@ -485,6 +483,8 @@ def bench_scale(
             yield from _case(folder, f"places={n}", "drawn" if n <= RENDERED else "made", n, threads, device)
             if n <= LONGEST["repeat"]:
                 yield from _repeating(folder, n, threads, device)
+        if not places:  # whole cycles of both tiles
+            yield from _repeating(folder, LONGEST["repeat"], threads, device)
     for found in bench_templates(sizes if places else TEMPLATES):
         yield from map(_of_templates, found)
 
@@ -604,7 +604,7 @@ def write_rows(folder: Path, rows: Sequence[ScaleRow], device: str) -> None:
 def pictured(rows: Sequence[ScaleRow]) -> dict[str, dict[str, list[tuple[float, float]]]]:
     """What is drawn over the number of places: heading -> contender -> points."""
     panels = {
-        "route bytes per place": ("places", "bytes_per_place", 1.0),
+        "recall@1": ("places", "recall_at_1", 1.0),
         "milliseconds of a query in a batch": ("places", "seconds", 1e3),
         "MB while localizing": ("places", "peak_bytes", 1e-6),
         "route bytes of ground that repeats": ("repeat", "route_bytes", 1.0),

@@ -31,6 +31,21 @@ def test_a_part_is_a_slice_however_the_frames_are_read(part: tuple[int, int, int
         assert torch.equal(inner, expected[1:4])
 
 
+@given(PARTS, st.integers(1, 50))
+def test_selected_frames_come_in_whole_batches(part: tuple[int, int, int], size: int) -> None:
+    start, stop, step = part
+    frames = range(start, stop or len(VALUES), step)
+    for traverse in (
+        Stream(VALUES),
+        ArrayTraverse(VALUES),
+        FrameRange(Stream(VALUES)),
+        FrameRange(ArrayTraverse(VALUES)),
+    ):
+        batches = list(traverse.select(frames, size))
+        assert torch.equal(torch.cat(batches), VALUES[frames.start : frames.stop : step])
+        assert all(len(batch) == size for batch in batches[:-1])
+
+
 def test_parts_of_parts_name_both() -> None:
     part = FrameRange(FrameRange(ArrayTraverse(VALUES, "walk"), start=10), stop=8, step=2)
     assert part.name == "walk[10:][0:8:2]"
