@@ -34,6 +34,7 @@ from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tile
 from dejavu_torch.experiments.template_search import PLACES as TEMPLATES
 from dejavu_torch.experiments.template_search import bench_templates
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.search import Search
 from dejavu_torch.types import InputError, Match
 
 PLACES = (10_000, 100_000, 1_000_000)
@@ -112,13 +113,18 @@ class Mapped(Contender):
 
     Args:
         budget: route bytes per place. chunk: places, or "route". step: in place of the budget.
-        shuffled: in random order, the null.
+        shuffled: in random order, the null. search: as of `DejaVu.localize`.
     """
 
     def __init__(
-        self, budget: float | None, chunk: Any, step: float | None = None, shuffled: bool = False
+        self,
+        budget: float | None,
+        chunk: Any,
+        step: float | None = None,
+        shuffled: bool = False,
+        search: Search = "auto",
     ) -> None:
-        self.mapper, self.shuffled = SpectralMapper(budget, step, chunk), shuffled
+        self.mapper, self.shuffled, self.search = SpectralMapper(budget, step, chunk), shuffled, search
 
     def learn(self, route: IndexedTraverse, path: Path) -> int:
         model = DejaVu(whitening="none", mapper=self.mapper)
@@ -137,7 +143,7 @@ class Mapped(Contender):
         order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
 
         def find(queries: Tensor) -> Found:
-            match = model.localize_descriptors(queries.to(device), order=order)
+            match = model.localize_descriptors(queries.to(device), order=order, search=self.search)
             return Found(match.score, match.index)
 
         return find
@@ -249,6 +255,8 @@ PLACED: dict[str, Callable[[float], Contender]] = {
     f"{OURS} 4 B": lambda room: Mapped(4.0, CHUNK),
     f"{OURS} 1 B, one chunk": lambda room: Mapped(1.0, "route"),
     f"{OURS} 4 B, one chunk": lambda room: Mapped(4.0, "route"),
+    f"{OURS} 1 B, ivf": lambda room: Mapped(1.0, CHUNK, search="ivf"),
+    f"{OURS} 4 B, ivf": lambda room: Mapped(4.0, CHUNK, search="ivf"),
     "null 1 B": lambda room: Mapped(1.0, CHUNK, shuffled=True),
     "null 4 B": lambda room: Mapped(4.0, CHUNK, shuffled=True),
     "faiss flat": lambda room: Faiss("Flat"),
