@@ -665,6 +665,8 @@ class DejaVu(nn.Module):
     ) -> Iterator[Match]:
         """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
+        if sequence is not None:
+            check_scanned(search)
         check_search(search, self.map)
         yield from self.matches_of(self._checked(queries, progress, sequence), sequence, search=search)
 
@@ -726,6 +728,8 @@ class DejaVu(nn.Module):
         """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
         self._require_map()
         check_candidates(k, apart, self.map.places)
+        if sequence is not None:
+            check_scanned(search)
         check_search(search, self.map)
         matching = Matching(sequence, ranks=k, apart=apart, search=search)
         for part in self._found(self._checked(queries, progress, sequence), matching):

@@ -266,7 +266,7 @@ def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -
         ("learn a --map b.safetensors --features 3", ["features", "3", "import path"]),
         ("learn a --map b.safetensors --features torch.nn.Linear", ["features", "in_features"]),
         ("learn a --map b.safetensors --periods.window 3", ["--periods.window"]),
-        ("learn a b --map c", ["b"]),
+        ("learn a b", ["required: --map"]),
         ("learn a", ["required: --map"]),
         ("localize a", ["required: source, --out"]),
         ("evaluate", ["required: matches, --truth, --out"]),

@@ -36,10 +36,10 @@ def paper_model(reference: Traverse | None = None) -> DejaVu:
     """The settings of configs/paper.yaml, the paper to the letter.
 
     Args:
-        reference: a traverse whose `ground`, where it has one, gives the velocity (section IV-B).
+        reference: a traverse whose `corners`, where it has one, gives the velocity (section IV-B).
     """
     periods = SpectrogramAnalysis(min_period=8, peaks="bins", false_alarm=None, short="refuse")
-    ground = getattr(reference, "ground", None)
+    ground = getattr(reference, "corners", None)
     velocity = None if ground is None else GroundOdometry(ground, PATCH)
     return DejaVu(mapper=TemplateMapper(periods, reduction="sum"), velocity=velocity)
 

@@ -23,7 +23,9 @@ SLACK = 1e-5  # of a bound, for rounding; of l2, times the squares of the length
 WORTH_BOUNDS = 2**24  # N x K; a smaller map is scanned before a bound pays
 TRIAL_CHUNKS, TRIAL_QUERIES = 64, 8  # by which `auto` finds out how many chunks bounds spare
 SPARED = 0.5  # of the chunks at least, for `auto` to go by bounds
-LISTS_PER_ROOT, TRAINED_PER_LIST, PROBED = 4, 39, 1 / 32  # of inverted lists
+LISTS_PER_ROOT, TRAINED_PER_LIST = 2, 39  # of inverted lists
+PROBED, PROBED_AT_LEAST = 1 / 32, 32
+CHECKED = 1 / 16  # of the queries that come together, until there is a sample
 
 
 class Best(NamedTuple):
@@ -240,7 +242,8 @@ class Searcher:
             descriptors, float32, in memory; of a spectral map. "auto" is the exact method that is faster:
             bounds where they spare over half of the chunks for the first queries, of a template map its own
             way to the best place where it has one, else the scan.
-        lists: of "ivf", how many; None is 4 sqrt(N). probes: how many are searched; None is one of 32.
+        lists: of "ivf", how many; None is 2 sqrt(N). probes: how many are searched; None is one of 32,
+            and at least 32.
         sample: of so many queries the places that "ivf" finds are compared with those of a scan.
 
     Shape: queries (Q,K), n -> Best of (Q,n).
@@ -342,10 +345,12 @@ class Searcher:
 
     def _check(self, queries: Tensor, found: Best) -> None:
         """Compare with a scan until there is a sample."""
-        some = queries[: max(0, self.sample - self.told.sampled)]
-        if len(some):
-            right = scan(self.route, some, 1).index.cpu() == found.index[: len(some), :1].cpu()
-            sampled = self.told.sampled + len(some)
+        count = min(self.sample - self.told.sampled, math.ceil(len(queries) * CHECKED))
+        if count > 0:
+            some = torch.arange(count) * len(queries) // count
+            exact = scan(self.route, queries[some.to(queries.device)], 1)
+            right = exact.index.cpu() == found.index[some, :1]
+            sampled = self.told.sampled + count
             hits = (self.told.recall or 0) * self.told.sampled + float(right.sum())
             self.told = self.told._replace(recall=hits / sampled, sampled=sampled)
 
@@ -400,7 +405,7 @@ def inverted_lists(route: SpectralMap, lists: int | None = None, probes: int | N
     places, cosine = route.places, route.metric == "cosine"
     most = max(1, places // TRAINED_PER_LIST)
     lists = min(most, math.ceil(LISTS_PER_ROOT * math.sqrt(places))) if lists is None else lists
-    probes = math.ceil(lists * PROBED) if probes is None else probes
+    probes = min(lists, max(PROBED_AT_LEAST, math.ceil(lists * PROBED))) if probes is None else probes
     if not 1 <= lists <= places or not 1 <= probes <= lists:
         raise InputError(
             f"{lists} lists and {probes} probes on {places} places; expected at most as many lists as "

@@ -328,7 +328,7 @@ def test_noise_and_shake_do_as_they_say(kind: type[Railway]) -> None:
 def test_the_ground_is_a_strip_beside_the_sleepers(kind: type[Railway], height: int, width: int) -> None:
     train, focal = kind(height=height, width=width), 0.55 * width
     met = []
-    for x, y in train.ground:
+    for x, y in train.corners:
         assert 0 <= x <= 1
         assert 0 <= y <= 1
         across, down = x * (width - 1) + 0.5 - width / 2, y * (height - 1) + 0.5 - 0.38 * height
@@ -346,7 +346,7 @@ def test_the_ground_is_a_strip_beside_the_sleepers(kind: type[Railway], height: 
 def test_the_ground_moves_as_the_train_does(kind: type[Railway], traverse: int) -> None:
     train, start, stop = ride_of(kind, traverse), 700, 800
     frames = frames_at(train, torch.arange(start, stop))
-    shift, confidence = GroundOdometry(train.ground, (32, 32))(frames)
+    shift, confidence = GroundOdometry(train.corners, (32, 32))(frames)
     metres = float(shift.sum()) * train.ground_span / 31
     assert metres == pytest.approx(float(train.distance[stop - 1] - train.distance[start]), rel=0.06)
     assert confidence.median() > 0.6

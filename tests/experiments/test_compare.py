@@ -340,7 +340,7 @@ def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.Monk
 
         return counted
 
-    monkeypatch.setattr(SpectralMap, "scores", counting(SpectralMap.scores, 1))
+    monkeypatch.setattr(SpectralMap, "score_blocks", counting(SpectralMap.score_blocks, 1))
     stores = "dejavu_torch.evaluation.baselines.phase_distances"
     monkeypatch.setattr(stores, counting(phase_distances, 0))
     monkeypatch.setattr("dejavu_torch.experiments.compare.draw_pictures", lambda *_: {})

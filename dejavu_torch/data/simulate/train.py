@@ -54,7 +54,7 @@ class Railway(SimulatedRoute):
             the first frame of the stop, and past its last frame, that one.
         structures: what repeats, each with its name, period, start and stop in metres.
         size: height and width of a frame in pixels.
-        ground: (x, y) of the corners of a strip of ground: far left, far right, near right, near left, in
+        corners: (x, y) of the corners of a strip of ground: far left, far right, near right, near left, in
             fractions of the frame, (0, 0) the centre of its top left pixel and (1, 1) of its bottom right
             one. 1.4 to 2.4 m to the right, beside the sleepers, of which the train may pass about one a
             frame; from just above the bottom row (where that does not show all of it, from where it is seen)
@@ -105,7 +105,7 @@ class Railway(SimulatedRoute):
         # a little above the bottom row, and where all of it is in sight
         near = 1.05 * max(FOOT / float(view.up.min()), RIGHT / float(view.right.max()))
         corners = (LEFT, AHEAD), (RIGHT, AHEAD), (RIGHT, near), (LEFT, near)
-        self.ground = tuple(view.project(x, FOOT, ahead) for x, ahead in corners)
+        self.corners = tuple(view.project(x, FOOT, ahead) for x, ahead in corners)
         self.ground_span = AHEAD - near
 
     def _ride(self, traverse: int) -> Tensor:
