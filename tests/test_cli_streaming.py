@@ -111,4 +111,4 @@ def test_several_sources_are_one_route(tmp_path: Path, capsys: pytest.CaptureFix
     assert "wide" in error
     assert "16 x 16" in error
     error = fails(capsys, "learn", "--map", tmp_path / "x.safetensors")
-    assert "sources" in error
+    assert "source" in error
