@@ -48,6 +48,7 @@ CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and chec
 BLOCK = 2**19  # numbers made at a time: they stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk made at a time, which is gone through for each
 ROWS = 2**14  # of descriptors, looked at together
+TOGETHER = 32  # chunks decoded before theirs are joined: many small tensors would split up the heap
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
 LINE_COST = 150  # of a coded line in a query's sum
@@ -102,16 +103,20 @@ def _decoded(streams: Sequence[Stream], lengths: list[int], escapes: Tensor, col
     """
     check_sizes(sum(lengths))
     check_claim(max(lengths), columns)
-    parts, used, total = [], 0, 0
+    whole: list[Coefficients] = []
+    parts: list[Coefficients] = []
+    used = total = 0
     for stream, length in zip(streams, lengths, strict=True):
         small = decode(stream, length, columns)
         marks = int((small == ESCAPE).sum())
         parts.append(coefficients_of(small, escapes[used : used + marks]))
         used, total = used + marks, total + len(parts[-1].level)
         check_sizes(sum(lengths), total)
+        if len(parts) == TOGETHER:
+            whole, parts = [*whole, joined(parts)], []
     if used != len(escapes):
         raise InputError(f"{len(escapes)} escapes; expected {used}")
-    return joined(parts)
+    return joined([*whole, *parts])
 
 
 def _streams_of(tensors: dict[str, Tensor]) -> list[Stream]:

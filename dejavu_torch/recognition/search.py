@@ -22,7 +22,7 @@ COARSE = 4  # places for each of which a bound has one sample of the low lines
 SLACK = 1e-5  # of a bound, for rounding; of l2, times the squares of the lengths
 WORTH_BOUNDS = 2**24  # N x K; a smaller map is scanned before a bound pays
 TRIAL_CHUNKS, TRIAL_QUERIES = 64, 8  # by which `auto` finds out how many chunks bounds spare
-SPARED = 0.5  # of the chunks at least, for `auto` to go by bounds
+SPARED = 0.95  # of the chunks, for `auto` to go by bounds: one alone takes as long as ten in a scan
 LISTS_PER_ROOT, TRAINED_PER_LIST = 2, 39  # of inverted lists
 PROBED, PROBED_AT_LEAST = 1 / 32, 32
 CHECKED = 1 / 16  # of the queries that come together, until there is a sample
@@ -240,7 +240,7 @@ class Searcher:
             gives the same places; of a spectral map with an integer chunk. "ivf" scores the places of the
             lists nearest to a query alone, which misses some: faiss inverted lists of the rebuilt
             descriptors, float32, in memory; of a spectral map. "auto" is the exact method that is faster:
-            bounds where they spare over half of the chunks for the first queries, of a template map its own
+            bounds where they spare 95 % of the chunks for the first queries, of a template map its own
             way to the best place where it has one, else the scan.
         lists: of "ivf", how many; None is 2 sqrt(N). probes: how many are searched; None is one of 32,
             and at least 32.

@@ -170,6 +170,7 @@ def test_of_equal_places_bounds_find_the_lowest() -> None:
 
 def test_auto_takes_bounds_where_they_spare_most_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "WORTH_BOUNDS", 1)
+    monkeypatch.setattr(search, "SPARED", 0.6)
     slow = walk(3200, smooth=0.9999)
     smooth, noise = (SpectralMapper(None, 0.3, 32)(one) for one in (slow, walk(3200, smooth=0.0)))
     for route, queries, method in ((smooth, slow[::100], "bound"), (noise, torch.randn(40, 6), "scan")):
