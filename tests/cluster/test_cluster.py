@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -54,6 +55,15 @@ class Watched(torch.nn.Module):
                 os._exit(1)
         return torch.nn.functional.avg_pool2d(frames, 4).flatten(1)
 """
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """Two workers for all tests here: to start Ray takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "processors", lambda: 2)
+        with Cluster() as workers:
+            yield workers
 
 
 @pytest.fixture(autouse=True)

@@ -42,7 +42,7 @@ def test_the_strongest_period_alone_is_a_wave() -> None:
     # |query|^2 + |place|^2 - 2 query . place
     wave = 10 - 8 * (2 * torch.pi * (place - 100) / 24).cos()
     assert torch.allclose(first.scores, wave, atol=0.05)
-    assert int(every.scores.argmin()) == 100
+    assert int(every.scores.argmin()) % 120 == 100  # both waves begin anew after 120 places
 
 
 def test_counts_of_more_periods_than_there_are_give_all_once() -> None:
