@@ -54,11 +54,12 @@ FEW_VIEWS = {
         "test_readme",
         "test_footprint",
         "test_scale",
+        "test_demo",
         "test_cli_networks",
         "test_pretrained",
     ),
 }
-PIXELS = FEW_VIEWS | {"test_real_routes", "test_reproduce", "test_cli_rejection"}
+PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes", "test_reproduce", "test_cli_rejection"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -133,7 +133,7 @@ def test_the_compiled_model_scores_frames_as_the_model_does(backbone: str) -> No
         torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.figures
 @pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> None:
     model = learned("HOG")

@@ -104,6 +104,7 @@ def test_the_dashes_of_the_motorway_are_found(
 ROAD = ((0.41, 0.66), (0.605, 0.66), (0.925, 0.985), (0.12, 0.985))
 
 
+@pytest.mark.figures
 def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_dir: Path) -> None:
     clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
     ground = GroundOdometry(corners=ROAD).distances(clip)
@@ -138,7 +139,8 @@ def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
         assert float(ground.distance.diff().mean()) == pytest.approx(mean, rel=0.03)
 
 
-@pytest.mark.parametrize("resampled", [pytest.param(False, marks=pytest.mark.figures), True])
+@pytest.mark.figures
+@pytest.mark.parametrize("resampled", [False, True])
 def test_even_steps_leave_the_period_of_a_constant_speed(
     resampled: bool, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,6 +155,7 @@ def test_even_steps_leave_the_period_of_a_constant_speed(
     assert measured == pytest.approx(int(told[1 + resampled]), rel=0.03)
 
 
+@pytest.mark.figures
 def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(data_dir: Path) -> None:
     laps = open_source(f"{data_dir}/rc_car_laps/frames")
     features = DejaVu().extract_all(open_source(f"{data_dir}/rc_car_laps/frames?width=80"))
@@ -274,6 +277,7 @@ def test_spectral_maps(column: int, options: tuple[str, ...], data_dir: Path, tm
         assert numbers(table[name][column]) == pytest.approx([report[key]], rel=0.02)
 
 
+@pytest.mark.figures
 def test_the_railway_in_two_seasons(data_dir: Path, tmp_path: Path) -> None:
     seasons = (data_dir / "nordland" / name for name in ("summer", "winter"))
     report = compare(tmp_path, *seasons, *TEMPLATES)
