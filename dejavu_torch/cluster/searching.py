@@ -87,6 +87,7 @@ class ClusterSearcher(Searcher):
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, n: int) -> Best:
+        queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         n = min(n, self.route.places)
         self.told = self.told._replace(queries=self.told.queries + len(queries))
         found = []

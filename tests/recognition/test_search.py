@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import gc
 import math
+import pickle
+import weakref
 from typing import Any
 
 import pytest
@@ -252,6 +255,46 @@ def test_a_merged_map_is_searched_block_by_block() -> None:
     assert_equal(scan(route, queries, 9), by_sorting(route.scores(queries), 9))
     assert [start for start, _ in route.score_blocks(queries, 190, 210)] == [190, 200]
     assert route.block_places == max(part.block_places for part in parts)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_queries_of_half_precision_are_searched_for_as_floats(dtype: torch.dtype) -> None:
+    route = learned()
+    few, many = walk(300)[:1].to(dtype), walk(300)[::5].to(dtype)  # which are scored in different ways
+    assert route.rebuilds(len(many)) > route.rebuilds(len(few))
+    for queries in (few, many):
+        for method in ("scan", "bound"):
+            expected = Searcher(route, method)(queries.float(), 3)  # type: ignore[arg-type]
+            assert_equal(Searcher(route, method)(queries, 3), expected)  # type: ignore[arg-type]
+
+
+def test_what_auto_takes_does_not_hang_on_what_was_asked_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "WORTH_BOUNDS", 1)
+    monkeypatch.setattr(search, "SPARED", 0)
+    route = walk(200)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50)).learn(route)
+    model.localize(route[:3], search="scan")
+    model.localize(route[:3])
+    assert model.searcher().told.method == "bound"  # as it spares enough
+    monkeypatch.setattr(search, "SPARED", 2)
+    assert model.searcher("bound") is not model.searcher()
+    searcher = model.searcher()
+    assert searcher(route[:0], 2).index.shape == (0, 2)
+    assert searcher.told.method == "auto"  # still open
+    model.localize(route[:3])
+    assert model.searcher() is searcher
+    assert searcher.told.method == "scan"
+
+
+def test_nothing_of_a_search_outlives_the_map_or_is_written() -> None:
+    route = walk(200)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50)).learn(route)
+    size, old = len(pickle.dumps(model)), weakref.ref(model.map)
+    model.localize(route[:3], search="bound")
+    assert len(pickle.dumps(model)) == size
+    model.learn(route)
+    gc.collect()
+    assert old() is None
 
 
 def test_a_search_is_kept_until_the_map_changes() -> None:
