@@ -34,7 +34,7 @@ from dejavu_torch.database.coefficients import (
 )
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.quantisation import RouteLines, dead_zone, quantise
-from dejavu_torch.database.sparse_product import compiled_sums
+from dejavu_torch.database.sparse_product import WORTH_COMPILING, compiled_sums
 from dejavu_torch.database.spectrum import Slots, Transform, from_slots, period_of, slots, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
@@ -163,7 +163,8 @@ class SpectralMap(PlaceMap):
 
     Attributes:
         chunks: the places [start, stop) of each. bounds: (G+1) where the coefficients of each chunk begin.
-        longest: places of the longest chunk.
+        longest: places of the longest chunk. compiled: whether products are summed by a compiled loop, where
+            there is one; a part of a map takes this, and `audible`, from the whole, for the same scores.
         needed: bytes per place that would hold half the variance of a route of which this map holds under a
             tenth; None where it holds more, or was loaded.
 
@@ -306,6 +307,7 @@ class SpectralMap(PlaceMap):
         self.chunks: list[tuple[int, int]] = list(zip([0, *stops], stops, strict=False))
         self.longest: int = max(self.lengths.tolist(), default=0)
         sums = torch.cat([self.lengths.new_zeros(1), self.counts.cumsum(0, dtype=torch.int64)])
+        self.compiled = len(self.level) >= WORTH_COMPILING
         self.bounds: list[int] = [0, *sums[self.lengths.cumsum(0)].tolist()]
         self._streams: list[Stream | None] = [None] * len(self.chunks)  # coded when they are asked for
         self.norms = self.steps.new_empty(self.places)
@@ -395,7 +397,7 @@ class SpectralMap(PlaceMap):
         length, (slot, factor, one) = self._length(chunks.start), self._slots(chunks)
         size = len(chunks) * one.count
         own = self.coefficients(chunks)
-        lines = compiled_sums(queries, own, slot, factor, size)
+        lines = compiled_sums(queries, own, slot, factor, size) if self.compiled else None
         if lines is None:
             line = lines_of(own.counts, own.level.shape[0])
             terms = queries.index_select(1, own.feature.int()) * (own.level * factor[line]).to(queries)
