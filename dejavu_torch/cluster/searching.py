@@ -86,6 +86,9 @@ class ClusterSearcher(Searcher):
     def fits(self, route: PlaceMap, method: Search) -> bool:
         return route is self.route
 
+    def pays(self, n: int) -> bool:
+        return True  # all scores would be made here
+
     @torch.no_grad()
     def __call__(self, queries: Tensor, n: int) -> Best:
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))

@@ -19,6 +19,8 @@ from dejavu_torch.types import InputError
 Search = Literal["auto", "scan", "bound", "ivf"]
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x n held at a time
+FEW = 1 / 16  # of the places of a block: of more, to keep the best takes longer than all scores
+LISTED = 16  # numbers held for each of the best of a query, while two lists are merged
 COARSE = 4  # places for each of which a bound has one sample of the low lines
 SLACK = 1e-5  # of a bound, for rounding; of l2, times the squares of the lengths
 WORTH_BOUNDS = 2**24  # N x K; a smaller map is scanned before a bound pays
@@ -284,6 +286,12 @@ class Searcher:
         made = [*route.buffers()]
         same = len(made) == len(self._made) and all(map(operator.is_, made, self._made))
         return same and route is self.route and method == self.asked
+
+    def pays(self, n: int) -> bool:
+        """Whether to search for n places, rather than to take them from all scores."""
+        places = self.route.places
+        most = max(1, FEW * min(places, self.route.block_places))
+        return n <= most or places > SCORES_AT_ONCE or self.asked in ("bound", "ivf")
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, n: int) -> Best:
