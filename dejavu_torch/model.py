@@ -190,6 +190,9 @@ class DejaVu(nn.Module):
         self.calibration: Calibration | None = None
         self._searcher: Searcher | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_searcher": None}  # which can hold more than the map, and is soon made again
+
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
         own = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
@@ -518,7 +521,7 @@ class DejaVu(nn.Module):
             route.positions = positions
             route.check()
         step = traverse.step if isinstance(traverse, ResampledTraverse) else None
-        self.map, self.step, self.frame_names = route, step, names
+        self.map, self.step, self.frame_names, self._searcher = route, step, names, None
         self.frame_shape, self.trained, self.calibration = shape or None, None, None
         return self
 

@@ -31,7 +31,7 @@ class Part(NamedTuple):
     """Chunks of a spectral map that follow each other, as they go to a worker.
 
     start: the place of the whole map that comes first. chunks, mean, settings: as of `SpectralMap.of_chunks`.
-    audible: of the map that they are of.
+    audible, compiled: of the map that they are of.
     """
 
     start: int
@@ -39,6 +39,7 @@ class Part(NamedTuple):
     mean: Tensor
     settings: dict[str, Any]
     audible: float
+    compiled: bool
 
     @property
     def places(self) -> int:
@@ -85,8 +86,12 @@ class ClusterSearcher(Searcher):
     def fits(self, route: PlaceMap, method: Search) -> bool:
         return route is self.route
 
+    def pays(self, n: int) -> bool:
+        return True  # all scores would be made here
+
     @torch.no_grad()
     def __call__(self, queries: Tensor, n: int) -> Best:
+        queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         n = min(n, self.route.places)
         self.told = self.told._replace(queries=self.told.queries + len(queries))
         found = []
@@ -137,7 +142,7 @@ class _Worker:
 
 def _map_of(part: Part) -> SpectralMap:
     route = SpectralMap.of_chunks(part.chunks, part.mean, **part.settings)
-    route.audible = part.audible
+    route.audible, route.compiled = part.audible, part.compiled
     return route
 
 
@@ -160,8 +165,8 @@ def _parts(route: SpectralMap, most: int, first: int) -> Iterator[Part]:
     held: list[CodedChunk] = []
     for block in blocks:
         if held and sum(one.places for one in [*held, *block]) > most:
-            yield Part(first, held, mean, settings, route.audible)
+            yield Part(first, held, mean, settings, route.audible, route.compiled)
             first += sum(one.places for one in held)
             held = []
         held = held + block
-    yield Part(first, held, mean, settings, route.audible)
+    yield Part(first, held, mean, settings, route.audible, route.compiled)

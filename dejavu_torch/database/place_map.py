@@ -98,7 +98,7 @@ class PlaceMap(nn.Module, ABC):
 
     @property
     def block_places(self) -> int:
-        """Places of the largest block of `score_blocks`, about."""
+        """Numbers that the largest block of `score_blocks` holds for a query, about: one for each place."""
         return self.places
 
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 
@@ -111,7 +112,7 @@ class RouteLines:
 
     def held(self, step: float, even: bool = False) -> float:
         """The share of the variance that lines in such steps hold."""
-        widths = [None] * len(self.lines) if even or self.width is None else self.width.split(self.rows)
+        widths = itertools.repeat(None) if even or self.width is None else self.width.split(self.rows)
         errors = [
             float((part - step * quantise(part, step, width)).square().sum())
             for part, width in zip(self._blocks(), widths, strict=False)

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.database.coefficients import Coefficients
+from dejavu_torch.database.compiling import compiled
 from dejavu_torch.database.l1 import numbers_of
 
-WORTH_COMPILING = 2**16  # coefficients: of fewer torch takes less than a millisecond
+WORTH_COMPILING = 2**16  # coefficients of a map: of fewer torch takes less than a millisecond
 
 log = logging.getLogger("dejavu_torch")
 
@@ -33,25 +34,18 @@ def _sums(query: Any, counts: Any, feature: Any, level: Any, where: Any, factor:
 
 
 @cache
-def _compiled() -> Callable[..., None] | None:
-    reason: Exception
-    for keep in (True, False):  # nowhere to keep what is compiled is no reason not to compile
-        try:
-            import numba
-
-            compiler = numba.njit(
-                cache=keep, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"}
-            )
-            kernel: Callable[..., None] = compiler(_sums)
-            if kernel is _sums:
-                raise RuntimeError("NUMBA_DISABLE_JIT is set")
-            few, numbers = np.zeros(1, np.uint8), np.zeros((1, 1), np.float32)
-            kernel(numbers, few, few, np.zeros(0, np.int8), np.zeros(1, np.int64), numbers[0], numbers)
-            return kernel
-        except Exception as error:  # a broken compiler must not break what works without one
-            reason = error
-    log.info("products with a spectral map by torch, not by numba: %s", " ".join(str(reason).split()))
-    return None
+def _compiled(*kinds: Any) -> Callable[..., None] | None:
+    """For coefficients of these dtypes: a map has those that its levels need."""
+    numbers = ", ".join(f"{kind}[::1]" for kind in kinds)
+    try:
+        return compiled(
+            _sums,
+            f"void(float32[:,::1], {numbers}, int64[::1], float32[::1], float32[:,::1])",
+            fastmath={"reassoc", "nsz", "contract"},
+        )
+    except Exception as error:  # a broken compiler must not break what works without one
+        log.info("products with a spectral map by torch, not by numba: %s", " ".join(str(error).split()))
+        return None
 
 
 def compiled_sums(
@@ -60,7 +54,7 @@ def compiled_sums(
     """Of each line the sum of its coefficients, each times the query's feature; None where torch has to.
 
     Torch keeps: gradients and what else follows or traces operations, other devices and dtypes, and all
-    without numba.
+    without numba. The two add up in different orders: a map goes by one of them, see `WORTH_COMPILING`.
 
     Args:
         where: (W,) int64, in which of `size` numbers the sum of a line goes; the others are 0.
@@ -68,13 +62,13 @@ def compiled_sums(
 
     Shape: (Q,K) -> (Q,size).
     """
-    if coefficients.level.shape[0] < WORTH_COMPILING:
+    query, factors = (numbers_of(tensor) for tensor in (queries, factor))
+    if query is None or factors is None or where.device.type != "cpu":
         return None
-    own = [numbers_of(tensor) for tensor in (queries, factor)]
-    kernel = None if any(one is None for one in own) else _compiled()
-    if kernel is None or where.device.type != "cpu":
+    own = [part.contiguous().numpy() for part in coefficients]
+    kernel = _compiled(*(part.dtype for part in own))
+    if kernel is None:
         return None
     out = np.zeros((queries.shape[0], size), np.float32)
-    query, factors = own
-    kernel(query, *(part.numpy() for part in coefficients), where.numpy(), factors, out)
+    kernel(query, *own, where.numpy(), factors, out)
     return torch.from_numpy(out)

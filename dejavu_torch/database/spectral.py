@@ -34,7 +34,7 @@ from dejavu_torch.database.coefficients import (
 )
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.quantisation import RouteLines, dead_zone, quantise
-from dejavu_torch.database.sparse_product import compiled_sums
+from dejavu_torch.database.sparse_product import WORTH_COMPILING, compiled_sums
 from dejavu_torch.database.spectrum import Slots, Transform, from_slots, period_of, slots, spectrum
 from dejavu_torch.database.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
@@ -48,6 +48,7 @@ CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and chec
 BLOCK = 2**19  # numbers made at a time: they stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk made at a time, which is gone through for each
 ROWS = 2**14  # of descriptors, looked at together
+COPIES = 4  # numbers held for a place of a long chunk and a query: line, transform, score, is it best
 TOGETHER = 32  # chunks decoded before theirs are joined: many small tensors would split up the heap
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
@@ -163,7 +164,8 @@ class SpectralMap(PlaceMap):
 
     Attributes:
         chunks: the places [start, stop) of each. bounds: (G+1) where the coefficients of each chunk begin.
-        longest: places of the longest chunk.
+        longest: places of the longest chunk. compiled: whether products are summed by a compiled loop, where
+            there is one; a part of a map takes this, and `audible`, from the whole, for the same scores.
         needed: bytes per place that would hold half the variance of a route of which this map holds under a
             tenth; None where it holds more, or was loaded.
 
@@ -306,6 +308,7 @@ class SpectralMap(PlaceMap):
         self.chunks: list[tuple[int, int]] = list(zip([0, *stops], stops, strict=False))
         self.longest: int = max(self.lengths.tolist(), default=0)
         sums = torch.cat([self.lengths.new_zeros(1), self.counts.cumsum(0, dtype=torch.int64)])
+        self.compiled = len(self.level) >= WORTH_COMPILING
         self.bounds: list[int] = [0, *sums[self.lengths.cumsum(0)].tolist()]
         self._streams: list[Stream | None] = [None] * len(self.chunks)  # coded when they are asked for
         self.norms = self.steps.new_empty(self.places)
@@ -395,7 +398,7 @@ class SpectralMap(PlaceMap):
         length, (slot, factor, one) = self._length(chunks.start), self._slots(chunks)
         size = len(chunks) * one.count
         own = self.coefficients(chunks)
-        lines = compiled_sums(queries, own, slot, factor, size)
+        lines = compiled_sums(queries, own, slot, factor, size) if self.compiled else None
         if lines is None:
             line = lines_of(own.counts, own.level.shape[0])
             terms = queries.index_select(1, own.feature.int()) * (own.level * factor[line]).to(queries)
@@ -445,33 +448,38 @@ class SpectralMap(PlaceMap):
             queries = queries / torch.where(length > 0, length, 1)
         for chunks, rebuilt in self._ways(queries.shape[0], self._inside(start, stop), rebuild):
             span = self._span(chunks)
-            if rebuilt:
-                scores = self._rebuilt_scores(queries, chunks)
-            elif self.metric == "cosine":
-                per_norm = self.per_norm(span.start, span.stop).to(queries)
-                scores = torch.addcmul(
-                    queries.new_ones(()), self.products(queries, chunks), per_norm, value=-1
-                )
-            else:
-                scores = self.norms[span].to(queries).square() - 2 * self.products(queries, chunks)
+            with torch.autocast(queries.device.type, enabled=False):
+                scores = self._scores(queries, chunks, rebuilt)
             if self.metric == "l2":
                 scores = (scores + length.square()).clamp(min=0)
             low, high = max(start, span.start), min(stop, span.stop)
             yield low, scores[:, low - span.start : high - span.start]
 
+    def _scores(self, queries: Tensor, chunks: range, rebuilt: bool) -> Tensor:
+        """Of equally long chunks, (Q,W G); of cosine for queries of length 1, of l2 without their squares."""
+        span = self._span(chunks)
+        if rebuilt:
+            return self._rebuilt_scores(queries, chunks)
+        products = self.products(queries, chunks)
+        if self.metric == "cosine":
+            per_norm = self.per_norm(span.start, span.stop).to(queries)
+            return torch.addcmul(queries.new_ones(()), products, per_norm, value=-1)
+        return self.norms[span].to(queries).square() - 2 * products
+
     def product_blocks(self, queries: Tensor) -> Iterator[Tensor]:
         """Inner products with the descriptors of all places, by runs of equally long chunks: (Q,G,W) each."""
         for chunks, rebuilt in self._ways(queries.shape[0], range(len(self.chunks))):
-            if rebuilt:
-                parts = (queries[:, some] @ part.to(queries) for some, part in self._series(chunks))
-                products = functools.reduce(torch.add, parts)
-            else:
-                products = self.products(queries, chunks)
+            with torch.autocast(queries.device.type, enabled=False):
+                if rebuilt:
+                    parts = (queries[:, some] @ part.to(queries) for some, part in self._series(chunks))
+                    products = functools.reduce(torch.add, parts)
+                else:
+                    products = self.products(queries, chunks)
             yield products.unflatten(1, (len(chunks), -1))
 
     @property
     def block_places(self) -> int:
-        return max(self.longest, BLOCK // max(1, self.dimension))
+        return max(COPIES * self.longest, BLOCK // max(1, self.dimension))
 
     def _ways(self, queries: int, chunks: range, rebuild: bool | None = None) -> Iterator[tuple[range, bool]]:
         """Runs of these chunks for so many queries, and whether they are rebuilt."""

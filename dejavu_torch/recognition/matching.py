@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, evidence, evidence_of
 from dejavu_torch.recognition.candidates import Candidates, best_candidates
-from dejavu_torch.recognition.search import Search, Searcher, enough
+from dejavu_torch.recognition.search import LISTED, SCORES_AT_ONCE, Search, Searcher, enough
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
@@ -87,13 +87,19 @@ class Matching(NamedTuple):
     @torch.no_grad()
     def search_for(self, queries: Tensor, searcher: Searcher) -> Found:
         """What is found of descriptors (B,K) by a search, on the CPU: what `found` finds of all scores."""
-        places, platt = searcher.route.places, self.platt
-        wanted = [(self.ranks, self.apart)]
-        if platt is not None:
-            wanted.append((min(2, places), TOLERANCE))
-        best = searcher(queries, max(enough(*one) for one in wanted))
-        candidates, *beside = (Candidates(*(c.cpu() for c in best.candidates(*one))) for one in wanted)
-        return Found(candidates, probability=platt and platt.probability(evidence(*beside)))
+        route, wanted = searcher.route, [(self.ranks, self.apart)]
+        if self.platt is not None:
+            wanted.append((min(2, route.places), TOLERANCE))
+        n = min(route.places, max(enough(*one) for one in wanted))
+        if not searcher.pays(n):
+            return self.found(map(route.scores, queries.split(max(1, SCORES_AT_ONCE // route.places))))
+        parts = []
+        for some in queries.split(max(1, SCORES_AT_ONCE // (LISTED * n))):
+            best = searcher(some, n)
+            candidates, *beside = (Candidates(*(c.cpu() for c in best.candidates(*one))) for one in wanted)
+            probability = self.platt and self.platt.probability(evidence(*beside))
+            parts.append(Found(candidates, probability=probability))
+        return joined(parts)
 
     def found(self, batches: Iterable[Tensor]) -> Found:
         """What is found by scores (B,N) of single queries, batches one behind the other.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -18,6 +19,8 @@ from dejavu_torch.types import InputError
 Search = Literal["auto", "scan", "bound", "ivf"]
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x n held at a time
+FEW = 1 / 16  # of the places of a block: of more, to keep the best takes longer than all scores
+LISTED = 16  # numbers held for each of the best of a query, while two lists are merged
 COARSE = 4  # places for each of which a bound has one sample of the low lines
 SLACK = 1e-5  # of a bound, for rounding; of l2, times the squares of the lengths
 WORTH_BOUNDS = 2**24  # N x K; a smaller map is scanned before a bound pays
@@ -271,7 +274,7 @@ class Searcher:
         sample: int = 0,
     ) -> None:
         check_search(method, route)
-        self.route, self.sample, self.sizes = route, sample, (lists, probes)
+        self.route, self.asked, self.sample, self.sizes = route, method, sample, (lists, probes)
         self._made = [*route.buffers()]
         self._bound: Bound | None = None
         self._index: Any = None
@@ -280,13 +283,22 @@ class Searcher:
 
     def fits(self, route: PlaceMap, method: Search) -> bool:
         """Whether it is for this map as it is now, and this method."""
-        chosen = self.told.method == method or (method == "auto" and self.told.method != "ivf")
-        same = len(self._made) == len([*route.buffers()])
-        return chosen and same and all(map(_is, self._made, route.buffers())) and route is self.route
+        made = [*route.buffers()]
+        same = len(made) == len(self._made) and all(map(operator.is_, made, self._made))
+        return same and route is self.route and method == self.asked
+
+    def pays(self, n: int) -> bool:
+        """Whether to search for n places, rather than to take them from all scores."""
+        places = self.route.places
+        most = max(1, FEW * min(places, self.route.block_places))
+        return n <= most or places > SCORES_AT_ONCE or self.asked in ("bound", "ivf")
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, n: int) -> Best:
+        queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         n = min(n, self.route.places)
+        if not len(queries):
+            return none_yet(queries, n)
         if self.told.method == "auto":
             self.told = self.told._replace(method=self._chosen(queries))
         method, before = self.told.method, self.told.queries
@@ -307,7 +319,7 @@ class Searcher:
         route = self.route
         if not isinstance(route, SpectralMap) or route.chunk == "route":
             return "scan"
-        if route.places * route.dimension < WORTH_BOUNDS or not len(queries):
+        if route.places * route.dimension < WORTH_BOUNDS:
             return "scan"
         some = part_of(route, TRIAL_CHUNKS)
         trial = Searcher(some, "bound")
@@ -468,10 +480,6 @@ def _faiss() -> Any:
             f"search 'ivf' needs faiss ({error}); expected it to be there: pip install 'dejavu_torch[bench]'"
         ) from error
     return faiss
-
-
-def _is(one: object, other: object) -> bool:
-    return one is other
 
 
 def _joined(parts: Iterable[Best]) -> Best:

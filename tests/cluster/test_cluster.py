@@ -19,12 +19,13 @@ from command_line import fails, frames, write_images
 from helpers import Fixed, Stream, refused, template_model
 from torch import Tensor, nn
 
-from dejavu_torch.cluster import session
+from dejavu_torch.cluster import searching, session
 from dejavu_torch.cluster.learning import code_on
-from dejavu_torch.cluster.searching import ClusterSearcher
+from dejavu_torch.cluster.searching import ClusterSearcher, _map_of, _parts
 from dejavu_torch.cluster.session import Cluster
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
+from dejavu_torch.database import spectral
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import merge
@@ -192,6 +193,21 @@ def test_parts_of_a_map_on_workers_find_what_the_whole_does(kind: str, cluster: 
     if kind == "route":
         os.kill(cluster.ray.get(searcher.actors[0].process.remote()), signal.SIGKILL)
         assert all(map(torch.equal, found_by(model, queries, searcher), whole))
+
+
+def test_a_part_is_scored_to_the_bit_as_in_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though its coefficients alone would not be worth a compiled loop."""
+    draw = torch.nn.functional.normalize(torch.randn(2000, 32, generator=torch.Generator().manual_seed(0)))
+    for module in (spectral, searching):
+        monkeypatch.setattr(module, "BLOCK", 2**13, raising=False)
+    monkeypatch.setattr(spectral, "WORTH_COMPILING", 6500)
+    whole = SpectralMapper(None, 0.25, chunk=CHUNK)(draw)
+    assert not whole.rebuilds(1)
+    for part in _parts(whole, 500, 0):
+        one = _map_of(part)
+        assert len(one.level) < 6500 < len(whole.level)
+        scores = whole.scores_between(draw[:1], part.start, part.start + part.places)
+        assert torch.equal(one.scores(draw[:1]), scores)
 
 
 def test_probabilities_are_those_of_the_whole_map(cluster: Cluster) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import builtins
 import math
+import pickle
+import weakref
 from typing import Any
 
 import pytest
@@ -20,9 +22,10 @@ from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.periods.imposed import ImposedPeriods
-from dejavu_torch.recognition import search
+from dejavu_torch.recognition import matching, search
 from dejavu_torch.recognition.calibration import Calibration, Platt, evidence_of
 from dejavu_torch.recognition.candidates import best_candidates
+from dejavu_torch.recognition.matching import Matching
 from dejavu_torch.recognition.search import Best, Bound, Searcher, enough, lowest, merged, scan
 
 METRICS = ("cosine", "l2")
@@ -246,12 +249,94 @@ def test_no_block_of_scores_is_as_long_as_the_route(monkeypatch: pytest.MonkeyPa
     assert sum(seen) % 4000 == 0  # for each batch of queries
 
 
+def test_what_a_long_chunk_holds_beside_its_scores_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    route, make, seen = learned(400, "route"), spectral.from_slots, []
+    monkeypatch.setattr(spectral, "BLOCK", 2**10)
+    monkeypatch.setattr(search, "SCORES_AT_ONCE", 8 * 400)
+    monkeypatch.setattr(spectral, "LONG", 2**11)
+    monkeypatch.setattr(spectral, "from_slots", lambda *args: seen.append(args[0].shape) or make(*args))
+    queries = walk(400)[::50]
+    assert torch.equal(Searcher(route)(queries, 1).index[:, 0], torch.arange(0, 400, 50))
+    assert [shape[0] for shape in seen] == [2] * 4
+
+
+@pytest.mark.parametrize("method", ["auto", "bound"])
+def test_many_of_the_best_are_taken_from_all_scores(
+    method: search.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless it is asked for otherwise; few of them for as many queries at a time as memory allows."""
+    route, queries = learned(2000, 50), walk(2000)[::99]
+    scores, searcher = route.scores(queries), Searcher(route, method)
+    batches: list[int] = []
+    make = Searcher.__call__
+    monkeypatch.setattr(Searcher, "__call__", lambda self, q, n: batches.append(len(q)) or make(self, q, n))
+    for ranks, apart in ((3, 5), (6, 100)):
+        found = Matching(ranks=ranks, apart=apart).search_for(queries, searcher).candidates
+        expected = best_candidates(scores, ranks, apart)
+        torch.testing.assert_close(found.score, expected.score, rtol=1e-5, atol=1e-5)
+    assert batches == [len(queries)] * (1 if method == "auto" else 2)
+    batches.clear()
+    monkeypatch.setattr(matching, "SCORES_AT_ONCE", 8 * matching.LISTED * enough(3, 5))
+    found = Matching(ranks=3, apart=5).search_for(queries, searcher).candidates
+    assert batches == [8, 8, 5]
+    assert found.index.shape == (21, 3)
+
+
 def test_a_merged_map_is_searched_block_by_block() -> None:
     parts = [SpectralMapper(None, 0.5, 50)(walk(places, seed=places)) for places in (200, 130)]
     route, queries = MergedMap(parts, ["out", "back"]), walk(130, seed=130)
     assert_equal(scan(route, queries, 9), by_sorting(route.scores(queries), 9))
     assert [start for start, _ in route.score_blocks(queries, 190, 210)] == [190, 200]
     assert route.block_places == max(part.block_places for part in parts)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_queries_of_half_precision_are_searched_for_as_floats(dtype: torch.dtype) -> None:
+    route = learned()
+    few, many = walk(300)[:1].to(dtype), walk(300)[::5].to(dtype)  # which are scored in different ways
+    assert route.rebuilds(len(many)) > route.rebuilds(len(few))
+    for queries in (few, many):
+        for method in ("scan", "bound"):
+            expected = Searcher(route, method)(queries.float(), 3)  # type: ignore[arg-type]
+            assert_equal(Searcher(route, method)(queries, 3), expected)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_convention_10_scores_are_float32_whatever_the_autocast(metric: str) -> None:
+    route = learned(metric=metric)
+    for queries in (walk(300)[:1], walk(300)[::5]):
+        for searcher in (Searcher(route, "scan"), Searcher(route, "bound")):
+            with torch.autocast("cpu", torch.bfloat16):
+                found = searcher(queries, 3)
+            assert_equal(found, searcher(queries, 3))
+
+
+def test_what_auto_takes_does_not_hang_on_what_was_asked_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "WORTH_BOUNDS", 1)
+    monkeypatch.setattr(search, "SPARED", 0)
+    route = walk(200)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50)).learn(route)
+    model.localize(route[:3], search="scan")
+    model.localize(route[:3])
+    assert model.searcher().told.method == "bound"  # as it spares enough
+    monkeypatch.setattr(search, "SPARED", 2)
+    assert model.searcher("bound") is not model.searcher()
+    searcher = model.searcher()
+    assert searcher(route[:0], 2).index.shape == (0, 2)
+    assert searcher.told.method == "auto"  # still open
+    model.localize(route[:3])
+    assert model.searcher() is searcher
+    assert searcher.told.method == "scan"
+
+
+def test_nothing_of_a_search_outlives_the_map_or_is_written() -> None:
+    route = walk(200)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50)).learn(route)
+    size, old = len(pickle.dumps(model)), weakref.ref(model.map)
+    model.localize(route[:3], search="bound")
+    assert len(pickle.dumps(model)) == size
+    model.learn(route)
+    assert old() is None
 
 
 def test_a_search_is_kept_until_the_map_changes() -> None:
