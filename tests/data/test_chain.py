@@ -93,6 +93,11 @@ def test_an_array_goes_elsewhere_as_its_file(tmp_path) -> None:  # type: ignore[
     packed = pickle.dumps(route)
     assert len(packed) < 1000
     assert torch.equal(all_of(pickle.loads(packed)), all_of(route))
+    # a part of what is mapped goes as its values
+    mapped = np.load(tmp_path / "route.npy", mmap_mode="r")
+    part, other = ArrayTraverse(mapped[100:140]), ArrayTraverse(mapped[200:240])
+    assert torch.equal(all_of(pickle.loads(pickle.dumps(part))), all_of(route)[100:140])
+    assert part.state(0, 40) != other.state(0, 40)
 
 
 def test_identities_tell_sources_apart(tmp_path) -> None:  # type: ignore[no-untyped-def]
