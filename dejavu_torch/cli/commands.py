@@ -38,7 +38,7 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_scanned, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.streaming.coder import Made, code_here
-from dejavu_torch.streaming.work import remove_work, work_folder_of
+from dejavu_torch.streaming.work import WorkFolder, work_folder_of
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
@@ -169,7 +169,9 @@ def run_learn(
         if calibration not in UNREAD:
             known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
-    done, start, work = "", model.map.places, work_folder_of(map)
+    done, start, work = "", model.map.places, WorkFolder(work_folder_of(map))
+    if visits is not None:
+        work.check_unused()
     with _making(cluster) as make:
         if append is not None and sources:
             growth.append(model, traverse, progress=True, work=work, make=make, visits=visits)
@@ -189,7 +191,7 @@ def run_learn(
         model.calibrate_if_possible(traverse, known, places)
     model.check_precision(None)
     model.save(map)
-    remove_work(work)
+    work.remove()
     print_map(model)
     if done:
         _say(done)

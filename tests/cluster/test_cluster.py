@@ -30,6 +30,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.growth import merge
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
+from dejavu_torch.streaming.work import WorkFolder
 from dejavu_torch.types import FrequencyLayer, Traverse
 
 CHUNK, PLACES = 50, 620
@@ -126,7 +127,9 @@ def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Mo
 
     thread = threading.Thread(target=kill)
     thread.start()
-    model = learned(open_source(images), watched, work=tmp_path / "work", make=partial(code_on, cluster))
+    model = learned(
+        open_source(images), watched, work=WorkFolder(tmp_path / "work"), make=partial(code_on, cluster)
+    )
     thread.join()
     assert killed
     assert killed[0] != os.getpid()
@@ -147,7 +150,7 @@ def test_what_cannot_be_made_is_named_and_only_that_is_made_again(
     (images / "110.png").write_bytes(b"no image")
     (tmp_path / "go").touch()
     (tmp_path / "deadly").touch()
-    settings = {"work": tmp_path / "work", "make": partial(code_on, cluster)}
+    settings = {"work": WorkFolder(tmp_path / "work"), "make": partial(code_on, cluster)}
     with refused("110.png", "read on", "1 more such part", "420 of 620"):
         learned(open_source(images), watched, **settings)
     (images / "110.png").write_bytes(good)
