@@ -177,8 +177,10 @@ def all_chunks(
         found = folder.finished(shard, states[shard])
         if found is not None:
             made[shard] = found
+    missing = [one for one in shards if one not in made]
+    if not missing:
+        return [one for shard in shards for one in made[shard]]
     try:
-        missing = [one for one in shards if one not in made]
         with closing(make(coder, traverse, missing, progress)) as parts:
             for shard, chunks in parts:
                 if folder is not None:

@@ -13,9 +13,10 @@ from functools import partial
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
-from command_line import fails, frames, write_images
+from command_line import fails, frames, run, write_images
 from helpers import Fixed, Stream, refused, template_model
 from torch import Tensor, nn
 
@@ -242,6 +243,15 @@ def test_probabilities_are_those_of_the_whole_map(cluster: Cluster) -> None:
         ClusterSearcher(
             cluster, template_model(Fixed(FrequencyLayer(7, 7, 0, 70, (0,)))).learn(route()[:70]).map
         )
+
+
+def test_a_short_route_starts_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "route.npy", route()[:64])
+    command = ("learn", tmp_path / "route.npy", "--map", tmp_path / "map.safetensors", "--mapper.chunk", "50")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "Cluster", None)
+        run(*command, "--calibration", "none", "--cluster", "auto")
+    assert "64 frames are learned here" in capsys.readouterr().out
 
 
 def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -163,6 +163,9 @@ def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
     assert len(sample_of(PLACES, CHUNK).views(views).places) == 400
     shown = sample_of(PLACES, CHUNK).views(Views(views.traverse, torch.arange(PLACES) - 30))
     assert torch.equal(sample_of(PLACES, CHUNK).frame[shown.places] + 30, shown.traverse.frame)  # type: ignore[attr-defined]
+    unseen = torch.tensor([one for one in range(PLACES) if one not in sample_of(PLACES, CHUNK).frame][:40])
+    with refused("none of the 400 frames", "stretches of 50"):
+        learned(route(), second=Views(ArrayTraverse(noisy[unseen]), unseen))
     model = DejaVu(whitening=Whitening(numbers=8), mapper=SpectralMapper(8.0, chunk=CHUNK))
     model.learn(route(), second=views)
     assert (model.localize(noisy[::7]).index == torch.arange(0, PLACES, 7)).float().mean() > 0.9
