@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from helpers import Stream, all_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch import types
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.chain import Chain, chained
 from dejavu_torch.data.selection import Selection, runs
@@ -57,6 +59,28 @@ def test_a_selection_has_the_frames_with_these_numbers(numbers: set[int], stream
     assert some.length == len(frame)
     assert torch.equal(torch.cat([VALUES[:0], *some.batches(size)]), VALUES[frame])
     assert [i for run in runs(frame) for i in run] == sorted(numbers)
+
+
+@pytest.mark.parametrize("streams", [False, True])
+def test_large_frames_are_read_few_at_a_time(streams: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 3)
+    chain = Chain(parts([20], streams))
+    some = Selection(chain, torch.arange(5, 30))
+    for traverse in (chain, some):
+        assert max(map(len, traverse.between(0, 25))) <= 3
+    read: list[int] = []
+    for part in chain.traverses:
+        batches = part.batches if streams else part.read
+        name = "batches" if streams else "read"
+
+        def noted(size: Any, batches: Any = batches) -> Any:
+            read.append(size if streams else len(size))
+            return batches(size)
+
+        monkeypatch.setattr(part, name, noted)
+    chain.count()
+    assert torch.equal(torch.cat(list(some.select(range(25), 2))), VALUES[5:30])
+    assert max(read) <= 3
 
 
 def test_frames_keep_their_names_behind_that_of_their_traverse(tmp_path) -> None:  # type: ignore[no-untyped-def]
