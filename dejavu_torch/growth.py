@@ -299,7 +299,7 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
 
     Returns:
         A model whose `map.routes` are the routes. Scores of a route's places are, to the bit, those of its
-        own map. A threshold is kept where all have it. Calibration and precision are of single routes and
+        own map. A threshold is kept where all have it. Calibration and precision hold for one route and
         are not kept; a line says so.
 
     Raises:
@@ -347,7 +347,9 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         *["precision"] * any(model.precision is not None for model in models),
     ]
     if lost:
-        log.warning("the merged map has no %s: those of its parts are of single routes", " or ".join(lost))
+        log.warning(
+            "the merged map has no %s: each holds only for the route it was made for", ", ".join(lost)
+        )
     return merged
 
 
