@@ -35,6 +35,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from dejavu_torch.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from dejavu_torch.data.source import open_source
     from dejavu_torch.database.distance import phase_distances
@@ -59,8 +61,6 @@ if TYPE_CHECKING:
     from dejavu_torch.training.datamodule import RouteData
     from dejavu_torch.training.task import PlaceRecognitionTask
     from dejavu_torch.types import FrequencyLayer, InputError, Match, Traverse
-
-__version__ = "0.1.0"
 
 __all__ = [
     "HOG",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from itertools import count
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.names import names_of
 from dejavu_torch.data.positions import positions_behind
-from dejavu_torch.database.mapfile import digests
+from dejavu_torch.database.mapfile import checksums, digests
 from dejavu_torch.database.merged import MergedMap, MergedMapper
 from dejavu_torch.database.recipe import difference, recipe_of
 from dejavu_torch.database.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
@@ -37,7 +36,7 @@ def append(
     model: DejaVu,
     traverse: Traverse | Tensor,
     progress: bool = False,
-    work: Path | None = None,
+    work: WorkFolder | None = None,
     make: Callable[..., Made] = code_here,
     visits: Views | None = None,
 ) -> DejaVu:
@@ -81,11 +80,10 @@ def append(
     text, counts = "learning" if progress else None, torch.ones(places, dtype=torch.int64)
     if visits is None:
         coder = model.chunk_coder(places, route, route.mean, before[-1].step)
-        folder = None
         if work is not None:
-            sums = [part.stream.checksum for part in before]
-            folder = WorkFolder(work, model.run_key(added, places) | digests(map=sums))
-        chunks = all_chunks(coder, added, folder, make, text)
+            sums = checksums(route.packed(), route.get_extra_state())
+            work.open(model.run_key(added, places) | digests(map=sums))
+        chunks = all_chunks(coder, added, work, make, text)
     else:
         _check_alike(model, visits.traverse)
         means, counts = _mean(model, model.extract_all(added, text).float(), counts, visits, progress)
@@ -301,7 +299,7 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
 
     Returns:
         A model whose `map.routes` are the routes. Scores of a route's places are, to the bit, those of its
-        own map. A threshold is kept where all have it. Calibration and precision are of single routes and
+        own map. A threshold is kept where all have it. Calibration and precision hold for one route and
         are not kept; a line says so.
 
     Raises:
@@ -349,7 +347,9 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         *["precision"] * any(model.precision is not None for model in models),
     ]
     if lost:
-        log.warning("the merged map has no %s: those of its parts are of single routes", " or ".join(lost))
+        log.warning(
+            "the merged map has no %s: each holds only for the route it was made for", ", ".join(lost)
+        )
     return merged
 
 

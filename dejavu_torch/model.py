@@ -62,6 +62,7 @@ from dejavu_torch.types import (
     Training,
     Traverse,
 )
+from dejavu_torch.version import __version__
 
 log = logging.getLogger("dejavu_torch")
 
@@ -203,7 +204,7 @@ class DejaVu(nn.Module):
         traverse: Traverse | Tensor,
         progress: bool = False,
         second: Views | None = None,
-        work: Path | None = None,
+        work: WorkFolder | None = None,
         make: Callable[..., Made] = code_here,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
@@ -212,8 +213,8 @@ class DejaVu(nn.Module):
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
             second: see `describe_reference`; `views` makes it.
             progress: show a progress bar on a terminal.
-            work: folder where the finished chunks of a long route are kept, so that learning goes on from
-                there after a kill; it is the caller's to remove.
+            work: keeps the finished chunks of a long route, so that learning goes on from there after a
+                kill; it is the caller's to remove.
             make: what makes the chunks of a long route: `code_here`, or a cluster.
 
         Returns:
@@ -235,6 +236,8 @@ class DejaVu(nn.Module):
             frames = 0 if self._chunked is None else traverse.count()
             if frames > streaming.SAMPLE:
                 return self._learn_chunks(traverse, frames, second, text, work, make)
+            if work is not None:
+                work.check_unused()
             return self.learn_features(self.describe_reference(traverse, second, text), traverse)
         except InputError:  # the map that there was is of its own whitening
             if self.whitening is not None and before is not None:
@@ -253,7 +256,7 @@ class DejaVu(nn.Module):
         frames: int,
         second: Views | None,
         progress: str | None,
-        work: Path | None,
+        work: WorkFolder | None,
         make: Callable[..., Made],
     ) -> DejaVu:
         """As `learn`, of a route of over `SAMPLE` frames."""
@@ -262,16 +265,20 @@ class DejaVu(nn.Module):
         size = int(mapper.chunk)
         names, positions = self._beside(traverse, frames)
         taken = positions.nbytes + _bytes_of(names)
-        folder = None
         if work is not None:
             sampled = runs(sample_of(frames, size).frame)
             key = self.run_key(traverse, frames, [traverse.state(run.start, run.stop) for run in sampled])
-            seen = second and [second.traverse.identity(), second.places.tolist()]
-            folder = WorkFolder(work, key | digests(second=seen))
+            shown = second and second.places.tolist()
+            seen = second and [
+                second.traverse.identity(),
+                shown,
+                second.traverse.state(0, len(second.places)),
+            ]
+            work.open(key | digests(second=seen))
         with in_one_thread():
-            fit = self._fit(traverse, frames, second, taken, progress, folder)
+            fit = self._fit(traverse, frames, second, taken, progress, work)
         coder = self.chunk_coder(frames, mapper, fit.mean, fit.step)
-        chunks = all_chunks(coder, traverse, folder, make, progress)
+        chunks = all_chunks(coder, traverse, work, make, progress)
         settings = mapper.metric, mapper.transform, size, mapper.resolution
         route = SpectralMap.of_chunks(chunks, fit.mean, *settings).to(self.map.positions.device)
         route.needed = fit.needed
@@ -285,10 +292,10 @@ class DejaVu(nn.Module):
         second: Views | None,
         taken: int,
         progress: str | None,
-        folder: WorkFolder | None,
+        work: WorkFolder | None,
     ) -> Fit:
         """Learn the whitening from a sample of a long route; mean and step of its chunks."""
-        found = None if folder is None else folder.fit()
+        found = None if work is None else work.fit()
         if found is not None:
             if self.whitening is not None:
                 self.whitening.load_state_dict(found[1])
@@ -306,8 +313,8 @@ class DejaVu(nn.Module):
         with torch.no_grad():
             route = other(descriptors)
         fit = Fit(route.mean, float(route.steps[0]), route.needed)
-        if folder is not None:
-            folder.keep_fit(fit, {} if self.whitening is None else self.whitening.state_dict())
+        if work is not None:
+            work.keep_fit(fit, {} if self.whitening is None else self.whitening.state_dict())
         return fit
 
     def chunk_coder(
@@ -326,10 +333,12 @@ class DejaVu(nn.Module):
         """
         parts = {name: getattr(self, name) for name in PARTS}
         header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
+        header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in self.modules()})))
         weights = self._weights("features")
         if self.whitening is not None and (self.whitening.fixed or states is None):
             weights |= self._weights("whitening")
-        header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE, "torch": torch.__version__}
+        header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE}
+        header |= {"version": __version__, "torch": torch.__version__}
         sums = checksums(weights, header)
         return digests(source=[traverse.identity(), frames, states]) | {"settings": sums.pop(HEADER), **sums}
 
@@ -359,7 +368,7 @@ class DejaVu(nn.Module):
 
         Convention: for a spectral map, a whitening of features beyond `concatenate`'s share of the memory is
             learned from a sample of them, see `sample_of`, and descriptors beyond a quarter of it lie in a
-            temporary file as float16, which is finer than any step.
+            temporary file; whitened ones as float16, which is finer than any step of these.
 
         Raises:
             InputError: as `learn`, or a second traverse that no whitening learns from.
@@ -375,7 +384,8 @@ class DejaVu(nn.Module):
             return concatenate(self.extract(traverse, progress), FEW_DESCRIPTORS, half=True)
         if whitening is None or whitening.fixed:
             batches = self.extract(traverse, progress)
-            return concatenate(batches, FEW_DESCRIPTORS, half=True) if spectral else concatenate(batches)
+            few = FEW_DESCRIPTORS if spectral else IN_MEMORY
+            return concatenate(batches, few, half=spectral and whitening is not None)
         device = self.map.positions.device
         features = concatenate(self._features(traverse, progress))
         if second is None and len(traverse.frame_shape) == 3:
@@ -1052,6 +1062,16 @@ def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tenso
         shown = places[done : done + len(batch)]
         yield batch[shown >= 0], shown[shown >= 0]
         done += len(batch)
+
+
+def _code_of(cls: type[nn.Module]) -> str:
+    """The source of a class of the user's own; "" where there is none, or where a version tells of it."""
+    if cls.__module__.partition(".")[0] in ("dejavu_torch", "torch"):
+        return ""
+    try:
+        return inspect.getsource(cls)
+    except (OSError, TypeError):
+        return ""
 
 
 def _bytes_of(names: list[str]) -> int:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from dejavu_torch.text import printable
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least one: 256 MB
+AT_ONCE = 64  # frames read at a time, where nobody says how many
 FRAME_NUMBERS = 2**28  # in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
 
@@ -66,7 +67,7 @@ class Traverse(ABC):
         A traverse that can begin anywhere does so.
         """
         seen = 0
-        for batch in self.batches(64):
+        for batch in self.batches(self.batch_size()):
             if seen >= stop:
                 return
             part = batch[max(0, start - seen) : max(0, stop - seen)]
@@ -121,9 +122,9 @@ class Traverse(ABC):
 
     def count(self) -> int:
         """Number of frames, read through where the traverse does not know its length."""
-        return sum(map(len, self.batches(64))) if self.length is None else self.length
+        return sum(map(len, self.batches(self.batch_size()))) if self.length is None else self.length
 
-    def batch_size(self, most: int) -> int:
+    def batch_size(self, most: int = AT_ONCE) -> int:
         """How many frames to read at a time: `most`, or fewer where frames are large.
 
         Raises:

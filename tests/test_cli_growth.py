@@ -33,6 +33,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "f": (*none, "--mapper.chunk", "32"),
     }.items():
         run("learn", folder / "d.npy", "--map", folder / f"{name}.safetensors", *options)
+    sure = DejaVu.load(folder / "f.safetensors")
+    sure.precision = 0.9
+    sure.save(folder / "sure.safetensors")
     return folder
 
 
@@ -103,6 +106,12 @@ def test_calibration_of_the_new_places(folder: Path, tmp_path: Path) -> None:
         ("d.npy --append f.safetensors --config paper", ["--config", "--append"]),
         ("d.npy --append f.safetensors --features.cell 4", ["f.safetensors", "cell"]),
         ("d.npy --append f.safetensors --precision .9", ["--precision 0.9", "--calibration SOURCE"]),
+        ("d.npy --append sure.safetensors", ["the map's precision, 0.9,", "d.npy", "--threshold"]),
+        (
+            "d.npy --append sure.safetensors --calibration none",
+            ["the map's precision, 0.9,", "--calibration none", "--threshold"],
+        ),
+        ("d.npy d.npy --map m.safetensors --calibration ./d.npy", ["d.npy itself", "another traverse"]),
         ("d.npy --append f.safetensors --map m.npy", ["--map m.npy", "m.safetensors"]),
         ("--append f.safetensors", ["required: source"]),
         ("d.npy", ["required: --map"]),
@@ -201,7 +210,7 @@ def test_live_names_the_route(merged: Path, capsys: pytest.CaptureFixture[str]) 
     ("words", "said"),
     [
         ("merge first.safetensors", ["merging first.safetensors", "at least two"]),
-        ("merge", ["0 maps", "at least two"]),
+        ("merge", ["required: maps"]),
         ("merge first.safetensors first.safetensors", ["first.safetensors", "one file"]),
         ("merge first.safetensors f.safetensors", ["first", "f cannot be merged", "no whitening"]),
         ("merge f.safetensors templates.safetensors", ["templates is", "'templates'", "'spectral'"]),
@@ -304,6 +313,8 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
     ("words", "said"),
     [
         ("d.npy --map m.safetensors --average d.npy", ["--average d.npy is what is learned"]),
+        ("d.npy --map m.safetensors --average ./d.npy", ["--average ./d.npy is what is learned"]),
+        ("d.npy --map m.safetensors --average e.npy --calibration ./e.npy", ["of --average"]),
         ("d.npy --map m.safetensors --average_truth 0", ["--average_truth 0", "--average SOURCE"]),
         ("d.npy --map m.safetensors --average a.npy", ["a.npy", "40 frames", "96"]),
         ("d.npy --map m.safetensors --average wide.npy --average_truth 0", ["wide.npy", "5 features"]),

@@ -85,6 +85,9 @@ def test_another_command_does_not_take_over_what_is_finished(
     assert str(folder) in error
     assert "settings" in error
     assert "removed" in error
+    error = fails(capsys, "learn", f"{route}?stop=600", "--map", out, *CHUNKED)
+    assert str(folder) in error
+    assert "another run" in error
     assert sorted(folder.iterdir()) == kept
     run("learn", route, "--map", out, *CHUNKED)
     assert out.read_bytes() == whole.read_bytes()

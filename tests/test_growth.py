@@ -414,7 +414,7 @@ def test_what_is_of_single_routes_is_not_kept_and_told(caplog: pytest.LogCapture
     models[1].precision, models[1].threshold = 0.9, 0.5
     merged = merge(models, ["a", "b"])
     assert (merged.calibration, merged.precision, merged.threshold) == (None, None, None)
-    assert "no thresholds or calibration or precision" in caplog.text
+    assert "no thresholds, calibration, precision" in caplog.text
     assert models[1].precision == 0.9
 
 

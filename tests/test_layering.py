@@ -14,7 +14,7 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 NAMES = [str(file) for file in FILES]
 ORDER = [
-    {"text"},
+    {"text", "version"},
     {"types"},
     {"resize", "memory"},
     {"features", "periods", "data"},
@@ -45,7 +45,7 @@ ARROWS = {
     "recognition": "types database",
     "motion": "data memory types",
     "streaming": "types data features database",
-    "model": "types text data features periods database recognition motion streaming",
+    "model": "types text version data features periods database recognition motion streaming",
     "growth": "types data features database streaming model motion",
     "cluster": "types text data database recognition streaming",
     "live": "types data features recognition model",

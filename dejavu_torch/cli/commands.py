@@ -9,8 +9,7 @@ import copy
 import shlex
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ from torch import Tensor, nn
 
 from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.data.chain import chained
+from dejavu_torch.data.chain import chained, parts_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.database.merged import MergedMap
@@ -31,14 +30,15 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision, check_sizes
 from dejavu_torch.motion.ground_plane import check_corners
-from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.recognition.calibration import NEVER
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_scanned, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.streaming.coder import Made, code_here
-from dejavu_torch.streaming.work import remove_work, work_folder_of
+from dejavu_torch.streaming.sample import SAMPLE as SHORT
+from dejavu_torch.streaming.work import WorkFolder, work_folder_of
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
@@ -134,11 +134,13 @@ def run_learn(
         device: what learns: cpu, cuda or cuda:1
     """
     where, map = device_of(device, learns=True), append if map is None else map
+    given = model.precision
     assert map is not None  # the parser has seen to it
     if append is None:
         model.to(where)
     else:
         model = _map_to_append_to(append, model, len(sources) > 0).to(where)
+    precision = f"--precision {given}" if given is not None else f"the map's precision, {model.precision},"
     if cluster is not None:
         _check_cluster(cluster, device)
         _check_chunks(cluster, model)
@@ -149,7 +151,8 @@ def run_learn(
     check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
     check_not_read(map, average, average_truth)
     if calibration == NO_CALIBRATION and model.precision is not None:
-        raise InputError(f"--precision {model.precision} with --calibration none; expected one of them")
+        seen = f"{precision} with --calibration none"
+        raise InputError(f"{seen}; expected one of them, as --threshold replaces the precision")
     _set_seed(model, seed)
     _check_average(average, average_truth, sources, calibration)
     visits: Views | None = None
@@ -159,17 +162,19 @@ def run_learn(
         traverse, views = _with_second(model, traverse, second, second_truth)
         if average is not None:
             visits = model.places_shown(traverse, open_source(average), average_truth)
-        _check_calibration(model, traverse, calibration)
+        _check_calibration(model, traverse, calibration, precision)
         traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
     else:
         visits = growth.shown_on_map(model, open_source(str(average)), average_truth)
         traverse, views = visits.traverse, None
-        _check_calibration(model, traverse, calibration)
+        _check_calibration(model, traverse, calibration, precision)
         known = None
         if calibration not in UNREAD:
             known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
-    done, start, work = "", model.map.places, work_folder_of(map)
+    done, start, work = "", model.map.places, WorkFolder(work_folder_of(map))
+    if visits is not None:
+        work.check_unused()
     with _making(cluster) as make:
         if append is not None and sources:
             growth.append(model, traverse, progress=True, work=work, make=make, visits=visits)
@@ -185,11 +190,14 @@ def run_learn(
             growth.learn_mean(model, traverse, visits, progress=True, second=views)
         else:
             model.learn(traverse, progress=True, second=views, work=work, make=make)
+            if cluster is not None and model.map.places <= SHORT:
+                seen = f"{model.map.places} frames are learned here"
+                print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
     if calibration != NO_CALIBRATION:
         model.calibrate_if_possible(traverse, known, places)
     model.check_precision(None)
     model.save(map)
-    remove_work(work)
+    work.remove()
     print_map(model)
     if done:
         _say(done)
@@ -439,7 +447,7 @@ def run_compare(
     strange = [open_source(other) for other in others]
     traverses = [first, queries, *(open_source(one) for one in (second, calibration) if one not in UNREAD)]
     for other in strange:
-        if Path(other.name).resolve() in [Path(one.name).resolve() for one in traverses]:
+        if _same_as(other, traverses):
             raise InputError(f"--distractors {other.name} is one of the traverses; expected another route")
     if top is not None:
         _check_top(top, model)
@@ -697,15 +705,13 @@ def run_export(
     _say(f"{size}; {written.difference:.1g} from torch at most, on noise; written to {onnx}")
 
 
-def run_merge(
-    maps: Sequence[Path] = (), *, map: Path, features: nn.Module | None = None, command: str
-) -> None:
+def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = None, command: str) -> None:
     """Join the maps of several routes that describe frames alike: an answer is then a route and its frame.
 
     Routes describe frames alike where all but the first were learned with --whitening FIRST.safetensors.
 
     Args:
-        maps: map files, at least two; each route is called as its file, those of merged maps as they were
+        maps: map files, at least two; a route is named after its file, one of a merged map keeps its name
         map: map file to write (.safetensors)
         features: class of the maps' features, if not ours
     """
@@ -784,15 +790,16 @@ def _check_chunks(cluster: str, model: DejaVu) -> None:
 
 @contextmanager
 def _making(cluster: str | None) -> Iterator[Callable[..., Made]]:
-    """What makes the chunks of a long route: this process, or a cluster, which is there within the block."""
+    """What makes the chunks of a long route: this process, or a cluster, which ends with the block."""
     if cluster is None:
         yield code_here
         return
     from dejavu_torch.cluster.learning import code_on
     from dejavu_torch.cluster.session import Cluster
 
-    with Cluster(cluster) as workers:
-        yield partial(code_on, workers)
+    with ExitStack() as stack:
+        # no sooner than there are chunks to make: it takes seconds
+        yield lambda *work: code_on(stack.enter_context(Cluster(cluster)), *work)
 
 
 @contextmanager
@@ -935,7 +942,7 @@ def _with_second(
             raise InputError(f"--second_truth {truth} is of no traverse; expected --second SOURCE with it")
         return reference, None
     traverse = open_source(second)
-    if query is not None and Path(traverse.name).resolve() == Path(query.name).resolve():
+    if query is not None and _same_as(traverse, [query]):
         raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
     reference = model.resample(reference, progress=True)
     return reference, model.views(reference, traverse, truth)
@@ -955,22 +962,22 @@ def _with_calibration(
             seen = f"--calibration_truth {truth} is of no traverse"
             raise InputError(f"{seen}; expected --calibration SOURCE with it")
         return reference, None
-    if source == second:
-        raise InputError(f"--calibration {source} is that of --second; expected a further traverse")
     traverse = open_source(str(source))
-    for other in (reference, query):
-        if other is not None and Path(traverse.name).resolve() == Path(other.name).resolve():
-            raise InputError(f"--calibration {source} is {other.name} itself; expected another traverse")
+    if second is not None and _same_as(traverse, [open_source(second)]):
+        raise InputError(f"--calibration {source} is that of --second; expected a further traverse")
+    same = _same_as(traverse, [*parts_of(source_of(reference)), *([] if query is None else [query])])
+    if same is not None:
+        raise InputError(f"--calibration {source} is {same.name} itself; expected another traverse")
     check_sizes(model, reference, traverse)
     reference = model.resample(reference, model.step, progress=True)
     return reference, model.places_shown(reference, traverse, truth)
 
 
-def _check_calibration(model: DejaVu, traverse: Traverse, calibration: str | None) -> None:
-    """Refuse a precision that nothing will tell of."""
+def _check_calibration(model: DejaVu, traverse: Traverse, calibration: str | None, told: str) -> None:
+    """Refuse a precision, told by its name, that nothing will tell of."""
     if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
-        seen = f"--precision {model.precision}: {traverse.name} has no frames to calibrate by"
-        raise InputError(f"{seen}; expected --calibration SOURCE")
+        seen = f"{told} and {traverse.name}, which has no frames to calibrate by"
+        raise InputError(f"{seen}; expected --calibration SOURCE, or --threshold in place of the precision")
 
 
 def _check_average(
@@ -981,10 +988,17 @@ def _check_average(
         if truth is not None:
             raise InputError(f"--average_truth {truth} is of no traverse; expected --average SOURCE with it")
         return
-    if average in sources:
+    traverse = open_source(average)
+    if _same_as(traverse, [open_source(one) for one in sources]):
         raise InputError(f"--average {average} is what is learned; expected another traverse of its places")
-    if average == calibration:
+    if calibration not in UNREAD and _same_as(traverse, [open_source(str(calibration))]):
         raise InputError(f"--calibration {calibration} is that of --average; expected a further traverse")
+
+
+def _same_as(traverse: Traverse, others: Iterable[Traverse]) -> Traverse | None:
+    """The first of others that has the name of a traverse, however its path is written."""
+    name = Path(traverse.name).resolve()
+    return next((other for other in others if Path(other.name).resolve() == name), None)
 
 
 def _check_top(top: int, model: DejaVu) -> None:

@@ -179,7 +179,7 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
     Args:
         function: its positional parameters are positional arguments, optional ones where they have a default,
             its keyword-only ones are options, and `Args:` of its docstring has their help. Those annotated
-        `Sequence` take any number of words, or, without a default, at least one.
+            `Sequence` take any number of words, or, without a default, at least one.
     """
     text = docstring_parser.parse(inspect.getdoc(function) or "")
     helps = {one.arg_name: one.description for one in text.params}

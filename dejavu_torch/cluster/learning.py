@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from tqdm import tqdm
 
@@ -35,25 +35,27 @@ def code_on(
     total = sum(len(range(*coder.span(shard))) for shard in shards)
     bar = tqdm(total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False)
     with bar:
-        for task, result in cluster.run(coded, shared, tasks):
-            if isinstance(result, Failure):
-                failed.append((range(task[0].start, task[-1].stop), result))
-                if len(failed) == FAILURES:
-                    break
-                continue
-            for shard, chunks in zip(task, result, strict=True):
+        for task, made, failure in cluster.run(coded, shared, tasks):
+            for shard, chunks in zip(task, made, strict=False):
                 bar.update(sum(one.places for one in chunks))
                 yield shard, chunks
+            if failure is not None:
+                left = task[len(made) :] if failure.host is None else task[len(made) : len(made) + 1]
+                failed.append((range(left[0].start, left[-1].stop), failure))
+                if len(failed) == FAILURES:
+                    break
     if failed:
-        chunks, failure = failed[0]
-        start, stop = coder.span(chunks)
+        part, failure = failed[0]
+        start, stop = coder.span(part)
+        read = "" if failure.host is None else f", read on {failure.host}"
         more = f", and {len(failed) - 1} more such parts" if len(failed) > 1 else ""
-        raise InputError(f"frames {start} to {stop - 1}, read on {failure.host}: {failure.why}{more}")
+        raise InputError(f"frames {start} to {stop - 1}{read}: {failure.why}{more}")
 
 
-def coded(shards: list[range], coder: ChunkCoder, traverse: Traverse) -> list[list[CodedChunk]]:
-    """The chunks of shards, by a worker."""
-    return [chunks for _, chunks in code_here(coder, traverse, shards)]
+def coded(shards: list[range], coder: ChunkCoder, traverse: Traverse) -> Iterator[list[CodedChunk]]:
+    """The chunks of each shard, by a worker."""
+    for _, chunks in code_here(coder, traverse, shards):
+        yield chunks
 
 
 def _dealt(shards: Sequence[range], workers: int) -> list[list[range]]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.cluster.session import RETRIES, Cluster, error_line
 from dejavu_torch.database.merged import MergedMap
 from dejavu_torch.database.place_map import PlaceMap
-from dejavu_torch.database.spectral import BLOCK, CodedChunk, SpectralMap
+from dejavu_torch.database.spectral import CodedChunk, SpectralMap
 from dejavu_torch.recognition.search import (
     SCORES_AT_ONCE,
     Best,
@@ -160,10 +160,9 @@ def _maps(route: PlaceMap) -> list[SpectralMap]:
 def _parts(route: SpectralMap, most: int, first: int) -> Iterator[Part]:
     """Parts of about `most` places at most, divided where the blocks of a scan are."""
     coded, settings, mean = route.coded(), route.settings(), route.mean.cpu()
-    together = max(1, BLOCK // max(1, route.dimension * max(one.places for one in coded)))
-    blocks = [coded[i : i + together] for i in range(0, len(coded), together)]
     held: list[CodedChunk] = []
-    for block in blocks:
+    for run in route.runs(range(len(coded)), route.dimension):
+        block = coded[run.start : run.stop]
         if held and sum(one.places for one in [*held, *block]) > most:
             yield Part(first, held, mean, settings, route.audible, route.compiled)
             first += sum(one.places for one in held)

@@ -29,10 +29,10 @@ QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "
 
 
 class Failure(NamedTuple):
-    """Why a task came to nothing, and on which host."""
+    """Why a task ended early, and on which host; None where its worker died, and took that along."""
 
     why: str
-    host: str
+    host: str | None
 
 
 class Cluster:
@@ -88,14 +88,14 @@ class Cluster:
             return [self.ray.put(values)]
 
     def run(
-        self, function: Callable[..., Any], shared: list[Any], tasks: Sequence[Any]
-    ) -> Generator[tuple[Any, Any], None, None]:
-        """Run `function(task, *shared)` for all tasks: each with its result, as they are finished.
+        self, function: Callable[..., Iterable[Any]], shared: list[Any], tasks: Sequence[Any]
+    ) -> Generator[tuple[Any, list[Any], Failure | None], None, None]:
+        """Go through `function(task, *shared)` for all tasks: each with its results, as tasks are finished.
 
         A task whose worker dies is run again, `RETRIES` times.
 
         Returns:
-            What the function returned, or a `Failure`.
+            A task, what the function gave, and what ended it early, if anything did.
         """
         remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_run)
         here, waiting = os.getcwd(), deque(tasks)
@@ -107,20 +107,21 @@ class Cluster:
                     running[remote.remote(function, shared, task, here)] = task
                 done, _ = self.ray.wait(list(running))
                 for one in done:
-                    yield running.pop(one), self._result(one)
+                    yield running.pop(one), *self._results(one)
         finally:
             for one in running:
                 with suppress(Exception):
                     self.ray.cancel(one, force=True)
 
-    def _result(self, reference: Any) -> Any:
+    def _results(self, reference: Any) -> tuple[list[Any], Failure | None]:
         try:
-            return self.ray.get(reference)
+            results: tuple[list[Any], Failure | None] = self.ray.get(reference)
+            return results
         except self.ray.exceptions.RayTaskError:  # an error of ours
             raise
         except self.ray.exceptions.RayError as error:
             seen = f"its worker died, {RETRIES + 1} times ({error_line(error)})"
-            return Failure(f"{seen}; expected workers that live, and memory for them", self.address)
+            return [], Failure(f"{seen}; expected workers that live, and memory for them", None)
 
 
 def error_line(error: Exception) -> str:
@@ -156,7 +157,9 @@ def _ray() -> Any:
 _shared: dict[str, Any] = {}  # of a worker process: what it was sent last
 
 
-def _run(function: Callable[..., Any], shared: list[Any], task: Any, folder: str) -> Any:
+def _run(
+    function: Callable[..., Iterable[Any]], shared: list[Any], task: Any, folder: str
+) -> tuple[list[Any], Failure | None]:
     """A task, in a worker."""
     import ray
 
@@ -166,11 +169,14 @@ def _run(function: Callable[..., Any], shared: list[Any], task: Any, folder: str
     if key not in _shared:
         _shared.clear()
         _shared[key] = ray.get(shared[0])
+    results: list[Any] = []
     try:
-        return function(task, *_shared[key])
+        for result in function(task, *_shared[key]):
+            results.append(result)
     except (InputError, OSError, RuntimeError, MemoryError) as error:
         kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-        return Failure(kind + one_line(error), socket.gethostname())
+        return results, Failure(kind + one_line(error), socket.gethostname())
+    return results, None
 
 
 @contextmanager

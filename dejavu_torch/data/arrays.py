@@ -39,6 +39,8 @@ class ArrayTraverse(IndexedTraverse):
             NaN.
     """
 
+    path: Path | None = None  # of the file that has all of the values, and nothing else
+
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
         shape = tuple(values.shape)
         kind = str(values.dtype).removeprefix("torch.") if isinstance(values, Tensor) else values.dtype.name
@@ -54,9 +56,7 @@ class ArrayTraverse(IndexedTraverse):
         self.values = values
 
     def read(self, frames: range) -> Tensor:
-        part = self.values[frames.start : frames.stop : frames.step]
-        if not isinstance(part, Tensor):  # a copy, of this machine's byte order
-            part = torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))
+        part = self._stored(frames)
         if part.dtype == torch.uint8:
             part = part[..., None] if part.ndim == 3 else part
             return part.permute(0, 3, 1, 2).float() / 255
@@ -72,17 +72,24 @@ class ArrayTraverse(IndexedTraverse):
             batch.clamp_(0, 1)
         return batch
 
+    def _stored(self, frames: range) -> Tensor:
+        """The values of frames, of the type that they have."""
+        part = self.values[frames.start : frames.stop : frames.step]
+        if isinstance(part, Tensor):
+            return part
+        return torch.from_numpy(
+            np.array(part, dtype=part.dtype.newbyteorder("="))
+        )  # writable, of this machine
+
     def state(self, start: int, stop: int) -> str:
-        file = getattr(self.values, "filename", None)
-        if file is not None:
-            return state_of(Path(file))
-        part = torch.as_tensor(self.values[start:stop]).detach().cpu().contiguous()
+        if self.path is not None:
+            return state_of(self.path)
+        part = self._stored(range(start, stop)).detach().cpu().contiguous()
         return blake2b(part.view(-1).view(torch.uint8).numpy().data, digest_size=8).hexdigest()
 
     def __reduce__(self) -> Any:
         # a file is opened where the traverse goes; its numbers do not go along
-        file = getattr(self.values, "filename", None)
-        return super().__reduce__() if file is None else (read_array, (Path(file),))
+        return super().__reduce__() if self.path is None else (read_array, (self.path,))
 
 
 def read_array(path: Path) -> ArrayTraverse:
@@ -102,7 +109,9 @@ def read_array(path: Path) -> ArrayTraverse:
             values: np.ndarray = np.memmap(path, kind, "r", start, shape, "F" if by_columns else "C")
         else:  # nothing to map
             values = np.zeros(shape, kind)
-    return ArrayTraverse(values, printable(path))
+    traverse = ArrayTraverse(values, printable(path))
+    traverse.path = path
+    return traverse
 
 
 def read_header(head: bytes) -> tuple[tuple[int, ...], np.dtype, bool, int]:

@@ -100,3 +100,8 @@ class Chain(Traverse):
 def chained(traverses: Sequence[Traverse]) -> Traverse:
     """Several traverses as one route; a single one as it is."""
     return traverses[0] if len(traverses) == 1 else Chain(traverses)
+
+
+def parts_of(traverse: Traverse) -> list[Traverse]:
+    """What a traverse was chained of; itself where it was not."""
+    return traverse.traverses if isinstance(traverse, Chain) else [traverse]

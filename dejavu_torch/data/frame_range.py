@@ -25,7 +25,7 @@ class IndexedTraverse(Traverse):
         yield from self.select(range(self.length), size)
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        yield from self.select(range(start, stop), 64)
+        yield from self.select(range(start, stop), self.batch_size())
 
     def select(self, frames: range, size: int) -> Iterator[Tensor]:
         if size < 1:
@@ -91,7 +91,7 @@ class FrameRange(Traverse):
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
         part = self.frames[start:stop]
         if part:
-            yield from self.traverse.select(part, 64)
+            yield from self.traverse.select(part, self.batch_size())
 
     @property
     def frame_shape(self) -> tuple[int, ...]:

@@ -77,7 +77,7 @@ class Video(Traverse):
         yield from self.select(range(2**62), size)
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        yield from self.select(range(start, stop), 64)
+        yield from self.select(range(start, stop), self.batch_size())
 
     def select(self, frames: range, size: int) -> Iterator[Tensor]:
         first: tuple[int, int] | None = None

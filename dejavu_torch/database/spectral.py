@@ -312,7 +312,7 @@ class SpectralMap(PlaceMap):
         self.bounds: list[int] = [0, *sums[self.lengths.cumsum(0)].tolist()]
         self._streams: list[Stream | None] = [None] * len(self.chunks)  # coded when they are asked for
         self.norms = self.steps.new_empty(self.places)
-        for chunks in self._runs(range(len(self.chunks)), self.dimension):
+        for chunks in self.runs(range(len(self.chunks)), self.dimension):
             squares = (part.square_().sum(0) for _, part in self._series(chunks))
             self.norms[self._span(chunks)] = functools.reduce(torch.add, squares).sqrt_()
         if not self.norms.isfinite().all():
@@ -345,7 +345,7 @@ class SpectralMap(PlaceMap):
         start, stop = self.chunks[chunk]
         return stop - start
 
-    def _runs(self, chunks: range, rows: int) -> Iterator[range]:
+    def runs(self, chunks: range, rows: int) -> Iterator[range]:
         """Equally long chunks one behind the other, as many as have `BLOCK` numbers in so many rows."""
         start = chunks.start
         while start < chunks.stop:
@@ -490,7 +490,7 @@ class SpectralMap(PlaceMap):
             rebuild = self.rebuilds(queries) if rebuild is None else rebuild
             if not rebuild:
                 rows = max(1, queries * (1 + len(self.level) // max(1, self.places)))
-        for run in self._runs(chunks, max(1, rows)):
+        for run in self.runs(chunks, max(1, rows)):
             yield run, rebuild
 
     def _rebuilt_scores(self, queries: Tensor, chunks: range) -> Tensor:

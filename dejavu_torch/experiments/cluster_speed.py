@@ -78,7 +78,7 @@ def _contenders(
             torch.set_num_threads(threads)
 
     def one_worker() -> list[CodedChunk]:
-        ((_, made),) = cluster.run(coded, shared, [shards])
+        ((_, made, _),) = cluster.run(coded, shared, [shards])
         return [one for chunks in made for one in chunks]
 
     def workers() -> list[CodedChunk]:

@@ -101,7 +101,7 @@ class ResampledTraverse(Traverse):
         frames = self.frame[start:stop]
         if len(frames):
             first, last = int(frames[0]), int(frames[-1])
-            yield from _shown(self.traverse.between(first, last + 1), first, frames, 64)
+            yield from _shown(self.traverse.between(first, last + 1), first, frames, self.batch_size())
 
 
 def _shown(batches: Iterator[Tensor], first: int, frames: Tensor, size: int) -> Iterator[Tensor]:

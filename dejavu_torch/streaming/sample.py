@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dejavu_torch.data.selection import Selection
 from dejavu_torch.features.views import Views
+from dejavu_torch.types import InputError
 
 SAMPLE = 10_000  # frames at most; a route that has no more is learned from all of them
 STRETCHES = 4  # at least
@@ -24,10 +25,17 @@ class Sample(NamedTuple):
     stretch: int
 
     def views(self, second: Views) -> Views:
-        """What another traverse shows of the sample, with places that count in it."""
+        """What another traverse shows of the sample, with places that count in it.
+
+        Raises:
+            InputError: nothing.
+        """
         places = second.places.cpu()
         at = torch.searchsorted(self.frame, places).clamp(max=len(self.frame) - 1)
         shown = (self.frame[at] == places).nonzero().flatten()
+        if not len(shown):
+            seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
+            raise InputError(f"{seen}, in stretches of {self.stretch} all along the route; expected some")
         return Views(Selection(second.traverse, shown), at[shown])
 
 

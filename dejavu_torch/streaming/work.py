@@ -8,12 +8,12 @@ import shutil
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.output import make_output_folder, remove_empty_folders, whole_file
+from dejavu_torch.data.output import PREFIX, make_output_folder, remove_empty_folders, whole_file
 from dejavu_torch.database.codec import Stream
 from dejavu_torch.database.mapfile import read_map, write_map
 from dejavu_torch.database.spectral import CodedChunk
@@ -40,39 +40,65 @@ class WorkFolder:
     """What is finished of one run: the fit of its sample, and the coded chunks of shards.
 
     Args:
-        path: the folder, made if it is not there.
-        key: digests of all that the chunks are made of, by what it is.
-
-    Raises:
-        InputError: it is of a run with another key, or cannot be made.
+        path: the folder, made when it is opened.
     """
 
-    def __init__(self, path: Path, key: Mapping[str, str]) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        known: object = {}
-        if path.is_dir() and any(path.iterdir()):
+        self.opened = False
+
+    def open(self, key: Mapping[str, str]) -> None:
+        """Go on with the run of a key, or begin it where nothing of any run is finished.
+
+        Args:
+            key: digests of all that the chunks are made of, by what it is.
+
+        Raises:
+            InputError: something is finished of a run with another key, or the folder cannot be made.
+        """
+        if not self._names() - {KEY}:
+            make_output_folder(self.path)
             try:
-                known = json.loads((path / KEY).read_text())
-            except (OSError, ValueError) as error:
-                raise InputError(
-                    f"{path} is no folder of finished chunks; expected none to be there"
-                ) from error
-        else:
-            make_output_folder(path)
-            try:
-                with whole_file(path / KEY) as file:
+                with whole_file(self.path / KEY) as file:
                     file.write_text(json.dumps(key))
             except BaseException:  # as on a full disk
-                remove_empty_folders(path)
+                remove_empty_folders(self.path)
                 raise
-            known = dict(key)
-        if known != key:
+        else:
+            try:
+                known = json.loads((self.path / KEY).read_text())
+            except (OSError, ValueError) as error:
+                seen = f"{self.path} is no folder of finished chunks"
+                raise InputError(f"{seen}; expected none to be there") from error
             known = known if isinstance(known, dict) else {}
-            other = ", ".join(name for name in {**key, **known} if key.get(name) != known.get(name))
-            raise InputError(
-                f"{path} has finished chunks of another run: its {other} differ; expected the command that "
-                "began it, or the folder removed"
-            )
+            if known != key:
+                other = [name for name in {**key, **known} if key.get(name) != known.get(name)]
+                self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
+        self.opened = True
+
+    def check_unused(self) -> None:
+        """Refuse a run that keeps no chunks where something is finished of one that does.
+
+        Raises:
+            InputError: as `open`.
+        """
+        names = self._names()
+        if KEY in names and len(names) > 1:
+            self._refuse()
+
+    def remove(self) -> None:
+        """Remove the folder, if this run opened it."""
+        if self.opened:
+            shutil.rmtree(self.path, ignore_errors=True)
+
+    def _names(self) -> set[str]:
+        """The files in the folder, but for what a kill left half written."""
+        files = self.path.iterdir() if self.path.is_dir() else ()
+        return {file.name for file in files if not file.name.startswith(PREFIX)}
+
+    def _refuse(self, why: str = "") -> NoReturn:
+        seen = f"{self.path} has finished chunks of another run{why}"
+        raise InputError(f"{seen}; expected the command that began it, or the folder removed")
 
     def fit(self) -> tuple[Fit, dict[str, Tensor]] | None:
         """The fit, and the whitening's state, if they are there."""
@@ -151,8 +177,10 @@ def all_chunks(
         found = folder.finished(shard, states[shard])
         if found is not None:
             made[shard] = found
+    missing = [one for one in shards if one not in made]
+    if not missing:
+        return [one for shard in shards for one in made[shard]]
     try:
-        missing = [one for one in shards if one not in made]
         with closing(make(coder, traverse, missing, progress)) as parts:
             for shard, chunks in parts:
                 if folder is not None:
@@ -170,12 +198,6 @@ def all_chunks(
 def work_folder_of(path: Path) -> Path:
     """The work folder of a map file, beside it."""
     return path.with_name(f"{path.name}.work")
-
-
-def remove_work(path: Path) -> None:
-    """Remove a work folder, if it is there."""
-    if (path / KEY).exists():
-        shutil.rmtree(path, ignore_errors=True)
 
 
 def _name(shard: range) -> str:

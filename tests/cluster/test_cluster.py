@@ -13,9 +13,10 @@ from functools import partial
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
-from command_line import fails, frames, write_images
+from command_line import fails, frames, run, write_images
 from helpers import Fixed, Stream, refused, template_model
 from torch import Tensor, nn
 
@@ -28,9 +29,10 @@ from dejavu_torch.data.source import open_source
 from dejavu_torch.database import spectral
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.features.views import Views
-from dejavu_torch.growth import merge
+from dejavu_torch.growth import append, merge
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
+from dejavu_torch.streaming.work import WorkFolder
 from dejavu_torch.types import FrequencyLayer, Traverse
 
 CHUNK, PLACES = 50, 620
@@ -127,7 +129,9 @@ def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Mo
 
     thread = threading.Thread(target=kill)
     thread.start()
-    model = learned(open_source(images), watched, work=tmp_path / "work", make=partial(code_on, cluster))
+    model = learned(
+        open_source(images), watched, work=WorkFolder(tmp_path / "work"), make=partial(code_on, cluster)
+    )
     thread.join()
     assert killed
     assert killed[0] != os.getpid()
@@ -148,11 +152,11 @@ def test_what_cannot_be_made_is_named_and_only_that_is_made_again(
     (images / "110.png").write_bytes(b"no image")
     (tmp_path / "go").touch()
     (tmp_path / "deadly").touch()
-    settings = {"work": tmp_path / "work", "make": partial(code_on, cluster)}
+    settings = {"work": WorkFolder(tmp_path / "work"), "make": partial(code_on, cluster)}
     with refused("110.png", "read on", "1 more such part", "420 of 620"):
         learned(open_source(images), watched, **settings)
     (images / "110.png").write_bytes(good)
-    with refused("frames 400 to 499", "worker died", "520 of 620"):
+    with refused("frames 400 to 499: its worker died", "520 of 620"):
         learned(open_source(images), watched, **settings)
     (tmp_path / "deadly").unlink()
     dealt: list[range] = []
@@ -164,6 +168,18 @@ def test_what_cannot_be_made_is_named_and_only_that_is_made_again(
     settings["make"] = noted
     assert file_of(learned(open_source(images), watched, **settings), tmp_path) == whole
     assert dealt == [range(8, 10)]
+
+
+def test_of_shards_read_together_those_ahead_of_a_bad_frame_are_kept(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    bad = route()
+    bad[544] = torch.nan
+    assert 544 not in sample.sample_of(PLACES, CHUNK).frame
+    with refused(
+        "frames 500 to 599", "read on", "frame 544", "500 of 620"
+    ):  # dealt out as 0 to 399, and 400 on
+        learned(Stream(bad), work=WorkFolder(tmp_path / "work"), make=partial(code_on, cluster))
 
 
 def found_by(model: DejaVu, queries: Tensor, searcher: ClusterSearcher | None = None) -> list[Tensor]:
@@ -181,7 +197,7 @@ def test_parts_of_a_map_on_workers_find_what_the_whole_does(kind: str, cluster: 
     models = [DejaVu(None, "none", SpectralMapper(None, 0.3, chunk=CHUNK)).learn(again)]
     if kind == "merged":
         models = [*models, DejaVu(None, "none", SpectralMapper(None, 0.2, chunk=40)).learn(again[:600])]
-    model = models[0] if kind == "route" else merge(models, ["one", "two"])
+    model = merge(models, ["one", "two"]) if kind == "merged" else models[0]
     queries = torch.cat([again[:90:7], again[480:700:9] + 0.1, again[:500:31]])
     whole = found_by(model, queries)
     assert int((whole[2][:, 1] - whole[2][:, 0]).remainder(500).eq(0).sum()) > 20
@@ -210,6 +226,20 @@ def test_a_part_is_scored_to_the_bit_as_in_the_whole_map(monkeypatch: pytest.Mon
         assert torch.equal(one.scores(draw[:1]), scores)
 
 
+def test_parts_are_scored_in_the_blocks_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spectral, "BLOCK", 3 * CHUNK * 8)
+    model = DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK)).learn(route()[:220])
+    whole = append(model, route()[220:]).map  # with a short chunk inside
+    queries = route()[:2]
+    starts = [start for start, _ in whole.score_blocks(queries, rebuild=True)]
+    parts = list(_parts(whole, 2 * CHUNK, 0))
+    assert len(parts) > 3
+    found = [
+        part.start + start for part in parts for start, _ in _map_of(part).score_blocks(queries, rebuild=True)
+    ]
+    assert found == starts
+
+
 def test_probabilities_are_those_of_the_whole_map(cluster: Cluster) -> None:
     torch.manual_seed(0)
     views = Views(ArrayTraverse(route() + 0.3 * torch.randn(PLACES, 8)), torch.arange(PLACES))
@@ -228,6 +258,15 @@ def test_probabilities_are_those_of_the_whole_map(cluster: Cluster) -> None:
         ClusterSearcher(
             cluster, template_model(Fixed(FrequencyLayer(7, 7, 0, 70, (0,)))).learn(route()[:70]).map
         )
+
+
+def test_a_short_route_starts_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "route.npy", route()[:64])
+    command = ("learn", tmp_path / "route.npy", "--map", tmp_path / "map.safetensors", "--mapper.chunk", "50")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "Cluster", None)
+        run(*command, "--calibration", "none", "--cluster", "auto")
+    assert "64 frames are learned here" in capsys.readouterr().out
 
 
 def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from helpers import Stream, all_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch import types
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.chain import Chain, chained
 from dejavu_torch.data.selection import Selection, runs
@@ -59,6 +61,28 @@ def test_a_selection_has_the_frames_with_these_numbers(numbers: set[int], stream
     assert [i for run in runs(frame) for i in run] == sorted(numbers)
 
 
+@pytest.mark.parametrize("streams", [False, True])
+def test_large_frames_are_read_few_at_a_time(streams: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 3)
+    chain = Chain(parts([20], streams))
+    some = Selection(chain, torch.arange(5, 30))
+    for traverse in (chain, some):
+        assert max(map(len, traverse.between(0, 25))) <= 3
+    read: list[int] = []
+    for part in chain.traverses:
+        batches = part.batches if streams else part.read
+        name = "batches" if streams else "read"
+
+        def noted(size: Any, batches: Any = batches) -> Any:
+            read.append(size if streams else len(size))
+            return batches(size)
+
+        monkeypatch.setattr(part, name, noted)
+    chain.count()
+    assert torch.equal(torch.cat(list(some.select(range(25), 2))), VALUES[5:30])
+    assert max(read) <= 3
+
+
 def test_frames_keep_their_names_behind_that_of_their_traverse(tmp_path) -> None:  # type: ignore[no-untyped-def]
     folders = [write_images(tmp_path / name, frames(count, size=16)) for name, count in (("a", 3), ("b", 2))]
     chain = chained([open_source(folder) for folder in folders])
@@ -93,6 +117,11 @@ def test_an_array_goes_elsewhere_as_its_file(tmp_path) -> None:  # type: ignore[
     packed = pickle.dumps(route)
     assert len(packed) < 1000
     assert torch.equal(all_of(pickle.loads(packed)), all_of(route))
+    # a part of what is mapped goes as its values
+    mapped = np.load(tmp_path / "route.npy", mmap_mode="r")
+    part, other = ArrayTraverse(mapped[100:140]), ArrayTraverse(mapped[200:240])
+    assert torch.equal(all_of(pickle.loads(pickle.dumps(part))), all_of(route)[100:140])
+    assert part.state(0, 40) != other.state(0, 40)
 
 
 def test_identities_tell_sources_apart(tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from torch import Tensor
 from dejavu_torch import growth
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.chain import Chain
+from dejavu_torch.data.output import PREFIX
 from dejavu_torch.data.source import open_source
 from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.features.hog import HOG
@@ -26,7 +28,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
 from dejavu_torch.streaming.coder import ChunkCoder, code_here, joined
 from dejavu_torch.streaming.sample import sample_of
-from dejavu_torch.streaming.work import all_chunks, remove_work, work_folder_of
+from dejavu_torch.streaming.work import WorkFolder, all_chunks, work_folder_of
 from dejavu_torch.types import Traverse
 
 CHUNK, PLACES = 50, 1030
@@ -83,7 +85,7 @@ def test_a_short_route_is_learned_from_all_of_it(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(sample, "SAMPLE", PLACES)
     model = DejaVu(mapper=SpectralMapper(3.0, chunk=CHUNK))
     whole = model.learn_features(model.describe_reference(ArrayTraverse(route())), ArrayTraverse(route()))
-    assert file_of(learned(route(), work=tmp_path / "work"), tmp_path) == file_of(whole, tmp_path)
+    assert file_of(learned(route(), work=WorkFolder(tmp_path / "work")), tmp_path) == file_of(whole, tmp_path)
     assert not (tmp_path / "work").exists()
 
 
@@ -161,6 +163,9 @@ def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
     assert len(sample_of(PLACES, CHUNK).views(views).places) == 400
     shown = sample_of(PLACES, CHUNK).views(Views(views.traverse, torch.arange(PLACES) - 30))
     assert torch.equal(sample_of(PLACES, CHUNK).frame[shown.places] + 30, shown.traverse.frame)  # type: ignore[attr-defined]
+    unseen = torch.tensor([one for one in range(PLACES) if one not in sample_of(PLACES, CHUNK).frame][:40])
+    with refused("none of the 400 frames", "stretches of 50"):
+        learned(route(), second=Views(ArrayTraverse(noisy[unseen]), unseen))
     model = DejaVu(whitening=Whitening(numbers=8), mapper=SpectralMapper(8.0, chunk=CHUNK))
     model.learn(route(), second=views)
     assert (model.localize(noisy[::7]).index == torch.arange(0, PLACES, 7)).float().mean() > 0.9
@@ -178,10 +183,11 @@ def test_finished_chunks_are_not_made_again(tmp_path: Path, made: list[int]) -> 
             yield part
 
     with pytest.raises(KeyboardInterrupt):
-        learned(route(), work=tmp_path / "work", make=killed)
+        learned(route(), work=WorkFolder(tmp_path / "work"), make=killed)
     assert len(made) >= 8
     made.clear()
-    again = learned(route(), work=tmp_path / "work")
+    work = WorkFolder(tmp_path / "work")
+    again = learned(route(), work=work)
     assert sum(made) == PLACES - 8 * CHUNK
     assert file_of(again, tmp_path) == whole
     made.clear()
@@ -189,32 +195,87 @@ def test_finished_chunks_are_not_made_again(tmp_path: Path, made: list[int]) -> 
     files = sorted((tmp_path / "work").glob("chunks-*"))
     files[2].write_bytes(files[2].read_bytes()[:-1])
     files[5].unlink()
-    assert file_of(learned(route(), work=tmp_path / "work"), tmp_path) == whole
+    assert file_of(learned(route(), work=WorkFolder(tmp_path / "work")), tmp_path) == whole
     assert made == [CHUNK] * 4
-    remove_work(tmp_path / "work")
+    work.remove()
     assert not (tmp_path / "work").exists()
 
 
 def test_chunks_of_another_run_are_refused(tmp_path: Path) -> None:
     folder = work_folder_of(tmp_path / "map.safetensors")
     assert folder.name == "map.safetensors.work"
-    learned(route(), work=folder)
+    learned(route(), work=WorkFolder(folder))
     kept = {file.name: file.read_bytes() for file in folder.iterdir()}
     with refused(str(folder), "settings"):
-        learned(route(), bytes_=3.5, work=folder)
+        learned(route(), bytes_=3.5, work=WorkFolder(folder))
     with refused(str(folder), "source"):
-        learned(route() + 1, work=folder)
+        learned(route() + 1, work=WorkFolder(folder))
     with refused(str(folder), "source"):
-        learned(route(PLACES + 1), work=folder)
-    with refused(str(folder), "second"):
-        learned(route(), work=folder, second=Views(ArrayTraverse(route() + 0.1), torch.arange(PLACES)))
+        learned(route(PLACES + 1), work=WorkFolder(folder))
+    short = WorkFolder(folder)
+    with refused(str(folder), "another run", "folder removed"):  # which keeps no chunks, but writes the map
+        learned(route(400), work=short)
+    short.remove()
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == kept
-    (tmp_path / "mine").mkdir()
+    mine = WorkFolder(tmp_path / "mine")
+    mine.path.mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with refused("mine"):
-        learned(route(), work=tmp_path / "mine")
-    remove_work(tmp_path / "mine")
+        learned(route(), work=mine)
+    learned(route(400), work=mine)
+    mine.remove()
     assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
+
+
+def test_what_the_whitening_learns_from_is_of_the_run(tmp_path: Path) -> None:
+    def second(shift: float) -> Views:
+        return Views(ArrayTraverse(route() + shift), torch.arange(PLACES))
+
+    learned(route(), work=WorkFolder(tmp_path / "work"), second=second(0.1))
+    for other in (second(0.2), None):
+        with refused("work", "second differs"):
+            learned(route(), work=WorkFolder(tmp_path / "work"), second=other)
+
+
+def test_other_code_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    file = tmp_path / "own_features.py"
+
+    def key(factor: int) -> dict[str, str]:
+        file.write_text(
+            "import torch\nclass Own(torch.nn.Module):\n    def forward(self, x):\n"
+            f"        return {factor} * x.flatten(1)\n"
+        )
+        own = importlib.import_module("own_features").Own()
+        return DejaVu(own).run_key(ArrayTraverse(route()), PLACES)
+
+    first = key(2)
+    assert key(2) == first
+    assert key(30) != first
+    monkeypatch.setattr("dejavu_torch.model.__version__", "0.0.7")
+    assert key(2) != first
+
+
+def test_a_run_of_which_nothing_is_finished_blocks_no_other(tmp_path: Path) -> None:
+    folder = write_images(tmp_path / "route", frames(520, size=16))
+    good = (folder / "0.png").read_bytes()  # in the sample
+
+    def learn() -> None:
+        mapper = SpectralMapper(8.0, chunk=CHUNK)
+        model = DejaVu(HOG(cell=8), "none", mapper)
+        model.learn(open_source(folder), work=WorkFolder(tmp_path / "work"))
+
+    (folder / "0.png").write_bytes(b"no image")
+    with refused("0.png"):
+        learn()
+    (tmp_path / "work" / f"{PREFIX}of-a-kill").mkdir()
+    (folder / "0.png").write_bytes(good)
+    WorkFolder(tmp_path / "work").check_unused()
+    learn()
+    assert len(list((tmp_path / "work").glob("chunks-*"))) == 6
+    # a kill ahead of the first whole file
+    (tmp_path / "other" / f"{PREFIX}of-a-kill").mkdir(parents=True)
+    WorkFolder(tmp_path / "other").open({})
 
 
 def test_a_full_disk_keeps_what_is_finished(
@@ -231,9 +292,9 @@ def test_a_full_disk_keeps_what_is_finished(
     with monkeypatch.context() as patch:
         patch.setattr(safetensors.torch, "save_file", full)
         with refused("No space left", "300 of 1030", "work"):
-            learned(route(), work=tmp_path / "work")
+            learned(route(), work=WorkFolder(tmp_path / "work"))
     made.clear()
-    assert file_of(learned(route(), work=tmp_path / "work"), tmp_path) == whole
+    assert file_of(learned(route(), work=WorkFolder(tmp_path / "work")), tmp_path) == whole
     assert sum(made) == PLACES - 300
 
 
@@ -249,15 +310,15 @@ def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path: Path,
     whole = file_of(model().learn(open_source(folder)), tmp_path)
     (folder / "434.png").write_bytes(b"no image")
     with refused("434.png", "400 of 520", "work"):
-        model().learn(open_source(folder), work=tmp_path / "work")
+        model().learn(open_source(folder), work=WorkFolder(tmp_path / "work"))
     (folder / "434.png").write_bytes(good)
     made.clear()
-    assert file_of(model().learn(open_source(folder), work=tmp_path / "work"), tmp_path) == whole
+    assert file_of(model().learn(open_source(folder), work=WorkFolder(tmp_path / "work")), tmp_path) == whole
     assert sum(made) == 120
     # what was changed since is made again, and nothing else
     made.clear()
     (folder / "434.png").write_bytes((folder / "435.png").read_bytes())
-    model().learn(open_source(folder), work=tmp_path / "work")
+    model().learn(open_source(folder), work=WorkFolder(tmp_path / "work"))
     assert sum(made) == 100
 
 
@@ -297,6 +358,15 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pyt
     assert (learnt.localize(values[::7]).index == torch.arange(0, PLACES, 7)).float().mean() > 0.95
 
 
+@pytest.mark.parametrize("scale", [1e-8, 1e5])
+def test_features_that_nothing_whitens_keep_their_scale(
+    scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dejavu_torch.model.FEW_DESCRIPTORS", PLACES * 4)
+    model = DejaVu(whitening="none").learn(route() * scale)
+    assert (model.localize(route()[::7] * scale).index == torch.arange(0, PLACES, 7)).float().mean() > 0.95
+
+
 def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[int]) -> None:
     first, rest = route()[:500], route()[500:]
 
@@ -308,13 +378,17 @@ def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[in
 
     whole = file_of(growth.append(learned(first), rest), tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        growth.append(learned(first), rest, work=tmp_path / "work", make=stopped)  # type: ignore[arg-type]
+        growth.append(learned(first), rest, work=WorkFolder(tmp_path / "work"), make=stopped)  # type: ignore[arg-type]
     model = learned(first)
     made.clear()
-    assert file_of(growth.append(model, rest, work=tmp_path / "work"), tmp_path) == whole
+    assert file_of(growth.append(model, rest, work=WorkFolder(tmp_path / "work")), tmp_path) == whole
     assert sum(made) == PLACES - 500 - 4 * CHUNK
     with refused("work", "map"):  # it has more places by now
-        growth.append(model, rest, work=tmp_path / "work")
+        growth.append(model, rest, work=WorkFolder(tmp_path / "work"))
+    other = learned(first)
+    other.map.mean += 1  # of the same streams
+    with refused("work", "map"):
+        growth.append(other, rest, work=WorkFolder(tmp_path / "work"))
 
 
 def test_a_map_appended_to_is_that_of_both_parts(tmp_path: Path) -> None:
