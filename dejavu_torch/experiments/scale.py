@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import tempfile
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,17 +22,25 @@ from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
 from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_file, whole_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.score_plots import plot_growth
 from dejavu_torch.experiments.bench import Row, peak_memory
 from dejavu_torch.experiments.footprint import give_back, in_process
 from dejavu_torch.experiments.made import Likeness, MadeRoute, likeness
-from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tiles_of
+from dejavu_torch.experiments.repeating import TiledRoute, tiles_of
+from dejavu_torch.experiments.scale_contenders import (
+    CONTENDERS,
+    FLOWN,
+    ONE_CHUNK,
+    PLACED,
+    REPEATED,
+    Find,
+    Found,
+)
+from dejavu_torch.experiments.scale_report import ScaleRow, exponents, pictured, with_ratios
 from dejavu_torch.experiments.template_search import PLACES as TEMPLATES
 from dejavu_torch.experiments.template_search import bench_templates
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.search import Search
 from dejavu_torch.types import InputError, Match
 
 PLACES = (10_000, 100_000, 1_000_000)
@@ -44,237 +50,8 @@ DESCRIBED = 10_000  # places that the whitening has seen
 QUERIES, SINGLE, BATCH = 2000, 20, 256  # in all, those of them that are timed one by one, of a batch
 CHECKED = 10_000  # places at which made descriptors stand beside drawn ones
 SHUFFLED = 100_000  # places of a null at most
-TRAINED = 100_000  # samples of an index at most
-ROTATED = 20_000  # of one whose rotation is trained as well
-ROWS = 8192  # descriptors read at a time
-CHUNK = 8192
 MEMORY = 8_000_000_000  # bytes of a process
-PROBES = 32  # of the cells of an inverted file
 TOLERANCE = 5
-SHARE = 0.8  # of the variance of a repeating route
-GROWING = ("bytes_per_place", "route_bytes", "seconds", "seconds_one", "peak_bytes", "learn_rate")
-OURS = "dejavu"
-
-
-class ScaleRow(NamedTuple):
-    """What one contender takes at one size; None where it is not known.
-
-    places: N. seconds: of a query of a batch of `BATCH`; seconds_one: of a query by itself, the median; both
-    on one thread, from the descriptor to the place. peak_bytes: most memory while localizing beyond that of
-    the programs, learn_peak_bytes while learning, each in a process of its own. bytes: of the file.
-    route_bytes: of ours all that grows with the route, mean and tables with it; of an index its codes and
-    links alone, without identifiers and codebooks. learn_rate: descriptors a second. ratio_to_ours: seconds
-    over those of our fastest. threads: that learned.
-    """
-
-    case: str
-    contender: str
-    places: int
-    seconds: float | None = None
-    seconds_one: float | None = None
-    peak_bytes: int | None = None
-    learn_peak_bytes: int | None = None
-    bytes: int | None = None
-    route_bytes: int | None = None
-    bytes_per_place: float | None = None
-    learn_rate: float | None = None
-    recall_at_1: float | None = None
-    auc: float | None = None
-    queries: int | None = None
-    threads: int | None = None
-    ratio_to_ours: float | None = None
-    skipped: str | None = None
-
-
-class Found(NamedTuple):
-    """The best place of each query and its score, lower is better: (Q,), (Q,)."""
-
-    score: Tensor
-    place: Tensor
-
-
-Find = Callable[[Tensor], Found]
-
-
-class Contender(ABC):
-    """A way to keep descriptors in a file, and to find the nearest."""
-
-    @abstractmethod
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        """Keep the descriptors of a route in a file; how many bytes of it are the route's."""
-
-    @abstractmethod
-    def load(self, path: Path, device: str) -> Find:
-        """What finds the places of queries (Q,K) in a file."""
-
-
-class Mapped(Contender):
-    """Ours: a spectral map.
-
-    Args:
-        budget: route bytes per place. chunk: places, or "route". step: in place of the budget.
-        shuffled: in random order, the null. search: as of `DejaVu.localize`.
-    """
-
-    def __init__(
-        self,
-        budget: float | None,
-        chunk: Any,
-        step: float | None = None,
-        shuffled: bool = False,
-        search: Search = "auto",
-    ) -> None:
-        self.mapper, self.shuffled, self.search = SpectralMapper(budget, step, chunk), shuffled, search
-
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        model = DejaVu(whitening="none", mapper=self.mapper)
-        if self.shuffled:
-            order = torch.randperm(route.length, generator=torch.Generator().manual_seed(0))
-            rows = torch.cat(list(route.batches(ROWS)))
-            model.learn(rows[order])
-            np.save(path.with_suffix(".npy"), order.numpy())
-        else:
-            model.learn(route)
-        model.save(path)
-        return model.map.summary().route_bytes
-
-    def load(self, path: Path, device: str) -> Find:
-        model = DejaVu.load(path).to(device)
-        order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
-
-        def find(queries: Tensor) -> Found:
-            match = model.localize_descriptors(queries.to(device), order=order, search=self.search)
-            return Found(match.score, match.index)
-
-        return find
-
-
-class Faiss(Contender):
-    """An index of faiss over descriptors of length 1.
-
-    Args:
-        factory: what `faiss.index_factory` takes; {cells} stands for the cells of an inverted file.
-        trained: samples that it is trained on, at most.
-    """
-
-    def __init__(self, factory: str, trained: int = TRAINED) -> None:
-        self.factory, self.trained = factory, trained
-
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        import faiss
-
-        faiss.omp_set_num_threads(torch.get_num_threads())
-        every = -(-route.length // self.trained)
-        sample = torch.cat(list(route.select(range(0, route.length, every), ROWS)))
-        cells = max(1, min(4 * math.isqrt(route.length), len(sample) // 40))
-        index = faiss.index_factory(sample.shape[1], self.factory.format(cells=cells))
-        index.train(sample.numpy())
-        del sample
-        faiss.write_index(index, str(path))
-        empty = path.stat().st_size
-        for part in route.batches(ROWS):
-            index.add(part.numpy())
-        faiss.write_index(index, str(path))
-        names = 8 * route.length if "IVF" in self.factory else 0
-        return path.stat().st_size - empty - names
-
-    def load(self, path: Path, device: str) -> Find:
-        import faiss
-
-        faiss.omp_set_num_threads(torch.get_num_threads())
-        index = faiss.read_index(str(path))
-        with suppress(RuntimeError):  # it has no cells
-            faiss.extract_index_ivf(index).nprobe = PROBES
-
-        def find(queries: Tensor) -> Found:
-            score, place = index.search(queries.numpy(), 1)
-            return Found(torch.from_numpy(score[:, 0]), torch.from_numpy(place[:, 0]))
-
-        return find
-
-
-class Interpolated(Contender):
-    """Every k-th descriptor in int8 and straight lines between them, in so many bytes per place."""
-
-    def __init__(self, room: float) -> None:
-        self.room = room
-
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        from dejavu_torch.evaluation.baselines import as_int8, keyframes
-
-        each = len(next(route.batches(1))[0])
-        k = max(1, math.ceil((route.length - 1) / max(1, self.room * route.length // each - 1)))
-        chosen = keyframes(route.length, k)
-        rows = torch.cat([route.read(range(i, i + 1)) for i in chosen.tolist()])
-        scale = rows.abs().max() / 127
-        small = (as_int8(rows) / scale).round().to(torch.int8)
-        save_file({"keys": small, "scale": scale.view(1), "k": torch.tensor([k, route.length])}, path)
-        return small.nbytes
-
-    def load(self, path: Path, device: str) -> Find:
-        from dejavu_torch.evaluation.baselines import between_keyframes
-
-        state = load_file(path)
-        keys = state["keys"].float() * state["scale"]
-        k, places = state["k"].tolist()
-
-        def find(queries: Tensor) -> Found:
-            best = torch.full((len(queries),), -math.inf)
-            index = torch.zeros(len(queries), dtype=torch.int64)
-            pieces = max(1, ROWS // k)
-            for start in range(0, places, k * pieces):
-                ends = keys[start // k : start // k + pieces + 1]
-                rows = between_keyframes(ends, min((len(ends) - 1) * k + 1, places - start), k)
-                score, at = (queries @ torch.nn.functional.normalize(rows, dim=1).T).max(1)
-                index = torch.where(score > best, at + start, index)
-                best = torch.maximum(best, score)
-            return Found(-best, index)
-
-        return find
-
-
-class Held(Mapped):
-    """Ours, in steps that keep so much of the variance of a route."""
-
-    def __init__(self, chunk: Any) -> None:
-        super().__init__(None, chunk, step=1.0)
-
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        self.mapper.step = step_that_holds(SHARE, route, self.mapper.chunk)
-        return super().learn(route, path)
-
-
-ONE_CHUNK = f"{OURS}, one chunk"
-FIXED = f"{OURS}, chunks of {CHUNK}"
-FLOWN = f"{OURS}, one chunk, of noisy frames"
-
-# "np" leaves out the training of faiss's filter by Hamming distances, which is not used here and takes long
-# by name: what it is made of, given the route bytes per place of ours where it is to take as many
-PLACED: dict[str, Callable[[float], Contender]] = {
-    f"{OURS} 1 B": lambda room: Mapped(1.0, CHUNK),
-    f"{OURS} 4 B": lambda room: Mapped(4.0, CHUNK),
-    f"{OURS} 1 B, one chunk": lambda room: Mapped(1.0, "route"),
-    f"{OURS} 4 B, one chunk": lambda room: Mapped(4.0, "route"),
-    f"{OURS} 1 B, ivf": lambda room: Mapped(1.0, CHUNK, search="ivf"),
-    f"{OURS} 4 B, ivf": lambda room: Mapped(4.0, CHUNK, search="ivf"),
-    "null 1 B": lambda room: Mapped(1.0, CHUNK, shuffled=True),
-    "null 4 B": lambda room: Mapped(4.0, CHUNK, shuffled=True),
-    "faiss flat": lambda room: Faiss("Flat"),
-    "faiss IVF-PQ, 4 B": lambda room: Faiss("IVF{cells},PQ4np"),
-    "faiss IVF-PQ, 8 B": lambda room: Faiss("IVF{cells},PQ8np"),
-    "faiss IVF-PQ, 16 B": lambda room: Faiss("IVF{cells},PQ16np"),
-    "faiss IVF-PQ, 32 B": lambda room: Faiss("IVF{cells},PQ32np"),
-    "faiss OPQ, IVF-PQ, 16 B": lambda room: Faiss("OPQ16,IVF{cells},PQ16np", ROTATED),
-    "faiss HNSW": lambda room: Faiss("HNSW16,Flat"),
-}
-REPEATED: dict[str, Callable[[float], Contender]] = {
-    ONE_CHUNK: lambda room: Held("route"),
-    FIXED: lambda room: Held(CHUNK),
-    FLOWN: lambda room: Mapped(room, "route"),
-    "null": lambda room: Mapped(room, "route", shuffled=True),
-    "interpolated frames": lambda room: Interpolated(room),
-}
-CONTENDERS = PLACED | REPEATED
 
 
 class Task(NamedTuple):
@@ -542,40 +319,6 @@ def _repeating(folder: Folder, places: int, threads: int, device: str) -> Iterat
         yield row
 
 
-def exponents(rows: Sequence[ScaleRow]) -> dict[str, dict[str, dict[str, float]]]:
-    """How each figure of each contender grows with N, by kind of case: the slope of a line in logarithms.
-
-    Example:
-        >>> rows = [ScaleRow(f"places={n}", "dejavu", n, seconds=1e-6 * n**0.5) for n in (100, 10_000)]
-        >>> round(exponents(rows)["places"]["dejavu"]["seconds"], 3)
-        0.5
-    """
-    found: dict[str, dict[str, dict[str, float]]] = {}
-    kinds = {(row.case.partition("=")[0], row.contender): None for row in rows}
-    for kind, name in kinds:
-        own = [row for row in rows if row.contender == name and row.case.partition("=")[0] == kind]
-        for key in GROWING:
-            points = [(row.places, getattr(row, key)) for row in own if getattr(row, key)]
-            if len(points) > 1:
-                x, y = np.log(np.array(points, dtype=float)).T
-                found.setdefault(kind, {}).setdefault(name, {})[key] = float(np.polyfit(x, y, 1)[0])
-    return found
-
-
-def with_ratios(rows: Sequence[ScaleRow]) -> list[ScaleRow]:
-    """The rows with their seconds over those of our fastest of the case."""
-    fastest: dict[str, float] = {}
-    for row in rows:
-        if row.contender.startswith(OURS) and row.seconds:
-            fastest[row.case] = min(row.seconds, fastest.get(row.case, math.inf))
-    return [
-        row._replace(ratio_to_ours=row.seconds / fastest[row.case])
-        if row.seconds and row.case in fastest
-        else row
-        for row in rows
-    ]
-
-
 def run_scale(
     out: Path, places: Sequence[int] = (), device: str = "cpu", progress: bool = False
 ) -> list[ScaleRow]:
@@ -607,64 +350,6 @@ def write_rows(folder: Path, rows: Sequence[ScaleRow], device: str) -> None:
         "version": dejavu_torch.__version__,
     }
     (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-
-
-def pictured(rows: Sequence[ScaleRow]) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """What is drawn over the number of places: heading -> contender -> points."""
-    panels = {
-        "recall@1": ("places", "recall_at_1", 1.0),
-        "milliseconds of a query in a batch": ("places", "seconds", 1e3),
-        "MB while localizing": ("places", "peak_bytes", 1e-6),
-        "route bytes of ground that repeats": ("repeat", "route_bytes", 1.0),
-    }
-    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for heading, (kind, key, unit) in panels.items():
-        for row in rows:
-            value = getattr(row, key)
-            if value and row.case.partition("=")[0] == kind:
-                found.setdefault(heading, {}).setdefault(row.contender, []).append((row.places, unit * value))
-    return found
-
-
-def scale_tables(rows: Sequence[ScaleRow]) -> Iterator[tuple[str, list[list[str]]]]:
-    """A table of each case, and one of the exponents: a heading and rows of text.
-
-    Example:
-        >>> next(scale_tables([ScaleRow("places=100", "dejavu", 100, bytes_per_place=1.0)]))[1][1][:2]
-        ['dejavu', '1']
-    """
-
-    def text(value: float | None, form: str, unit: float = 1.0) -> str:
-        return "" if value is None else format(value * unit, form)
-
-    head = ["", "B/place", "recall@1", "AUC", "ms one", "ms of 256", "peak MB", "learn MB", "learned/s", ""]
-    for case in dict.fromkeys(row.case for row in rows):
-        yield (
-            case,
-            [head]
-            + [
-                [
-                    row.contender,
-                    text(row.bytes_per_place, ".3g"),
-                    text(row.recall_at_1, ".3f"),
-                    text(row.auc, ".3f"),
-                    text(row.seconds_one, ".3g", 1e3),
-                    text(row.seconds, ".3g", 1e3),
-                    text(row.peak_bytes, ".0f", 1e-6),
-                    text(row.learn_peak_bytes, ".0f", 1e-6),
-                    text(row.learn_rate, ".0f"),
-                    f"skipped: {row.skipped}" if row.skipped else "",
-                ]
-                for row in rows
-                if row.case == case
-            ],
-        )
-    for kind, grown in exponents(rows).items():
-        yield (
-            f"{kind}=N: exponents of N",
-            [["", *GROWING]]
-            + [[name, *(text(one.get(key), ".2f") for key in GROWING)] for name, one in grown.items()],
-        )
 
 
 def limit_memory() -> None:

@@ -20,10 +20,11 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.baselines import as_int8, interpolated
-from dejavu_torch.experiments import scale
+from dejavu_torch.experiments import scale, scale_contenders
 from dejavu_torch.experiments.made import BLOCK, Likeness, MadeRoute, likeness
 from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tiles_of
-from dejavu_torch.experiments.scale import (
+from dejavu_torch.experiments.scale import Task, spread
+from dejavu_torch.experiments.scale_contenders import (
     CONTENDERS,
     FIXED,
     FLOWN,
@@ -33,12 +34,8 @@ from dejavu_torch.experiments.scale import (
     Faiss,
     Interpolated,
     Mapped,
-    ScaleRow,
-    Task,
-    exponents,
-    scale_tables,
-    spread,
 )
+from dejavu_torch.experiments.scale_report import ScaleRow, exponents, scale_tables
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 
@@ -133,7 +130,7 @@ def test_a_step_holds_the_share_that_is_asked_for() -> None:
 def test_interpolated_frames_are_those_of_the_baseline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scale, "ROWS", 64)  # several pieces
+    monkeypatch.setattr(scale_contenders, "ROWS", 64)  # several pieces
     route, queries = smooth(501, 12), smooth(501, 12, seed=1)[:50]
     size = Interpolated(12 * 30 / 501).learn(ArrayTraverse(route), tmp_path / "kept")
     back, k, keys = interpolated(as_int8(route), 12 * 30)
@@ -187,10 +184,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "SHUFFLED": 600,
         "CHECKED": 520,
         "QUERIES": 40,
-        "CHUNK": 128,
         "BATCH": 20,
     }.items():
         monkeypatch.setattr(scale, name, value)
+    monkeypatch.setattr(scale_contenders, "CHUNK", 128)
     kept = ("dejavu 4 B", "null 4 B", "faiss flat")
     for name in list(PLACED):
         if name not in kept:
