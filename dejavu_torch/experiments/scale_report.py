@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from dejavu_torch.experiments.scale_contenders import OURS
+from dejavu_torch.data.simulate.aerial import LONGEST
+from dejavu_torch.experiments.scale_contenders import GIVEN, OURS
 
+FITTED = 3  # sizes at least
+RECALL = "recall@1"  # the panel of it
 GROWING = ("bytes_per_place", "route_bytes", "seconds", "seconds_one", "peak_bytes", "learn_rate")
 
 
@@ -17,11 +20,15 @@ class ScaleRow(NamedTuple):
     """What one contender takes at one size; None where it is not known.
 
     places: N. seconds: of a query of a batch of `BATCH`; seconds_one: of a query by itself, the median; both
-    on one thread, from the descriptor to the place. peak_bytes: most memory while localizing beyond that of
-    the programs, learn_peak_bytes while learning, each in a process of its own. bytes: of the file.
-    route_bytes: of ours all that grows with the route, mean and tables with it; of an index its codes and
-    links alone, without identifiers and codebooks. learn_rate: descriptors a second. ratio_to_ours: seconds
-    over those of our fastest. threads: that learned.
+    on one thread, from the descriptor to the place. seconds_load: from the file to the first answer.
+    peak_bytes: most memory while localizing beyond that of the programs, learn_peak_bytes while learning,
+    each in a process of its own. bytes: of the file. route_bytes: of ours all that grows with the route, mean
+    and tables with it; of an index its codes and links alone, without identifiers and codebooks. step: of the
+    lines of a map that is not learned to a budget. learn_rate: descriptors a second; ours codes chunks in
+    one thread, whatever `threads`, those that an index is trained and filled by. agrees: share of queries
+    whose place is that of the scan of the same map. ratio_to_ours: seconds over those of our fastest.
+    difference: largest to the places of the scan, of templates. device: that localized. bandwidth_share: of a
+    copy's, by the bytes that a scan goes through once for each batch; peak_bytes are those of the device.
     """
 
     case: str
@@ -41,25 +48,53 @@ class ScaleRow(NamedTuple):
     threads: int | None = None
     ratio_to_ours: float | None = None
     skipped: str | None = None
+    seconds_load: float | None = None
+    step: float | None = None
+    agrees: float | None = None
+    difference: float | None = None
+    device: str | None = None
+    bandwidth_share: float | None = None
+
+    @property
+    def kind(self) -> str:
+        """Of the case, without its size."""
+        return self.case.partition("=")[0]
+
+
+def grown(rows: Iterable[ScaleRow], kind: str, key: str) -> dict[str, list[tuple[int, float]]]:
+    """Of each contender a figure over N, where it tells of growth.
+
+    Bytes that are given tell nothing. Nor does the one size at which ground that repeats ends with a whole
+    cycle, beside those at which it does not.
+    """
+    found: dict[str, list[tuple[int, float]]] = {}
+    for row in rows:
+        value = getattr(row, key)
+        given = key in ("bytes_per_place", "route_bytes") and row.contender in GIVEN
+        whole = row.kind == "repeat" and row.places == LONGEST["repeat"]
+        if row.kind == kind and value is not None and not given and not whole:
+            found.setdefault(row.contender, []).append((row.places, value))
+    return found
 
 
 def exponents(rows: Sequence[ScaleRow]) -> dict[str, dict[str, dict[str, float]]]:
     """How each figure of each contender grows with N, by kind of case: the slope of a line in logarithms.
 
+    Convention: a line is fitted to 3 sizes or more, of what `grown` tells.
+
     Example:
-        >>> rows = [ScaleRow(f"places={n}", "dejavu", n, seconds=1e-6 * n**0.5) for n in (100, 10_000)]
+        >>> rows = [ScaleRow(f"places={n}", "dejavu", n, seconds=1e-6 * n**0.5) for n in (100, 400, 1600)]
         >>> round(exponents(rows)["places"]["dejavu"]["seconds"], 3)
         0.5
     """
     found: dict[str, dict[str, dict[str, float]]] = {}
-    kinds = {(row.case.partition("=")[0], row.contender): None for row in rows}
-    for kind, name in kinds:
-        own = [row for row in rows if row.contender == name and row.case.partition("=")[0] == kind]
+    for kind in dict.fromkeys(row.kind for row in rows):
         for key in GROWING:
-            points = [(row.places, getattr(row, key)) for row in own if getattr(row, key)]
-            if len(points) > 1:
-                x, y = np.log(np.array(points, dtype=float)).T
-                found.setdefault(kind, {}).setdefault(name, {})[key] = float(np.polyfit(x, y, 1)[0])
+            for name, points in grown(rows, kind, key).items():
+                above = [point for point in points if point[1] > 0]  # 0 has no logarithm
+                if len(above) >= FITTED:
+                    x, y = np.log(np.array(above, dtype=float)).T
+                    found.setdefault(kind, {}).setdefault(name, {})[key] = float(np.polyfit(x, y, 1)[0])
     return found
 
 
@@ -80,18 +115,19 @@ def with_ratios(rows: Sequence[ScaleRow]) -> list[ScaleRow]:
 def pictured(rows: Sequence[ScaleRow]) -> dict[str, dict[str, list[tuple[float, float]]]]:
     """What is drawn over the number of places: heading -> contender -> points."""
     panels = {
-        "recall@1": ("places", "recall_at_1", 1.0),
+        RECALL: ("places", "recall_at_1", 1.0),
         "milliseconds of a query in a batch": ("places", "seconds", 1e3),
         "MB while localizing": ("places", "peak_bytes", 1e-6),
         "route bytes of ground that repeats": ("repeat", "route_bytes", 1.0),
     }
-    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for heading, (kind, key, unit) in panels.items():
-        for row in rows:
-            value = getattr(row, key)
-            if value and row.case.partition("=")[0] == kind:
-                found.setdefault(heading, {}).setdefault(row.contender, []).append((row.places, unit * value))
-    return found
+    found = {
+        heading: {
+            name: [(float(places), unit * value) for places, value in points]
+            for name, points in grown(rows, kind, key).items()
+        }
+        for heading, (kind, key, unit) in panels.items()
+    }
+    return {heading: lines for heading, lines in found.items() if lines}
 
 
 def scale_tables(rows: Sequence[ScaleRow]) -> Iterator[tuple[str, list[list[str]]]]:
@@ -105,7 +141,8 @@ def scale_tables(rows: Sequence[ScaleRow]) -> Iterator[tuple[str, list[list[str]
     def text(value: float | None, form: str, unit: float = 1.0) -> str:
         return "" if value is None else format(value * unit, form)
 
-    head = ["", "B/place", "recall@1", "AUC", "ms one", "ms of 256", "peak MB", "learn MB", "learned/s", ""]
+    head = ["", "B/place", "recall@1", "AUC", "agrees", "ms one", "ms of 256", "bandwidth", "s load"]
+    head += ["peak MB", "learn MB", "learned/s", ""]
     for case in dict.fromkeys(row.case for row in rows):
         yield (
             case,
@@ -116,8 +153,11 @@ def scale_tables(rows: Sequence[ScaleRow]) -> Iterator[tuple[str, list[list[str]
                     text(row.bytes_per_place, ".3g"),
                     text(row.recall_at_1, ".3f"),
                     text(row.auc, ".3f"),
+                    text(row.agrees, ".3f"),
                     text(row.seconds_one, ".3g", 1e3),
                     text(row.seconds, ".3g", 1e3),
+                    text(row.bandwidth_share, ".1%"),
+                    text(row.seconds_load, ".3g"),
                     text(row.peak_bytes, ".0f", 1e-6),
                     text(row.learn_peak_bytes, ".0f", 1e-6),
                     text(row.learn_rate, ".0f"),
@@ -127,9 +167,9 @@ def scale_tables(rows: Sequence[ScaleRow]) -> Iterator[tuple[str, list[list[str]
                 if row.case == case
             ],
         )
-    for kind, grown in exponents(rows).items():
+    for kind, fitted in exponents(rows).items():
         yield (
             f"{kind}=N: exponents of N",
             [["", *GROWING]]
-            + [[name, *(text(one.get(key), ".2f") for key in GROWING)] for name, one in grown.items()],
+            + [[name, *(text(one.get(key), ".2f") for key in GROWING)] for name, one in fitted.items()],
         )
