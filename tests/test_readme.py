@@ -26,6 +26,8 @@ SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
 REJECTION = (ROOT / "docs" / "rejection.md").read_text()
 GROWING = (ROOT / "docs" / "growing.md").read_text()
 STORAGE = (ROOT / "docs" / "storage.md").read_text()
+SCALE = (ROOT / "docs" / "scale.md").read_text()
+CLUSTER = (ROOT / "docs" / "cluster.md").read_text()
 LIVE = (ROOT / "docs" / "live.md").read_text()
 PRETRAINED = (ROOT / "docs" / "pretrained.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -103,15 +105,17 @@ def understand(line: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE, LIVE, REJECTION, GROWING],
+    [README, TRAINING, ROUTES, SPECTRAL, SEQUENCES, STORAGE, LIVE, REJECTION, GROWING, SCALE, CLUSTER],
     ids=[
         *("README", "training", "real_routes", "spectral_maps", "sequences", "storage", "live", "rejection"),
-        "growing",
+        *("growing", "scale", "cluster"),
     ],
 )
 def test_every_command_shown_is_understood(text: str) -> None:
-    shown = re.findall(r"^dejavu .*$", text.replace("\\\n", " "), re.MULTILINE)
-    shown += [line for line in re.findall(r"`(dejavu [^`]+)`", text) if " -" in line and "--help" not in line]
+    setting = r"(?:[A-Z_]+=\S+ )*"  # of the environment
+    shown = re.findall(rf"^{setting}(dejavu .*)$", text.replace("\\\n", " "), re.MULTILINE)
+    inline = re.findall(rf"`{setting}(dejavu [^`]+)`", text)
+    shown += [line for line in inline if " -" in line and "--help" not in line]
     assert len(shown) >= 2
     for line in shown:
         understand(line)

@@ -594,7 +594,15 @@ def run_bench(
         device: of scale, what localizes: as of `dejavu localize`
     """
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import bench, cluster_speed, footprint, frontier, live_speed, scale
+    from dejavu_torch.experiments import (
+        bench,
+        cluster_speed,
+        footprint,
+        frontier,
+        live_speed,
+        scale,
+        scale_report,
+    )
 
     for file in (out, out / "bench.json", out / "bench.png"):
         check_not_read(file, *sources, codebooks)
@@ -608,7 +616,7 @@ def run_bench(
                 "bench scale takes no sources, maps, codebooks or whitening; expected places, device"
             )
         scaled = scale.run_scale(out, places, str(device_of(device)), progress=True)
-        for title, table in scale.scale_tables(scaled):
+        for title, table in scale_report.scale_tables(scaled):
             print(title, text_table(table), "", sep="\n")
         _say(
             f"recall within {scale.TOLERANCE} places; localized on one thread; next: open {out / 'bench.png'}"

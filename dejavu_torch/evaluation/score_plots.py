@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from textwrap import fill
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -16,6 +16,12 @@ _OURS = COLOURS["map"]
 _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
 RATIO = "time over that of our fastest; less is better"
 LOWEST, HIGHEST = 0.01, 0.999  # areas, where more and less is drawn as this
+# of `plot_growth`: the families of a kind, in turn
+_GROWTH = {
+    "dejavu": ("#5aa9d6", "#00406b", _OURS),
+    "null": (COLOURS["null"], COLOURS["null_same_plan"], GREY),
+}
+_OTHERS = ("#222222", "#e07b00", "#c21f0a", "#10b248", "#b43cff", "#f2b80f")
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
 FAMILIES = {  # of `plot_frontiers`: colour and line
@@ -239,30 +245,58 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) ->
     return figure, axes[:, 0]
 
 
-def plot_growth(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]) -> Plot:
+def plot_growth(
+    panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], linear: Collection[str] = ()
+) -> Plot:
     """Figures of contenders over the number of places, a panel each, both axes logarithmic.
 
     Args:
-        panels: at least one: what is drawn -> contender -> places and figure. Names that start with "dejavu"
-            are ours, those with "null" nulls.
+        panels: at least one: what is drawn -> contender -> places and figure. What stands before the first
+            comma of a name is its family, which gives the colour; a mark is of one contender. Families that
+            start with "dejavu" are ours, those with "null" nulls.
+        linear: panels of shares, 0 to 1, on a linear axis.
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
-    kinds = [name.partition(" ")[0].rstrip(",") for name in names]
-    figure, axes = canvas(2.4 * len(panels) + 1.1 * LINE * len(names), len(panels), squeeze=False)
+    styles = _growth_styles(names)
+    figure, axes = canvas(2.6 * len(panels) + 1.1 * LINE * len(names), len(panels), squeeze=False)
+    drawn = {}
     for axis, (heading, lines) in zip(axes[:, 0], panels.items(), strict=True):
         for name, points in lines.items():
-            i = names.index(name)
-            order = kinds[:i].count(kinds[i])  # among its own kind
-            colour = {"dejavu": _OURS, "null": GREY}.get(kinds[i], f"C{1 + order % 9}")
-            style = ("-", "--", ":", "-.", (0, (1, 3)))[order % 5]
-            axis.loglog(*zip(*points, strict=True), color=colour, linestyle=style, marker="o", markersize=3)
-            axis.lines[-1].set_label(name)
+            drawn[name] = axis.plot(*zip(*points, strict=True), **styles[name])[0]
+        axis.set_xscale("log")
+        if heading in linear:
+            axis.set_ylim(0, 1.02)
+        else:
+            axis.set_yscale("log")
         axis.set_title(heading, loc="left", fontsize=10, weight="bold")
         axis.grid(alpha=0.25)
     axes[-1, 0].set_xlabel("places")
-    drawn = {t: h for a in axes[:, 0] for h, t in zip(*a.get_legend_handles_labels(), strict=True)}
-    figure.legend(drawn.values(), drawn.keys(), loc="outside lower left", frameon=False, fontsize=9)
+    handles = [drawn[name] for name in names]
+    figure.legend(handles, names, loc="outside lower left", frameon=False, fontsize=9, handlelength=4)
     return figure, axes[:, 0]
+
+
+def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """A style of each contender: of its family the colour, of its own the mark and the line."""
+    families = {name: name.partition(",")[0] for name in names}
+    colours: dict[str, str] = {}
+    for family in dict.fromkeys(families.values()):
+        kind = family.partition(" ")[0]
+        among = _GROWTH.get(kind, _OTHERS)
+        used = sum(colour in among for colour in colours.values())
+        colours[family] = among[used % len(among)]
+    styles = {}
+    for i, (name, family) in enumerate(families.items()):
+        order = list(families.values())[:i].count(family)  # in its family
+        styles[name] = {
+            "color": colours[family],
+            "marker": "os^Dv"[order % 5],
+            "markerfacecolor": colours[family] if order % 2 == 0 else "white",
+            "markersize": 6,
+            "linestyle": ":" if family.startswith("null") else ("-", "--", "-.")[order % 3],
+            "linewidth": 1.6 if family.startswith("dejavu") else 1.2,
+        }
+    return styles
 
 
 def plot_frontiers(

@@ -14,7 +14,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from math import inf
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -435,16 +435,20 @@ def write_bench(folder: Path, rows: Sequence[Row], picture: Plot | None = None) 
     Args:
         picture: None draws the seconds over ours.
     """
-    facts = {
-        "rows": [row._asdict() for row in rows],
+    facts = {"rows": [row._asdict() for row in rows]} | programs()
+    figure, _ = picture or plot_ratios(bars(rows, lambda row: row.ratio_to_ours))
+    figure.savefig(folder / "bench.png")
+    (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+def programs() -> dict[str, Any]:
+    """What figures depend on beside the machine, as bench.json names it."""
+    return {
         "threads": torch.get_num_threads(),
         "l1_backend": l1_backend(),
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "versions": {"dejavu_torch": dejavu_torch.__version__} | {name: _version(name) for name in COMPARED},
     }
-    figure, _ = picture or plot_ratios(bars(rows, lambda row: row.ratio_to_ours))
-    figure.savefig(folder / "bench.png")
-    (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def bars(rows: Sequence[Row], height: Callable[[Row], float | None]) -> dict[str, dict[str, float]]:

@@ -60,27 +60,6 @@ def random_map(places: int, generator: torch.Generator) -> TemplateMap:
     return TemplateMap(tuple(plan), blocks, places, 2 * FEATURES)
 
 
-def exponents(rows: Sequence[Row]) -> dict[str, float]:
-    """Of each contender, p where its seconds grow as N ** p: a least-squares line through their logarithms.
-
-    Example:
-        >>> exponents([Row(f"templates={n}", "scan", seconds=n / 1e8) for n in (100, 1000, 10000)])
-        {'scan': 1.0}
-    """
-    points: dict[str, list[tuple[float, float]]] = {}
-    for row in rows:
-        if row.seconds:
-            places = int(row.case.partition("=")[2])
-            points.setdefault(row.contender, []).append((math.log(places), math.log(row.seconds)))
-    return {name: round(_slope(of), 3) for name, of in points.items() if len(of) > 1}
-
-
-def _slope(points: Sequence[tuple[float, float]]) -> float:
-    x, y = torch.tensor(points, dtype=torch.float64).T
-    x = x - x.mean()
-    return float(x @ y / (x @ x))
-
-
 def _case(route: TemplateMap, queries: int, repeats: int, generator: torch.Generator) -> Iterator[Row]:
     asked = torch.rand(queries, route.dimension, generator=generator).split(1)
     search = LayerSearch(route)

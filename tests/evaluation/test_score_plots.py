@@ -11,7 +11,14 @@ from drawn import render, texts
 from dejavu_torch.evaluation.contenders import COLOURS, Contender
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, RIGHT, WRONG
-from dejavu_torch.evaluation.score_plots import Length, plot_auc, plot_curves, plot_lengths, plot_ratios
+from dejavu_torch.evaluation.score_plots import (
+    Length,
+    plot_auc,
+    plot_curves,
+    plot_growth,
+    plot_lengths,
+    plot_ratios,
+)
 from dejavu_torch.types import PRCurve
 
 
@@ -108,3 +115,15 @@ def test_recall_and_bytes_over_the_length_of_a_chunk() -> None:
     assert (comparable, printed) == ([0.85, 0.95], [0.8, 0.9])
     assert list(plot[1][1].lines[0].get_ydata()) == [40.0, 30.0]
     assert {line.get_color() for line in plot[1][1].lines[:1]} == {COLOURS["map"]}
+
+
+def test_every_contender_that_grows_has_a_style_of_its_own() -> None:
+    from dejavu_torch.experiments.scale_contenders import CONTENDERS
+
+    shares = {name: [(1e4, 1.0), (1e5, 0.0)] for name in CONTENDERS}
+    figure, axes = plot_growth({"recall@1": shares, "ms": {"dejavu 1 B": [(1e4, 1.0)]}}, ["recall@1"])
+    render(figure)
+    styles = {(line.get_color(), line.get_marker(), line.get_linestyle()) for line in axes[0].lines}
+    assert len(styles) == len(CONTENDERS)
+    assert set(CONTENDERS) <= set(texts(figure))
+    assert [axis.get_yscale() for axis in axes] == ["linear", "log"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
 from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.baselines import as_int8, interpolated
-from dejavu_torch.experiments import scale
+from dejavu_torch.experiments import scale, scale_contenders
 from dejavu_torch.experiments.made import BLOCK, Likeness, MadeRoute, likeness
 from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tiles_of
-from dejavu_torch.experiments.scale import (
+from dejavu_torch.experiments.scale import Task, spread
+from dejavu_torch.experiments.scale_contenders import (
     CONTENDERS,
-    FIXED,
     FLOWN,
     ONE_CHUNK,
     PLACED,
@@ -33,12 +34,8 @@ from dejavu_torch.experiments.scale import (
     Faiss,
     Interpolated,
     Mapped,
-    ScaleRow,
-    Task,
-    exponents,
-    scale_tables,
-    spread,
 )
+from dejavu_torch.experiments.scale_report import ScaleRow, exponents, scale_tables
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 
@@ -133,13 +130,13 @@ def test_a_step_holds_the_share_that_is_asked_for() -> None:
 def test_interpolated_frames_are_those_of_the_baseline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scale, "ROWS", 64)  # several pieces
+    monkeypatch.setattr(scale_contenders, "ROWS", 64)  # several pieces
     route, queries = smooth(501, 12), smooth(501, 12, seed=1)[:50]
     size = Interpolated(12 * 30 / 501).learn(ArrayTraverse(route), tmp_path / "kept")
     back, k, keys = interpolated(as_int8(route), 12 * 30)
     assert size == 12 * keys <= 12 * 30
     expected = (queries @ F.normalize(back, dim=1).T).max(1)
-    found = Interpolated(0).load(tmp_path / "kept", "cpu")(queries)
+    found = Interpolated(0).load(tmp_path / "kept", "cpu").find(queries)
     assert k > 1
     assert torch.allclose(-found.score, expected.values, atol=1e-2)
     assert ((found.place - expected.indices).abs() <= 1).double().mean() > 0.9
@@ -150,7 +147,7 @@ def test_an_index_finds_the_nearest_and_tells_its_bytes(factory: str, tmp_path: 
     pytest.importorskip("faiss")
     route = smooth(1200, 16)
     size = Faiss(factory).learn(ArrayTraverse(route), tmp_path / "kept")
-    found = Faiss(factory).load(tmp_path / "kept", "cpu")(route[::50])
+    found = Faiss(factory).load(tmp_path / "kept", "cpu").find(route[::50])
     assert ((found.place - torch.arange(0, 1200, 50)).abs() <= 5).double().mean() > 0.9
     code = 4 if "PQ" in factory else 64
     assert code * 1200 <= size <= (code + 200) * 1200
@@ -162,7 +159,7 @@ def test_a_null_tells_the_frames_that_it_shuffled(tmp_path: Path) -> None:
     route = smooth(600, 16)
     null = Mapped(8.0, "route", shuffled=True)
     null.learn(ArrayTraverse(route), tmp_path / "kept")
-    found = null.load(tmp_path / "kept", "cpu")(route[::20])
+    found = null.load(tmp_path / "kept", "cpu").find(route[::20])
     assert ((found.place - torch.arange(0, 600, 20)).abs() <= 5).double().mean() > 0.9
 
 
@@ -187,11 +184,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "SHUFFLED": 600,
         "CHECKED": 520,
         "QUERIES": 40,
-        "CHUNK": 128,
         "BATCH": 20,
+        "COPIED": 2**20,
     }.items():
         monkeypatch.setattr(scale, name, value)
-    kept = ("dejavu 4 B", "null 4 B", "faiss flat")
+    monkeypatch.setattr(scale_contenders, "CHUNK", 128)
+    kept = ("dejavu 4 B", "dejavu 4 B, one chunk", "dejavu 4 B, ivf", "null 4 B", "faiss flat")
     for name in list(PLACED):
         if name not in kept:
             monkeypatch.delitem(PLACED, name)
@@ -218,26 +216,52 @@ def test_rows_of_all_cases_are_written(
         assert 3.8 < ours["bytes_per_place"] <= 4.0
         assert ours["recall_at_1"] > 0.8
         assert ours["queries"] == 40
-        assert ours["ratio_to_ours"] == 1
-        assert min(ours[key] for key in ("seconds", "seconds_one", "learn_rate", "bytes")) > 0
+        assert ours["ratio_to_ours"] >= 1
+        shares = ("bandwidth_share", "learn_rate", "bytes")
+        assert min(ours[key] for key in ("seconds", "seconds_one", "seconds_load", *shares)) > 0
+        assert ours["device"] == "cpu"
+        assert ours["agrees"] is None
+        one_chunk, lists = rows[case, "dejavu 4 B, one chunk"], rows[case, "dejavu 4 B, ivf"]
+        assert one_chunk["recall_at_1"] > 0.8
+        if lists["skipped"] is None:  # faiss is there
+            assert lists["agrees"] > 0.9
+            assert lists["bandwidth_share"] is None
+            assert lists["bytes"] == ours["bytes"]
     assert "600" in rows["places=900", "null 4 B"]["skipped"]
     assert rows["repeat=600", "null"]["bytes_per_place"] == pytest.approx(
         rows["repeat=600", ONE_CHUNK]["bytes_per_place"], rel=0.02
     )
+    assert rows["repeat=600", FLOWN]["step"] == rows["repeat=600", ONE_CHUNK]["step"] > 0
+    assert rows["repeat=600", FLOWN]["bytes_per_place"] != rows["repeat=600", ONE_CHUNK]["bytes_per_place"]
     assert "600" in rows["repeat=900", FLOWN]["skipped"]
     assert set(REPEATED) <= {name for _, name in rows}
     assert rows["templates=900", "dejavu two layers"]["seconds"] > 0
-    assert 0.5 < written["exponents"]["repeat"][FIXED]["route_bytes"] < 1.5
+    assert rows["templates=900", "dejavu two layers"]["difference"] == 0
+    assert written["exponents"] == {}  # of two sizes
+    assert {"faiss", "versions", "cpu_capability"} <= set(written)
     assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
     shown = capsys.readouterr().out
     assert "places=600" in shown
-    assert "exponents" in shown
+
+
+def test_rows_are_written_as_they_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def two(*_: Any) -> Iterator[ScaleRow]:
+        for name in ("one", "two"):
+            yield ScaleRow("places=600", name, 600, seconds=1.0)
+            assert json.loads((tmp_path / "bench.json").read_text())["rows"][-1]["contender"] == name
+        raise RuntimeError("the third")
+
+    monkeypatch.setattr(scale, "bench_scale", two)
+    with pytest.raises(RuntimeError, match="third"):
+        scale.run_scale(tmp_path)
+    assert len(json.loads((tmp_path / "bench.json").read_text())["rows"]) == 2
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_without_faiss_its_rows_say_so(small: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
     np.save(tmp_path / "drawn.npy", smooth(600, 16).numpy())
-    row = scale.measured(Task("places=600", "faiss flat", "drawn", 600, 0, 1, "cpu"), tmp_path)
+    row = scale.measured(Task("places=600", "faiss flat", "drawn", 600, 1, "cpu"), tmp_path)
     assert "faiss" in (row.skipped or "")
     assert row.seconds is None
 
@@ -249,7 +273,7 @@ def test_a_process_learns_and_another_localizes(tmp_path: Path) -> None:
         {"queries": route[::20].contiguous(), "truth": spread(600)[::20].contiguous()},
         tmp_path / "places=600.safetensors",
     )
-    row = scale.measured(Task("places=600", "dejavu 4 B", "drawn", 600, 0, 1, "cpu"), tmp_path)
+    row = scale.measured(Task("places=600", "dejavu 4 B", "drawn", 600, 1, "cpu"), tmp_path)
     assert row.skipped is None
     assert row.recall_at_1 == 1
     assert not list(tmp_path.glob("kept*"))
@@ -279,12 +303,20 @@ def test_exponents_and_tables() -> None:
         ScaleRow(f"{kind}={n}", "dejavu", n, seconds=1e-6 * n**power, route_bytes=7)
         for kind, power in (("places", 0.5), ("repeat", 1.0))
         for n in (100, 1000, 10_000)
-    ] + [ScaleRow("places=100", "faiss flat", 100, skipped="no faiss")]
+    ]
+    rows += [
+        ScaleRow(f"places={n}", "dejavu 1 B", n, seconds=1.0, route_bytes=n) for n in (100, 1000, 10_000)
+    ]
+    rows += [ScaleRow(f"places={n}", "null 1 B", n, seconds=1.0) for n in (100, 1000)]
+    rows += [ScaleRow(f"repeat={math.lcm(*TILES)}", "dejavu", math.lcm(*TILES), route_bytes=1)]
+    rows += [ScaleRow("places=100", "faiss flat", 100, skipped="no faiss")]
     found = exponents(rows)
     assert found["places"]["dejavu"]["seconds"] == pytest.approx(0.5)
     assert found["repeat"]["dejavu"] == pytest.approx({"seconds": 1, "route_bytes": 0}, abs=1e-9)
-    assert "faiss flat" not in found["places"]
+    assert found["places"]["dejavu 1 B"].keys() == {"seconds"}  # its bytes are given
+    assert not found["places"].keys() & {"faiss flat", "null 1 B"}  # of two sizes at most
     tables = dict(scale_tables(rows))
-    assert tables["places=100"][2][0] == "faiss flat"
-    assert tables["places=100"][2][-1] == "skipped: no faiss"
+    assert tables["places=100"][-1][0] == "faiss flat"
+    assert tables["places=100"][-1][-1] == "skipped: no faiss"
+    assert {len(line) for line in tables["places=100"]} == {len(tables["places=100"][0])}
     assert set(CONTENDERS) == set(PLACED) | set(REPEATED)

@@ -8,8 +8,7 @@ import pytest
 import torch
 from helpers import refused
 
-from dejavu_torch.experiments.bench import Row
-from dejavu_torch.experiments.template_search import OURS, SCAN, bench_templates, exponents, random_map
+from dejavu_torch.experiments.template_search import OURS, SCAN, bench_templates, random_map
 
 
 def test_times_both_ways_to_the_same_places() -> None:
@@ -25,7 +24,6 @@ def test_times_both_ways_to_the_same_places() -> None:
     for rows, phases in zip(sizes, (143, 401), strict=True):
         assert {row.file_bytes for row in rows} == {rows[0].file_bytes}
         assert 0 <= (rows[0].file_bytes or 0) - 4 * 64 * phases < 1000
-    assert set(exponents([row for rows in sizes for row in rows])) == {OURS, SCAN}
 
 
 @pytest.mark.parametrize("places", [4, 5, 6, 7, 1000, 10**7])
@@ -33,13 +31,6 @@ def test_the_periods_are_the_least_that_tell_the_places_apart(places: int) -> No
     short, long = (layer.period.numerator for layer in random_map(places, torch.Generator()).plan)
     assert (math.gcd(short, long), long) == (1, short + 1)
     assert short * long >= places > (short - 1) * short
-
-
-def test_exponents_are_slopes_of_logarithms() -> None:
-    powers = {OURS: 0.5, SCAN: 1.0}
-    rows = [Row(f"templates={n}", name, seconds=n**p) for n in (10, 300, 5000) for name, p in powers.items()]
-    rows += [Row("templates=10", "once", seconds=1.0), Row("templates=20", "once", skipped="why")]
-    assert exponents(rows) == powers
 
 
 def test_numbers_that_make_no_sense_are_refused() -> None:

@@ -1,0 +1,253 @@
+"""What stands side by side in `dejavu bench scale`: ways to keep descriptors, and to find the nearest."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.experiments.repeating import step_that_holds
+from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.search import Search
+
+ROWS = 8192  # descriptors read at a time
+CHUNK = 8192
+SHARE = 0.8  # of the variance of a repeating route
+OURS = "dejavu"
+IVF = ", ivf"  # behind the name of the map that is searched so
+TRAINED, ROTATED = 100_000, 20_000  # samples at most of an index of faiss, of its rotation
+CELLS_PER_PROBE, PROBED_AT_LEAST = 32, 32  # of an inverted file
+EF_SEARCH = 64  # candidates while a graph is searched
+
+
+class Found(NamedTuple):
+    """The best place of each query and its score, lower is better: (Q,), (Q,)."""
+
+    score: Tensor
+    place: Tensor
+
+
+Find = Callable[[Tensor], Found]
+
+
+class Opened(NamedTuple):
+    """A file that was loaded.
+
+    find: the places of queries (Q,K). device: that it runs on. scanned: bytes that each batch of queries goes
+    through as a whole, asked for when there was one; None where it did not.
+    """
+
+    find: Find
+    device: str = "cpu"
+    scanned: Callable[[], int | None] = lambda: None
+
+
+class Contender(ABC):
+    """A way to keep descriptors in a file, and to find the nearest."""
+
+    def prepare(self, route: IndexedTraverse) -> float | None:
+        """Choose by the route, which is no part of learning; the step of a map that learns with one."""
+        return None
+
+    @abstractmethod
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
+        """Keep the descriptors of a route in a file; how many bytes of it are the route's."""
+
+    @abstractmethod
+    def load(self, path: Path, device: str) -> Opened:
+        """Make ready to find the places of queries in a file; who cannot use the device takes the CPU."""
+
+
+class Mapped(Contender):
+    """Ours: a spectral map.
+
+    Args:
+        budget: route bytes per place. chunk: places, or "route". step: in place of the budget.
+        shuffled: in random order, the null. search: as of `DejaVu.localize`.
+    """
+
+    def __init__(
+        self,
+        budget: float | None,
+        chunk: Any,
+        step: float | None = None,
+        shuffled: bool = False,
+        search: Search = "auto",
+    ) -> None:
+        self.mapper, self.shuffled, self.search = SpectralMapper(budget, step, chunk), shuffled, search
+
+    def prepare(self, route: IndexedTraverse) -> float | None:
+        return self.mapper.step
+
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
+        model = DejaVu(whitening="none", mapper=self.mapper)
+        if self.shuffled:
+            order = torch.randperm(route.length, generator=torch.Generator().manual_seed(0))
+            rows = torch.cat(list(route.batches(ROWS)))
+            model.learn(rows[order])
+            np.save(path.with_suffix(".npy"), order.numpy())
+        else:
+            model.learn(route)
+        model.save(path)
+        return model.map.summary().route_bytes
+
+    def load(self, path: Path, device: str) -> Opened:
+        model = DejaVu.load(path).to(device)
+        order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
+
+        def find(queries: Tensor) -> Found:
+            match = model.localize_descriptors(queries.to(device), search=self.search)
+            index = match.index.cpu()
+            return Found(match.score.cpu(), index if order is None else order[index])
+
+        def scanned() -> int | None:
+            if model.searcher(self.search).told.method != "scan":
+                return None
+            return sum(one.nbytes for one in model.map.buffers())
+
+        return Opened(find, device, scanned)
+
+
+class Held(Mapped):
+    """Ours, in steps that keep so much of the variance of a route."""
+
+    def __init__(self, chunk: Any) -> None:
+        super().__init__(None, chunk, step=1.0)
+
+    def prepare(self, route: IndexedTraverse) -> float | None:
+        self.mapper.step = step_that_holds(SHARE, route, self.mapper.chunk)
+        return self.mapper.step
+
+
+class Faiss(Contender):
+    """An index of faiss over descriptors of length 1.
+
+    Args:
+        factory: what `faiss.index_factory` takes; {cells} stands for the cells of an inverted file.
+    """
+
+    def __init__(self, factory: str) -> None:
+        self.factory = factory
+
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
+        import faiss
+
+        faiss.omp_set_num_threads(torch.get_num_threads())
+        every = -(-route.length // TRAINED)
+        sample = torch.cat(list(route.select(range(0, route.length, every), ROWS)))
+        cells = max(1, min(4 * math.isqrt(route.length), len(sample) // 40))
+        index: Any = faiss.index_factory(sample.shape[1], self.factory.format(cells=cells))
+        if isinstance(index, faiss.IndexPreTransform):  # else training it takes longer than all the rest
+            chain: Any = index.chain
+            rotation: Any = faiss.downcast_VectorTransform(chain.at(0))
+            rotation.max_train_points = ROTATED
+        index.train(sample.numpy())
+        del sample
+        faiss.write_index(index, str(path))
+        empty = path.stat().st_size
+        for part in route.batches(ROWS):
+            index.add(part.numpy())
+        faiss.write_index(index, str(path))
+        names = 8 * route.length if "IVF" in self.factory else 0
+        return path.stat().st_size - empty - names
+
+    def load(self, path: Path, device: str) -> Opened:
+        import faiss
+
+        faiss.omp_set_num_threads(torch.get_num_threads())
+        index: Any = faiss.read_index(str(path))
+        if "IVF" in self.factory:
+            cells = faiss.extract_index_ivf(index)
+            cells.nprobe = max(PROBED_AT_LEAST, cells.nlist // CELLS_PER_PROBE)
+        elif "HNSW" in self.factory:
+            index.hnsw.efSearch = EF_SEARCH
+
+        def find(queries: Tensor) -> Found:
+            score, place = index.search(queries.numpy(), 1)
+            return Found(torch.from_numpy(score[:, 0]), torch.from_numpy(place[:, 0]))
+
+        return Opened(find)
+
+
+class Interpolated(Contender):
+    """Every k-th descriptor in int8 and straight lines between them, in so many bytes per place."""
+
+    def __init__(self, room: float) -> None:
+        self.room = room
+
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
+        from dejavu_torch.evaluation.baselines import as_int8, keyframes
+
+        each = len(next(route.batches(1))[0])
+        k = max(1, math.ceil((route.length - 1) / max(1, self.room * route.length // each - 1)))
+        chosen = keyframes(route.length, k)
+        rows = torch.cat([route.read(range(i, i + 1)) for i in chosen.tolist()])
+        scale = rows.abs().max() / 127
+        small = (as_int8(rows) / scale).round().to(torch.int8)
+        save_file({"keys": small, "scale": scale.view(1), "k": torch.tensor([k, route.length])}, path)
+        return small.nbytes
+
+    def load(self, path: Path, device: str) -> Opened:
+        from dejavu_torch.evaluation.baselines import between_keyframes
+
+        state = load_file(path)
+        keys = state["keys"].float() * state["scale"]
+        k, places = state["k"].tolist()
+
+        def find(queries: Tensor) -> Found:
+            best = torch.full((len(queries),), -math.inf)
+            index = torch.zeros(len(queries), dtype=torch.int64)
+            pieces = max(1, ROWS // k)
+            for start in range(0, places, k * pieces):
+                ends = keys[start // k : start // k + pieces + 1]
+                rows = between_keyframes(ends, min((len(ends) - 1) * k + 1, places - start), k)
+                score, at = (queries @ torch.nn.functional.normalize(rows, dim=1).T).max(1)
+                index = torch.where(score > best, at + start, index)
+                best = torch.maximum(best, score)
+            return Found(-best, index)
+
+        return Opened(find)
+
+
+ONE_CHUNK = f"{OURS}, one chunk"
+FIXED = f"{OURS}, chunks of {CHUNK}"
+FLOWN = f"{OURS}, one chunk, of noisy frames"
+
+# by name: what it is made of, given the route bytes per place and the step of `ONE_CHUNK` at this size, where
+# it is to take the same. "np" leaves out the training of faiss's filter by Hamming distances, which takes
+# long and is not used here
+PLACED: dict[str, Callable[[float, float], Contender]] = {
+    f"{OURS} 1 B": lambda *_: Mapped(1.0, CHUNK),
+    f"{OURS} 4 B": lambda *_: Mapped(4.0, CHUNK),
+    f"{OURS} 1 B, one chunk": lambda *_: Mapped(1.0, "route"),
+    f"{OURS} 4 B, one chunk": lambda *_: Mapped(4.0, "route"),
+    f"{OURS} 1 B{IVF}": lambda *_: Mapped(1.0, CHUNK, search="ivf"),
+    f"{OURS} 4 B{IVF}": lambda *_: Mapped(4.0, CHUNK, search="ivf"),
+    "null 1 B": lambda *_: Mapped(1.0, CHUNK, shuffled=True),
+    "null 4 B": lambda *_: Mapped(4.0, CHUNK, shuffled=True),
+    "faiss flat": lambda *_: Faiss("Flat"),
+    "faiss IVF-PQ, 4 B": lambda *_: Faiss("IVF{cells},PQ4np"),
+    "faiss IVF-PQ, 8 B": lambda *_: Faiss("IVF{cells},PQ8np"),
+    "faiss IVF-PQ, 16 B": lambda *_: Faiss("IVF{cells},PQ16np"),
+    "faiss IVF-PQ, 32 B": lambda *_: Faiss("IVF{cells},PQ32np"),
+    "faiss OPQ, IVF-PQ, 16 B": lambda *_: Faiss("OPQ16,IVF{cells},PQ16np"),
+    "faiss HNSW": lambda *_: Faiss("HNSW16,Flat"),
+}
+REPEATED: dict[str, Callable[[float, float], Contender]] = {
+    ONE_CHUNK: lambda *_: Held("route"),
+    FIXED: lambda *_: Held(CHUNK),
+    FLOWN: lambda room, step: Mapped(None, "route", step),
+    "null": lambda room, step: Mapped(room, "route", shuffled=True),
+    "interpolated frames": lambda room, step: Interpolated(room),
+}
+CONTENDERS = PLACED | REPEATED
+GIVEN = CONTENDERS.keys() - {ONE_CHUNK, FIXED, FLOWN}  # those whose bytes per place are given, and no result
