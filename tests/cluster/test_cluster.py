@@ -20,7 +20,7 @@ from command_line import fails, frames, run, write_images
 from helpers import Fixed, Stream, refused, template_model
 from torch import Tensor, nn
 
-from dejavu_torch.cluster import searching, session
+from dejavu_torch.cluster import session
 from dejavu_torch.cluster.learning import code_on
 from dejavu_torch.cluster.searching import ClusterSearcher, _map_of, _parts
 from dejavu_torch.cluster.session import Cluster
@@ -214,8 +214,7 @@ def test_parts_of_a_map_on_workers_find_what_the_whole_does(kind: str, cluster: 
 def test_a_part_is_scored_to_the_bit_as_in_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Though its coefficients alone would not be worth a compiled loop."""
     draw = torch.nn.functional.normalize(torch.randn(2000, 32, generator=torch.Generator().manual_seed(0)))
-    for module in (spectral, searching):
-        monkeypatch.setattr(module, "BLOCK", 2**13, raising=False)
+    monkeypatch.setattr(spectral, "BLOCK", 2**13)
     monkeypatch.setattr(spectral, "WORTH_COMPILING", 6500)
     whole = SpectralMapper(None, 0.25, chunk=CHUNK)(draw)
     assert not whole.rebuilds(1)
