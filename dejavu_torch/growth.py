@@ -19,9 +19,9 @@ from dejavu_torch.database.recipe import difference, recipe_of
 from dejavu_torch.database.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import REGISTRY, DejaVu, check_sizes
+from dejavu_torch.model import REGISTRY, DejaVu, check_sizes, shown_by
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
-from dejavu_torch.streaming.coder import Made, code_here
+from dejavu_torch.streaming.coder import Made, code_here, with_visits
 from dejavu_torch.streaming.work import WorkFolder, all_chunks
 from dejavu_torch.types import InputError, Traverse
 
@@ -51,8 +51,7 @@ def append(
             the ground it is resampled likewise, and its first frame is the next place.
         progress: show a progress bar on a terminal.
         work, make: as of `DejaVu.learn`.
-        visits: frames of another traverse of its places, averaged in ahead of the coding, see `learn_mean`;
-            `work` and `make` then play no part.
+        visits: frames of another traverse of its places, averaged in ahead of the coding, see `learn_mean`.
 
     Returns:
         The model. What is refused leaves it as it was.
@@ -77,18 +76,16 @@ def append(
     before, places = route.coded(), added.count()
     frames = len(added.positions) if isinstance(added, ResampledTraverse) else places
     _check_count(route.places + places, model.step is not None)
-    text, counts = "learning" if progress else None, torch.ones(places, dtype=torch.int64)
-    if visits is None:
-        coder = model.chunk_coder(places, route, route.mean, before[-1].step)
-        if work is not None:
-            sums = checksums(route.packed(), route.get_extra_state())
-            work.open(model.run_key(added, places) | digests(map=sums))
-        chunks = all_chunks(coder, added, work, make, text)
-    else:
+    counts = torch.ones(places, dtype=torch.int64)
+    if visits is not None:
         _check_alike(model, visits.traverse)
-        means, counts = _mean(model, model.extract_all(added, text).float(), counts, visits, progress)
-        coding = route.mean, before[-1].step, route.transform, route.resolution
-        chunks = [code_chunk(part, *coding) for part in means.split(int(route.chunk))]
+        counts += shown_by(visits, places)
+    if work is not None:
+        sums = checksums(route.packed(), route.get_extra_state())
+        work.open(model.run_key(added, places, visits=visits) | digests(map=sums))
+    visits = visits and model.read_once(visits, "averaging" if progress else None)
+    coder = model.chunk_coder(places, route, route.mean, before[-1].step, visits)
+    chunks = all_chunks(coder, added, work, make, "learning" if progress else None)
     grown = with_chunks(route, [*before, *chunks])
     grown.count_visits(torch.cat([route.visit_counts, counts.to(route.visits.device)]))
     if isinstance(added, ResampledTraverse):
@@ -109,13 +106,16 @@ def learn_mean(
     visits: Views,
     progress: bool = False,
     second: Views | None = None,
+    work: WorkFolder | None = None,
+    make: Callable[..., Made] = code_here,
 ) -> DejaVu:
     """As `DejaVu.learn`, of the mean of several visits to each place: what changes between them cancels out.
 
     Args:
         visits: frames of another traverse and the places that they show, as `DejaVu.places_shown` finds them.
             A place that k of them show is the mean of k + 1 descriptors.
-        traverse, progress, second: as of `DejaVu.learn`. Whitening learns from these, not from `visits`.
+        traverse, progress, second, work, make: as of `DejaVu.learn`. Whitening learns from these, not from
+            `visits`.
 
     Returns:
         The model; `map.visit_counts` says how many visits each place is the mean of.
@@ -136,19 +136,7 @@ def learn_mean(
         raise InputError(f"{seen}; expected a SpectralMapper to average visits for")
     reference = model.resample(as_traverse(traverse), progress=progress)
     check_sizes(model, reference, visits.traverse)
-    before = None if model.whitening is None else model.whitening.state_dict()
-    try:
-        text = "learning" if progress else None
-        descriptors = model.describe_reference(reference, second, text).float()
-        once = torch.ones(len(descriptors), dtype=torch.int64)
-        means, counts = _mean(model, descriptors, once, visits, progress)
-        model.learn_features(means, reference)
-    except InputError:  # the map that there was is of its own whitening
-        if model.whitening is not None and before is not None:
-            model.whitening.load_state_dict(before)
-        raise
-    model.map.count_visits(counts)
-    return model
+    return model.learn(reference, progress, second, work, make, visits)
 
 
 @torch.no_grad()
@@ -171,18 +159,17 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     """
     route = one_route(model)
     _check_alike(model, visits.traverse)
-    described = _described(model, visits, route.dimension, route.places, progress)
     before, chunks, counts = route.coded(), [], route.visit_counts.cpu()
-    seen = torch.zeros_like(counts)
+    seen = shown_by(visits, route.places)
+    described, shown = model.describe_visits(visits, route.dimension, progress)
     for g, (start, stop) in enumerate(route.chunks):
-        inside = ((visits.places >= start) & (visits.places < stop)).nonzero()[:, 0]
+        inside = ((shown >= start) & (shown < stop)).nonzero()[:, 0]
         if not len(inside):
             chunks.append(before[g])
             continue
-        places = visits.places[inside] - start
+        places = shown[inside] - start
         rows = described[inside].to(route.mean.device)
-        means = _with_visits(route.rebuilt(g), counts[start:stop], rows, places)
-        seen[start:stop] += places.bincount(minlength=stop - start)
+        means = with_visits(route.rebuilt(g), counts[start:stop], rows, places)
         coding = route.mean, before[g].step, route.transform, route.resolution
         chunks.append(code_chunk(means, *coding))
     made = with_chunks(route, chunks)
@@ -220,39 +207,6 @@ def shown_on_map(model: DejaVu, traverse: Traverse, truth: str | None = None) ->
             f"{seen}; expected as many, frame i being place i, or a truth that says what they show"
         )
     return Views(traverse, torch.arange(shown))
-
-
-def _mean(
-    model: DejaVu, descriptors: Tensor, counts: Tensor, visits: Views, progress: bool
-) -> tuple[Tensor, Tensor]:
-    """Descriptors (N,K) averaged with those of visits, and of how many each then is the mean."""
-    places, dimension = descriptors.shape
-    shown = visits.places >= 0
-    rows = _described(model, visits, dimension, places, progress)[shown].to(descriptors.device)
-    at = visits.places[shown]
-    return _with_visits(descriptors, counts, rows, at), counts + at.bincount(minlength=places)
-
-
-def _with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> Tensor:
-    """Means (N,K) of so many visits each, and of further ones (n,K) to places (n,) as well."""
-    before = counts.to(means)[:, None]
-    more = places.bincount(minlength=len(means)).to(means)[:, None]
-    sums = (means * before).index_add(0, places.to(means.device), rows.to(means))
-    return torch.where(more > 0, sums / (before + more), means)
-
-
-def _described(model: DejaVu, visits: Views, dimension: int, places: int, progress: bool) -> Tensor:
-    """Descriptors (n,K) of all frames of a visit to some of so many places."""
-    name, last = visits.traverse.name, int(visits.places.max())
-    if last >= places:
-        raise InputError(f"{name} shows place {last}; expected one of {places}")
-    rows = model.extract_all(visits.traverse, "averaging" if progress else None)
-    if rows.shape != (len(visits.places), dimension):
-        seen = f"{name} gives descriptors {tuple(rows.shape)} of {len(visits.places)} places"
-        raise InputError(f"{seen}; expected one of {dimension} numbers for each")
-    if not bool(rows.isfinite().all()):
-        raise InputError(f"{name} gives NaN or infinite descriptors; expected finite numbers")
-    return rows
 
 
 def one_route(model: DejaVu) -> SpectralMap:

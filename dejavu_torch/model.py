@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.arrays import ArrayTraverse, as_traverse
 from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
@@ -49,7 +49,7 @@ from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Search, Searcher, check_scanned, check_search
 from dejavu_torch.streaming import sample as streaming
-from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread
+from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread, with_visits
 from dejavu_torch.streaming.sample import sample_of
 from dejavu_torch.streaming.work import Fit, WorkFolder, all_chunks
 from dejavu_torch.text import one_line
@@ -206,6 +206,7 @@ class DejaVu(nn.Module):
         second: Views | None = None,
         work: WorkFolder | None = None,
         make: Callable[..., Made] = code_here,
+        visits: Views | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
 
@@ -216,6 +217,7 @@ class DejaVu(nn.Module):
             work: keeps the finished chunks of a long route, so that learning goes on from there after a
                 kill; it is the caller's to remove.
             make: what makes the chunks of a long route: `code_here`, or a cluster.
+            visits: see `growth.learn_mean`.
 
         Returns:
             self, with the map in `self.map`. A route in which nothing repeats gives a template map without
@@ -235,10 +237,16 @@ class DejaVu(nn.Module):
         try:
             frames = 0 if self._chunked is None else traverse.count()
             if frames > streaming.SAMPLE:
-                return self._learn_chunks(traverse, frames, second, text, work, make)
+                return self._learn_chunks(traverse, frames, second, text, work, make, visits)
             if work is not None:
                 work.check_unused()
-            return self.learn_features(self.describe_reference(traverse, second, text), traverse)
+            descriptors = self.describe_reference(traverse, second, text)
+            if visits is None:
+                return self.learn_features(descriptors, traverse)
+            counts = 1 + shown_by(visits, len(descriptors))
+            self.learn_features(self._averaged(descriptors, visits, progress), traverse)
+            self.map.count_visits(counts)
+            return self
         except InputError:  # the map that there was is of its own whitening
             if self.whitening is not None and before is not None:
                 self.whitening.load_state_dict(before)
@@ -258,30 +266,30 @@ class DejaVu(nn.Module):
         progress: str | None,
         work: WorkFolder | None,
         make: Callable[..., Made],
+        visits: Views | None,
     ) -> DejaVu:
         """As `learn`, of a route of over `SAMPLE` frames."""
         mapper = self._chunked
         assert mapper is not None
         size = int(mapper.chunk)
+        counts = visits and 1 + shown_by(visits, frames)
         names, positions = self._beside(traverse, frames)
         taken = positions.nbytes + _bytes_of(names)
         if work is not None:
             sampled = runs(sample_of(frames, size).frame)
-            key = self.run_key(traverse, frames, [traverse.state(run.start, run.stop) for run in sampled])
-            shown = second and second.places.tolist()
-            seen = second and [
-                second.traverse.identity(),
-                shown,
-                second.traverse.state(0, len(second.places)),
-            ]
-            work.open(key | digests(second=seen))
+            states = [traverse.state(run.start, run.stop) for run in sampled]
+            key = self.run_key(traverse, frames, states, visits)
+            work.open(key | digests(second=_state_of(second)))
+        visits = visits and self.read_once(visits, progress)
         with in_one_thread():
-            fit = self._fit(traverse, frames, second, taken, progress, work)
-        coder = self.chunk_coder(frames, mapper, fit.mean, fit.step)
+            fit = self._fit(traverse, frames, second, taken, progress, work, visits)
+        coder = self.chunk_coder(frames, mapper, fit.mean, fit.step, visits)
         chunks = all_chunks(coder, traverse, work, make, progress)
         settings = mapper.metric, mapper.transform, size, mapper.resolution
         route = SpectralMap.of_chunks(chunks, fit.mean, *settings).to(self.map.positions.device)
         route.needed = fit.needed
+        if counts is not None:
+            route.count_visits(counts)
         self._say_reached(route, taken)
         return self._take(route, traverse, names, positions)
 
@@ -293,6 +301,7 @@ class DejaVu(nn.Module):
         taken: int,
         progress: str | None,
         work: WorkFolder | None,
+        visits: Views | None,
     ) -> Fit:
         """Learn the whitening from a sample of a long route; mean and step of its chunks."""
         found = None if work is None else work.fit()
@@ -306,6 +315,8 @@ class DejaVu(nn.Module):
         sample = sample_of(frames, size)
         part = Selection(traverse, sample.frame)
         descriptors = self.describe_reference(part, second and sample.views(second), progress and "sampling")
+        if visits is not None and len((shown := sample.shown(visits)).places):
+            descriptors = self._averaged(descriptors, shown)
         # what the file holds once counts for the sample by its share alone
         share, once = len(descriptors) / frames, 2 * descriptors.shape[1]
         other = copy.copy(mapper.beside(round(share * taken - (1 - share) * once)))
@@ -318,18 +329,59 @@ class DejaVu(nn.Module):
         return fit
 
     def chunk_coder(
-        self, frames: int, settings: SpectralMap | SpectralMapper, mean: Tensor, step: float
+        self,
+        frames: int,
+        settings: SpectralMap | SpectralMapper,
+        mean: Tensor,
+        step: float,
+        visits: Views | None = None,
     ) -> ChunkCoder:
         """What makes coded chunks of so many frames, described as this model does."""
         module, whitening = self.pipeline, self.whitening
         size, transform, resolution = int(settings.chunk), settings.transform, settings.resolution
-        return ChunkCoder(module, whitening, self._at_once, frames, size, mean, step, transform, resolution)
+        sizes = self._at_once, frames, size
+        return ChunkCoder(module, whitening, *sizes, mean, step, transform, resolution, visits)
 
-    def run_key(self, traverse: Traverse, frames: int, states: list[str] | None = None) -> dict[str, str]:
+    def read_once(self, visits: Views, progress: str | None = None) -> Views:
+        """Visits that can be read anywhere: as they are, or the features of all, which may lie in a file."""
+        if visits.traverse.seeks:
+            return visits
+        features = concatenate(self._features(visits.traverse, progress and "averaging"))
+        return Views(ArrayTraverse(features.cpu(), visits.traverse.name), visits.places)
+
+    def _averaged(self, descriptors: Tensor, visits: Views, progress: bool = False) -> Tensor:
+        """Descriptors (N,K) of places that were visited once, averaged with those of further visits."""
+        seen = self.describe_visits(visits, descriptors.shape[1], progress)
+        return with_visits(descriptors.float(), torch.ones(len(descriptors)), *seen)
+
+    def describe_visits(self, visits: Views, dimension: int, progress: bool = False) -> tuple[Tensor, Tensor]:
+        """Descriptors (n,K) of the frames that show a place, and these places (n,).
+
+        Raises:
+            InputError: descriptors of another dimension or number, or that are not finite.
+        """
+        name = visits.traverse.name
+        rows = self.extract_all(visits.traverse, "averaging" if progress else None)
+        if rows.shape != (len(visits.places), dimension):
+            seen = f"{name} gives descriptors {tuple(rows.shape)} of {len(visits.places)} places"
+            raise InputError(f"{seen}; expected one of {dimension} numbers for each")
+        if not bool(rows.isfinite().all()):
+            raise InputError(f"{name} gives NaN or infinite descriptors; expected finite numbers")
+        shown = visits.places.to(rows.device) >= 0
+        return rows[shown], visits.places[shown.to(visits.places.device)]
+
+    def run_key(
+        self,
+        traverse: Traverse,
+        frames: int,
+        states: list[str] | None = None,
+        visits: Views | None = None,
+    ) -> dict[str, str]:
         """What the chunks of a traverse are made of, as digests: see `WorkFolder`.
 
         Args:
             states: of the frames that the whitening is learned from.
+            visits: that are averaged in.
         """
         parts = {name: getattr(self, name) for name in PARTS}
         header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
@@ -340,7 +392,8 @@ class DejaVu(nn.Module):
         header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE}
         header |= {"version": __version__, "torch": torch.__version__}
         sums = checksums(weights, header)
-        return digests(source=[traverse.identity(), frames, states]) | {"settings": sums.pop(HEADER), **sums}
+        sources = digests(source=[traverse.identity(), frames, states], visits=_state_of(visits))
+        return sources | {"settings": sums.pop(HEADER), **sums}
 
     def _say_reached(self, route: SpectralMap, taken: int) -> None:
         """What a long route takes, where the sample told wrongly."""
@@ -1072,6 +1125,27 @@ def _code_of(cls: type[nn.Module]) -> str:
         return inspect.getsource(cls)
     except (OSError, TypeError):
         return ""
+
+
+def shown_by(visits: Views, places: int) -> Tensor:
+    """How many frames of visits show each of so many places, (N,).
+
+    Raises:
+        InputError: they show a place beyond these.
+    """
+    shown = visits.places[visits.places >= 0].cpu()
+    if len(shown) and int(shown.max()) >= places:
+        seen = f"{visits.traverse.name} shows place {int(shown.max())}"
+        raise InputError(f"{seen}; expected one of {places}")
+    return shown.bincount(minlength=places)
+
+
+def _state_of(views: Views | None) -> list[Any] | None:
+    """What tells views from others, as JSON takes it."""
+    if views is None:
+        return None
+    traverse, places = views
+    return [traverse.identity(), traverse.state(0, len(places)), places.tolist()]
 
 
 def _bytes_of(names: list[str]) -> int:

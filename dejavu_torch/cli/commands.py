@@ -173,8 +173,6 @@ def run_learn(
             known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
     done, start, work = "", model.map.places, WorkFolder(work_folder_of(map))
-    if visits is not None:
-        work.check_unused()
     with _making(cluster) as make:
         if append is not None and sources:
             growth.append(model, traverse, progress=True, work=work, make=make, visits=visits)
@@ -183,11 +181,12 @@ def run_learn(
             done = f"{len(places)} places behind the {start} of {append}; written to {map}"
         elif append is not None:
             assert visits is not None
+            work.check_unused()
             count, places = growth.average(model, visits, progress=True), visits.places
             done = f"{count} of the {start} places of {append}"
             done += ": decoded, averaged and coded again at the same step"
         elif visits is not None:
-            growth.learn_mean(model, traverse, visits, progress=True, second=views)
+            growth.learn_mean(model, traverse, visits, True, views, work, make)
         else:
             model.learn(traverse, progress=True, second=views, work=work, make=make)
             if cluster is not None and model.map.places <= SHORT:

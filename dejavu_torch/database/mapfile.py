@@ -50,7 +50,7 @@ def checksums(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, s
     for name, tensor in sorted(tensors.items()):
         part = sums.setdefault(name.partition(".")[0], blake2b(digest_size=8))
         part.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        part.update(tensor.contiguous().view(-1).view(torch.uint8).numpy().data)
+        part.update(tensor.cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
     return {part: digest.hexdigest() for part, digest in sums.items()}
 
 

@@ -10,9 +10,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.data.selection import Selection
 from dejavu_torch.database.spectral import CodedChunk, code_chunk
 from dejavu_torch.database.spectrum import Transform
 from dejavu_torch.features.extract import feature_batches
+from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.types import InputError, Traverse
 
@@ -25,6 +27,8 @@ class ChunkCoder(NamedTuple):
     pipeline: makes features of frames. whitening: makes descriptors of these, if not None.
     batch_size: frames at a time. frames: N, of the route. chunk: places of a chunk.
     mean, step, transform, resolution: as of `code_chunk`.
+    visits: frames of another traverse, averaged with those of the places that they show, if not None. It is
+        read a chunk's frames at a time, so that it has to be one that `seeks`.
 
     Convention: batches begin where a chunk does, so that what is ahead of a chunk changes nothing in it.
         Matrix products round differently by the number of threads: work `in_one_thread`.
@@ -39,6 +43,7 @@ class ChunkCoder(NamedTuple):
     step: float
     transform: Transform
     resolution: float
+    visits: Views | None = None
 
     @torch.no_grad()
     def chunks(self, traverse: Traverse, wanted: range, progress: str | None = None) -> Iterator[CodedChunk]:
@@ -55,14 +60,35 @@ class ChunkCoder(NamedTuple):
         held: list[Tensor] = []
         left = part.length
         for features in feature_batches(part, self.pipeline, self.batch_size, device, progress):
-            held.append(features if self.whitening is None else self.whitening(features))
+            held.append(self._whitened(features))
             left -= len(features)
             if (part.length - left) % self.chunk == 0 or not left:
-                yield code_chunk(torch.cat(held), self.mean, self.step, self.transform, self.resolution)
+                rows = torch.cat(held)
+                rows = self._averaged(rows, part.start + part.length - left - len(rows))
+                yield code_chunk(rows, self.mean, self.step, self.transform, self.resolution)
                 held = []
         if left:
             seen = f"{traverse.name} ended at frame {part.start + part.length - left}"
             raise InputError(f"{seen}; expected {self.frames} frames, as it had before")
+
+    def _whitened(self, features: Tensor) -> Tensor:
+        return features if self.whitening is None else self.whitening(features)
+
+    def _averaged(self, rows: Tensor, start: int) -> Tensor:
+        """Descriptors (n,K) of the places from `start` on, averaged with those of the visits."""
+        if self.visits is None:
+            return rows
+        traverse, places = self.visits.traverse, self.visits.places.cpu() - start
+        frames = ((places >= 0) & (places < len(rows))).nonzero()[:, 0]
+        if not len(frames):
+            return rows
+        some = Selection(traverse, frames)
+        batches = feature_batches(some, self.pipeline, self.batch_size, self.mean.device)
+        seen = torch.cat([self._whitened(features) for features in batches])
+        if len(seen) != len(frames):
+            told = f"{traverse.name} has fewer than the {int(frames[-1]) + 1} frames"
+            raise InputError(f"{told} that it is to show places with; expected these")
+        return with_visits(rows, torch.ones(len(rows)), seen, places[frames])
 
     def span(self, chunks: range) -> tuple[int, int]:
         """The frames [start, stop) of chunks."""
@@ -72,6 +98,14 @@ class ChunkCoder(NamedTuple):
         """The numbers of all chunks, those that are made together in one range."""
         together, count = -(-SHARD // self.chunk), -(-self.frames // self.chunk)
         return [range(first, min(first + together, count)) for first in range(0, count, together)]
+
+
+def with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> Tensor:
+    """Means (N,K) of so many visits (N,) each, and of further ones (n,K) to places (n,) as well."""
+    before = counts.to(means)[:, None]
+    more = places.bincount(minlength=len(means)).to(means)[:, None]
+    sums = (means * before).index_add(0, places.to(means.device), rows.to(means))
+    return torch.where(more > 0, sums / (before + more), means)
 
 
 class _Aligned(Traverse):

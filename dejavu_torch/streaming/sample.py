@@ -25,17 +25,22 @@ class Sample(NamedTuple):
     stretch: int
 
     def views(self, second: Views) -> Views:
-        """What another traverse shows of the sample, with places that count in it.
+        """As `shown`, to learn from.
 
         Raises:
-            InputError: nothing.
+            InputError: it shows nothing of the sample.
         """
+        found = self.shown(second)
+        if not len(found.places):
+            seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
+            raise InputError(f"{seen}, in stretches of {self.stretch} all along the route; expected some")
+        return found
+
+    def shown(self, second: Views) -> Views:
+        """What another traverse shows of the sample, with places that count in it."""
         places = second.places.cpu()
         at = torch.searchsorted(self.frame, places).clamp(max=len(self.frame) - 1)
         shown = (self.frame[at] == places).nonzero().flatten()
-        if not len(shown):
-            seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
-            raise InputError(f"{seen}, in stretches of {self.stretch} all along the route; expected some")
         return Views(Selection(second.traverse, shown), at[shown])
 
 

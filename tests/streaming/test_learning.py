@@ -399,3 +399,65 @@ def test_a_map_appended_to_is_that_of_both_parts(tmp_path: Path) -> None:
     part.map = SpectralMap.of_chunks(whole.map.coded()[:12], whole.map.mean, **whole.map.settings())
     growth.append(part, route()[600:])
     assert file_of(part, tmp_path) == file_of(whole, tmp_path)
+
+
+def visits_of(places: Tensor, kind: type[Traverse] = ArrayTraverse) -> Views:
+    """Frames that show these places; -1 is none."""
+    noise = 0.5 * torch.randn(len(places), 12, generator=torch.Generator().manual_seed(2))
+    return Views(kind(route()[places] + noise), places)  # type: ignore[call-arg]
+
+
+def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:
+    # all places but some, one of them twice, some frames that show none, and against the direction
+    places = torch.cat([torch.arange(0, 400), torch.tensor([7, -1, -1]), torch.arange(480, PLACES).flip(0)])
+
+    def model() -> DejaVu:
+        return DejaVu(whitening="none", mapper=SpectralMapper(3.0, chunk=CHUNK))
+
+    whole = growth.learn_mean(model(), route(), visits_of(places))
+    assert made == [CHUNK] * 20 + [30]
+    sums, counts = route(), torch.ones(PLACES)
+    shown = places >= 0
+    sums.index_add_(0, places[shown], visits_of(places).traverse.values[shown])  # type: ignore[attr-defined]
+    counts.index_add_(0, places[shown], torch.ones(int(shown.sum())))
+    assert torch.equal(whole.map.visit_counts, counts.long())
+    for own, mean in zip(whole.map.coded(), (sums / counts[:, None]).split(CHUNK), strict=True):
+        settings = whole.map.mean, own.step, whole.map.transform, whole.map.resolution
+        assert torch.equal(own.stream.bytes, code_chunk(mean, *settings).stream.bytes)
+    bytes_ = file_of(whole, tmp_path)
+    assert file_of(growth.learn_mean(model(), route(), visits_of(places, Stream)), tmp_path) == bytes_
+
+    def stopped(*work: object) -> Iterator[object]:
+        for done, part in enumerate(code_here(*work)):  # type: ignore[arg-type]
+            if done == 4:
+                raise KeyboardInterrupt
+            yield part
+
+    work = WorkFolder(tmp_path / "work")
+    with pytest.raises(KeyboardInterrupt):
+        growth.learn_mean(model(), route(), visits_of(places), work=work, make=stopped)  # type: ignore[arg-type]
+    with refused("work", "visits differs"):
+        growth.learn_mean(model(), route(), visits_of(places.clamp(min=0)), work=work)
+    made.clear()
+    assert file_of(growth.learn_mean(model(), route(), visits_of(places), work=work), tmp_path) == bytes_
+    assert sum(made) == PLACES - 8 * CHUNK
+    for bad, words in (
+        (visits_of(places)._replace(places=places + 1), ("shows place 1030", "1030")),
+        (visits_of(places)._replace(places=torch.arange(PLACES)), ("353", "of 400")),
+    ):
+        with refused(*words):
+            growth.learn_mean(model(), route(), bad)
+
+
+def test_visits_to_appended_places_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:
+    def grown(**settings: object) -> DejaVu:
+        model = learned(route()[:500])
+        made.clear()
+        visits = Views(ArrayTraverse(route()[500:] + 0.1), torch.arange(PLACES - 500))
+        return growth.append(model, route()[500:], visits=visits, **settings)  # type: ignore[arg-type]
+
+    whole = grown(work=WorkFolder(tmp_path / "work"))
+    assert made == [CHUNK] * 10 + [30]
+    assert whole.map.visits.tolist() == [[500, 1], [PLACES - 500, 2]]
+    assert file_of(grown(work=WorkFolder(tmp_path / "work")), tmp_path) == file_of(whole, tmp_path)
+    assert made == []
