@@ -27,6 +27,7 @@ from dejavu_torch import (
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.database.mapfile import read_map, write_map
+from dejavu_torch.database.merged import MergedMap
 from dejavu_torch.database.spectral import SpectralMap, code_chunk
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
@@ -201,6 +202,20 @@ def test_positions_behind_others_reach_as_many_places(moves: list[float], places
         shown = shown_frames(joined)[places:]
         assert shown[0] == 2
         assert (shown - 2 - shown_frames(own.clamp(min=0))).abs().max() <= 1
+
+
+def test_no_place_is_lost_behind_more_than_float32_can_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = torch.arange(50.0)
+    assert count_places(positions_behind(own, 2**24 - 50)) == 2**24
+    with refused("16777217 places", "merge"):
+        positions_behind(own, 2**24 - 49)
+    parts = [SpectralMapper(4.0, chunk=25)(walk(50, seed=seed)) for seed in range(2)]
+    for part in parts:
+        part.positions = own
+    route = MergedMap(parts, ["one", "two"])
+    monkeypatch.setattr(MergedMap, "_starts", property(lambda self: [0, 2**24 + 1]))
+    route.loaded()
+    assert torch.equal(route.positions[50:] - 2**24, own.double() + 1)
 
 
 def test_only_a_chunk_of_descriptors_is_held(monkeypatch: pytest.MonkeyPatch) -> None:

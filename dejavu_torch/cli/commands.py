@@ -246,8 +246,9 @@ def run_localize(
         search_every: of the filter, queries from one search of all places to the next; in between only those
             near the last place are scored; 1 if not given
         search: of single queries: scan scores all places; bound, of a map with chunks, passes over those that
-            cannot be best, and finds the same; ivf, with faiss, scores about one place in 32 and may miss
-            the best; auto takes scan or bound, by what the first queries show
+            cannot be best, and finds the same; ivf, with faiss, scores the places of one list
+            in 32, but at least 32, of 2 sqrt(places), and may miss the best; auto takes scan or bound, by
+            what the first queries show
         cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
         device: what computes: cpu, cuda, cuda:1 or mps
         features: class of the map's features, if not ours

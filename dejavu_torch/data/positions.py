@@ -9,6 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dejavu_torch.types import InputError
+
+MOST = 2**24  # places: from there on float32 holds no odd numbers
 NEAR = 1e-4  # steps: a frame so near to a place has reached it
 
 
@@ -45,8 +48,17 @@ def positions_behind(positions: Tensor, places: int) -> Tensor:
     """Positions (F,) of frames whose first place is behind so many others, float32.
 
     Convention: frames behind their own first place are moved to it: there are other places behind it now.
+
+    Raises:
+        InputError: more places than float32 can tell apart.
     """
     double = positions.double().clamp(min=0)
+    total = places + count_places(double)
+    if total > MOST:
+        raise InputError(
+            f"{total} places at even steps, one behind the other; expected at most {MOST}, whose positions "
+            "float32 can tell apart: make several maps, and merge them"
+        )
     moved = (double + places).float()
     # at many places float32 would round some up to the next place
     reached = (double + NEAR).floor() + places

@@ -48,7 +48,7 @@ def coefficients_of(small: Tensor, escapes: Tensor) -> Coefficients:
     for rows in small.split(max(1, AT_ONCE // max(1, width))):
         there = rows != 0
         counts = there.sum(1).to(_type_for(width))
-        parts.append(Coefficients(counts, there.nonzero()[:, 1].to(_type_for(width)), rows[there]))
+        parts.append(Coefficients(counts, there.nonzero()[:, 1].to(_type_for(width - 1)), rows[there]))
     counts, feature, level = (torch.cat(column) for column in zip(*parts, strict=True))
     marks = level == ESCAPE
     if int(marks.sum()) != len(escapes) or bool((escapes.abs() <= 127).any()):

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.files import LARGEST
-from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.database.place_map import EXTRA, Mapper, PlaceMap, Route
 from dejavu_torch.database.schema import checked
 from dejavu_torch.database.spectral import SpectralMap, SpectralState
@@ -75,8 +74,8 @@ class MergedMap(PlaceMap):
             Route(name, part.places, len(part.positions) or part.places)
             for name, part in zip(self.names, self._parts, strict=True)
         )
-        moved = [
-            positions_behind(part.positions, start)
+        moved = [  # in double: of many routes float32 would lose places
+            part.positions.double().clamp(min=0) + start
             for start, part in zip(self._starts, self._parts, strict=False)
             if len(part.positions)
         ]

@@ -36,7 +36,8 @@ class PlaceMap(nn.Module, ABC):
         state: type of what `get_extra_state` gives, by which a file is checked: a NamedTuple of its entries.
         places: N, the number of places. dimension: D, features per frame. Plain ints.
         positions: (F,) float32, how many even steps each reference frame lies from the first place, where
-            frames were resampled (section IV-B); (0,) where place i is reference frame i.
+            frames were resampled (section IV-B); (0,) where place i is reference frame i. Of a merged map
+            float64.
         visits: (V,2) int32, runs of places and how many visits each of these is the mean of; (0,2) where all
             are of one.
         routes: of a merged map, in order; () for one route. Places and frames then count through all of them,

@@ -381,7 +381,7 @@ class SpectralMap(PlaceMap):
             stop = min(start + step, self.dimension)
             some = (line, feature, level)
             if step < self.dimension:
-                inside = (feature >= start) & (feature < stop)
+                inside = (feature >= start) & (feature <= stop - 1)  # a byte holds no 256
                 some = (line[inside], feature[inside], level[inside])
             spot = (some[1].long() - start) * size + slot[some[0]]
             slotted = factor.new_zeros((stop - start) * size).scatter_(0, spot, some[2] * factor[some[0]])

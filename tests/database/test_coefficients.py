@@ -43,6 +43,7 @@ def test_they_are_the_levels(rows: int, width: int, largest: int, share: float, 
     found = coefficients_of(small, escapes)
     assert torch.equal(levels_of(found, width).long(), levels)
     assert all(map(torch.equal, coded_levels(found, width), (small, escapes)))
+    assert (found.feature.element_size() == 1) == (width <= 256)  # they go to width - 1
     assert disagreement(found, width) == ""
     size = 1 if not len(escapes) else 2 if int(levels.abs().max()) < 2**15 else 4
     assert found.level.element_size() == size
@@ -51,6 +52,13 @@ def test_they_are_the_levels(rows: int, width: int, largest: int, share: float, 
         parts = levels[:half], levels[half:]
         again = joined([coefficients_of(*to_int8(part)) for part in parts])
         assert torch.equal(levels_of(again, width).long(), levels)
+
+
+def test_a_byte_for_each_of_256_numbers_also_of_a_long_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    route = SpectralMapper(None, 0.5, 32)(torch.randn(64, 256))
+    whole = [route.rebuilt(g) for g in range(2)]
+    monkeypatch.setattr(spectral, "LONG", 32 * 100)
+    assert all(torch.equal(route.rebuilt(g), whole[g]) for g in range(2))
 
 
 def test_escapes_that_there_is_no_room_for_are_refused() -> None:
