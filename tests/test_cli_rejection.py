@@ -10,6 +10,7 @@ import pytest
 from command_line import fails, report_of, run
 
 from dejavu_torch import DejaVu
+from dejavu_torch.features.views import FEWEST
 
 ROUTE, AGAIN, THIRD, SEA = (
     f"sim:{name}"
@@ -25,7 +26,9 @@ ROUTE, AGAIN, THIRD, SEA = (
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("learned") / "map.safetensors"
-    run("learn", ROUTE, "--map", path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dejavu_torch.features.views.FEWEST", FEWEST)  # for the probabilities of a filter
+        run("learn", ROUTE, "--map", path)
     return path
 
 
