@@ -138,9 +138,11 @@ def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
 )
 def test_parts_of_a_mapper_of_templates_as_options(templates: tuple[str, ...], tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
-    run("learn", LONG, "--map", route, *templates, "--mapper.periods.window", "128")
+    np.save(tmp_path / "frames.npy", frames(64, size=16))
+    window = "--mapper.periods.window", "32"
+    run("learn", tmp_path / "frames.npy", "--map", route, *templates, *window)
     model = DejaVu.load(route)
-    assert (model.mapper.periods.window, model.mapper.periods.peaks) == (128, "local")
+    assert (model.mapper.periods.window, model.mapper.periods.peaks) == (32, "local")
     assert model.whitening is None
 
 
@@ -209,7 +211,9 @@ def test_compare_without_truth_gives_matches_and_no_scores(
     assert "--truth" in page
     assert "<table" not in page
     assert len((tmp_path / "report" / "matches.csv").read_text().splitlines()) == 65
-    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--truth", "16", "--out", tmp_path / "report")
+    known = "--map", tmp_path / "report" / "map.safetensors"
+    pair = tmp_path / "a.npy", tmp_path / "b.npy"
+    run("compare", *pair, *known, "--truth", "16", "--out", tmp_path / "report")
     report = report_of(tmp_path / "report")
     assert report["auc"] is not None
 
