@@ -57,9 +57,11 @@ FEW_VIEWS = {
         "test_demo",
         "test_cli_networks",
         "test_pretrained",
+        "test_cli_rejection",
+        "test_onnx_file",
     ),
 }
-PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes", "test_reproduce", "test_cli_rejection"}
+PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes", "test_reproduce"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import inspect
 import os
+import re
 import shlex
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -63,16 +65,14 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
 
 
 def test_convention_4_threshold_option_then_map_then_all(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     route, out = tmp_path / "a.safetensors", tmp_path / "m.csv"
 
     def accepted() -> int:
         return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
 
-    run("learn", SMALL, "--map", route)
-    capsys.readouterr()
-    run("localize", route, QUERY, "--out", out)
+    run("localize", small_map, QUERY, "--out", out)
     assert "no threshold" in capsys.readouterr().out
     assert accepted() == 96
     score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[40]
@@ -138,9 +138,11 @@ def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
 )
 def test_parts_of_a_mapper_of_templates_as_options(templates: tuple[str, ...], tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
-    run("learn", LONG, "--map", route, *templates, "--mapper.periods.window", "128")
+    np.save(tmp_path / "frames.npy", frames(64, size=16))
+    window = "--mapper.periods.window", "32"
+    run("learn", tmp_path / "frames.npy", "--map", route, *templates, *window)
     model = DejaVu.load(route)
-    assert (model.mapper.periods.window, model.mapper.periods.peaks) == (128, "local")
+    assert (model.mapper.periods.window, model.mapper.periods.peaks) == (32, "local")
     assert model.whitening is None
 
 
@@ -166,16 +168,17 @@ def test_features_of_another_package_are_named_again_to_localize(
     assert len((tmp_path / "matches.csv").read_text().splitlines()) == 65
 
 
-def test_classes_of_the_current_folder(tmp_path: Path) -> None:
+def test_classes_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_network.py").write_text("import torch\nclass Net(torch.nn.Flatten):\n    pass\n")
     np.save(tmp_path / "frames.npy", frames(64))
-    code = "from dejavu_torch.cli import main; main()"
     words = ["learn", "frames.npy", "--map", "a.safetensors", "--features", "my_network.Net"]
-    # -P: as an installed command, which does not look there by itself
-    python = [sys.executable, "-P", "-c", code, *words]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    subprocess.run(python, cwd=tmp_path, env=environment, check=True, capture_output=True)
-    assert (tmp_path / "a.safetensors").is_file()
+    monkeypatch.chdir(tmp_path)
+    # as for an installed command, which does not look there by itself
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place and Path(place) != tmp_path])
+    with pytest.raises(ImportError):
+        import_module("my_network")
+    run(*words)
+    assert DejaVu.load("a.safetensors", sys.modules.pop("my_network").Net()).map.places == 64
 
 
 def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -208,30 +211,24 @@ def test_compare_without_truth_gives_matches_and_no_scores(
     assert "--truth" in page
     assert "<table" not in page
     assert len((tmp_path / "report" / "matches.csv").read_text().splitlines()) == 65
-    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", "--truth", "16", "--out", tmp_path / "report")
+    known = "--map", tmp_path / "report" / "map.safetensors"
+    pair = tmp_path / "a.npy", tmp_path / "b.npy"
+    run("compare", *pair, *known, "--truth", "16", "--out", tmp_path / "report")
     report = report_of(tmp_path / "report")
     assert report["auc"] is not None
 
 
-@pytest.mark.parametrize("offset", [["--truth=-3"], ["--truth", "-3"]])
-def test_negative_offset_is_a_truth(tmp_path: Path, offset: list[str]) -> None:
-    np.save(tmp_path / "a.npy", frames(64))
-    pair = tmp_path / "a.npy", tmp_path / "a.npy"
-    run("compare", *pair, *offset, "--tolerance", "0", "--out", tmp_path / "r")
-    report = report_of(tmp_path / "r")
-    assert report["tolerance"] == 0
-    assert report["with_answer"] == 61
-
-
-def test_a_report_keeps_the_map_and_says_what_to_do_next(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run("compare", SMALL, QUERY, "--out", tmp_path / "report")
-    assert capsys.readouterr().out.splitlines()[-1] == f"next: open {tmp_path / 'report' / 'index.html'}"
-    kept, again = tmp_path / "report" / "map.safetensors", ("--tolerance", "2", "--out", tmp_path / "report")
-    before = kept.read_bytes()
-    run("compare", SMALL, QUERY, "--map", kept, "--threshold", "0.01", *again)
-    assert kept.read_bytes() == before
+def test_negative_offset_is_a_truth(tmp_path: Path) -> None:
+    reference, matches = tmp_path / "a.npy", tmp_path / "m.csv"
+    np.save(reference, frames(64))
+    rows = "".join(f"{i},{i},0.5\n" for i in range(64))
+    matches.write_text(f"query,place,score\n{rows}")
+    run("compare", reference, reference, "--truth", "-3", "--tolerance", "0", "--out", tmp_path / "apart")
+    exact = "--tolerance", "0", "--reference", reference, "--out", tmp_path / "joined"
+    run("evaluate", matches, "--truth=-3", *exact)
+    for name in ("apart", "joined"):
+        report = report_of(tmp_path / name)
+        assert (report["tolerance"], report["with_answer"]) == (0, 61)
 
 
 def test_what_learn_says_to_do_next_can_be_done(
@@ -263,7 +260,9 @@ def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> No
     assert out.splitlines()[0].startswith(f"usage: dejavu {command}")
 
 
-def test_help_loads_nothing_that_only_a_run_needs() -> None:
+@pytest.fixture(scope="module")
+def helped() -> tuple[str, str]:
+    """What a process in which every help is asked for prints, and what it and OpenMP say on stderr."""
     code = (
         "import sys, dejavu_torch.cli as cli\n"
         "try: cli.main(['--help'])\n"
@@ -274,8 +273,18 @@ def test_help_loads_nothing_that_only_a_run_needs() -> None:
         "heavy = 'kornia', 'matplotlib', 'pytorch_lightning', 'torchmetrics', 'av', 'numba', 'cv2', 'scipy'\n"
         "print([name for name in heavy if name in sys.modules])"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (ran.stdout.splitlines()[-1], ran.stderr) == ("[]", "")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
+    environment = {**kept, "OMP_DISPLAY_ENV": "true"}
+    command = [sys.executable, "-c", code]
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return ran.stdout, ran.stderr
+
+
+def test_help_loads_nothing_that_only_a_run_needs(helped: tuple[str, str]) -> None:
+    own = re.sub(
+        r"\s*OPENMP DISPLAY ENVIRONMENT BEGIN.*?OPENMP DISPLAY ENVIRONMENT END\s*", "", helped[1], flags=re.S
+    )
+    assert (helped[0].splitlines()[-1], own) == ("[]", "")
 
 
 def test_every_setting_of_a_model_is_an_option_and_a_key(capsys: pytest.CaptureFixture[str]) -> None:
@@ -287,20 +296,15 @@ def test_every_setting_of_a_model_is_an_option_and_a_key(capsys: pytest.CaptureF
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libgomp is the OpenMP of Linux builds")
-@pytest.mark.parametrize(("given", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "active"}, "ACTIVE")])
-def test_threads_do_not_spin_while_they_wait(given: dict[str, str], policy: str) -> None:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
-    environment = {**kept, "OMP_DISPLAY_ENV": "true", **given}
-    command = [sys.executable, "-m", "dejavu_torch.cli", "info", "nowhere"]  # for which torch is loaded
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert f"OMP_WAIT_POLICY = '{policy}'" in done.stderr
+def test_threads_do_not_spin_while_they_wait(helped: tuple[str, str]) -> None:
+    assert "OMP_WAIT_POLICY = 'PASSIVE'" in helped[1]
 
 
-def test_quiet_where_not_a_terminal(tmp_path: Path) -> None:
-    words = ["learn", SMALL, "--map", str(tmp_path / "a.safetensors"), "--whitening.views", "1"]
-    command = [sys.executable, "-m", "dejavu_torch.cli", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stderr == ""
+def test_threads_spin_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")  # which OpenMP reads where torch loads it
+    with pytest.raises(SystemExit):
+        run("info", "nowhere")
+    assert os.environ["OMP_WAIT_POLICY"] == "active"
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"]])
@@ -582,20 +586,25 @@ def test_a_command_that_fails_leaves_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_map_that_is_given_is_not_learned(
+def test_a_map_that_is_given_is_not_learned_and_stays_in_the_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    small_map = tmp_path / "learned" / "map.safetensors"
-    run("compare", SMALL, QUERY, *TEMPLATES, "--out", tmp_path / "learned")
-    assert "Learning took" in capsys.readouterr().out
+    folder = tmp_path / "report"
+    kept = folder / "map.safetensors"
+    run("compare", SMALL, QUERY, *TEMPLATES, "--out", folder)
+    learned, before = report_of(folder), kept.read_bytes()
+    out = capsys.readouterr().out
+    assert "Learning took" in out
+    assert out.splitlines()[-1] == f"next: open {folder / 'index.html'}"
     assert len([line for line in caplog.messages if "window shrunk" in line]) == 1
     caplog.clear()
-    run("compare", SMALL, QUERY, "--map", small_map, "--out", tmp_path / "given")
+    run("compare", SMALL, QUERY, "--map", kept, "--threshold", "0.01", "--out", folder)
+    assert kept.read_bytes() == before
     out = capsys.readouterr().out
     assert "Localizing took" in out
     assert "Learning" not in out
     assert "window shrunk" not in caplog.text
-    learned, given = report_of(tmp_path / "learned"), report_of(tmp_path / "given")
+    given = report_of(folder)
     assert given["seconds_learn"] == 0 < learned["seconds_learn"]
     assert {key: given[key] for key in ("auc", "null")} == {key: learned[key] for key in ("auc", "null")}
 
@@ -666,27 +675,32 @@ def test_what_torch_cannot_allocate_is_one_line_and_a_bug_is_a_traceback(
         run("info", "a")
 
 
-@pytest.mark.slow
-def test_localize_memory_does_not_grow_with_the_queries(small_map: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def own_process(small_map: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """What commands behind one another in a process of their own print, and what they say on stderr."""
     code = (
-        "import resource, sys; from dejavu_torch.cli import main\n"
+        "import resource, sys, warnings; from dejavu_torch.cli import commands, main\n"
         "for count in (128, 1280):\n"
         "    main(['localize', sys.argv[1], f'sim:aerial?frames={count}', '--out', sys.argv[2]])\n"
-        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+        f"main(['learn', {SMALL!r}, '--map', sys.argv[3], '--whitening.views', '1'])\n"
+        "print('learned', file=sys.stderr)\n"
+        "commands.print_map = lambda model: warnings.warn('two\\nlines')\nmain(['info', sys.argv[1]])"
     )
-    command = [sys.executable, "-c", code, str(small_map), str(tmp_path / "m.csv")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    few, many = (int(line) for line in done.stdout.splitlines() if line.isdigit())
+    folder = tmp_path_factory.mktemp("process")
+    words = map(str, (small_map, folder / "m.csv", folder / "a.safetensors"))
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    return done.stdout, done.stderr
+
+
+@pytest.mark.slow
+def test_localize_memory_does_not_grow_with_the_queries(own_process: tuple[str, str]) -> None:
+    few, many = (int(line) for line in own_process[0].splitlines() if line.isdigit())
     # features of the further frames would take 8 MB, their frames 57 MB, the painted route takes 2 MB
     assert many - few < 8_000
 
 
-def test_a_warning_of_a_library_is_one_line(small_map: Path) -> None:
-    code = (
-        "import sys, warnings\nfrom dejavu_torch.cli import commands, main\n"
-        "commands.print_map = lambda model: warnings.warn('two\\nlines')\nmain(['info', sys.argv[1]])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(small_map)], capture_output=True, text=True, check=True
-    )
-    assert done.stderr == "dejavu: two lines\n"
+def test_quiet_where_not_a_terminal_and_a_warning_of_a_library_is_one_line(
+    own_process: tuple[str, str],
+) -> None:
+    assert own_process[1] == "learned\ndejavu: two lines\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +31,17 @@ def matches(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return folder / "matches.csv"
 
 
+@pytest.fixture(scope="module")
+def compared(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of both, with the truth."""
+    folder = tmp_path_factory.mktemp("compared") / "report"
+    run("compare", *pair, "--truth", "4", "--out", folder)
+    return folder
+
+
 @pytest.mark.slow
 def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(
-    pair: tuple[Path, Path], matches: Path, tmp_path: Path
+    pair: tuple[Path, Path], matches: Path, compared: Path, tmp_path: Path
 ) -> None:
     rows = [f"{query},{query + 4}" for query in range(84)]
     (tmp_path / "all.csv").write_text("query,place\n" + "\n".join(rows))
@@ -40,9 +49,9 @@ def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(
     hard = np.zeros((96, 84), dtype=bool)
     hard[np.arange(84) + 4, np.arange(84)] = True
     np.savez(tmp_path / "truth.npz", GThard=hard)
-    run("compare", *pair, "--truth", "4", "--out", tmp_path / "c0")
-    run("compare", *pair, "--truth", tmp_path / "truth.npz", "--out", tmp_path / "c3")
-    expected = report_of(tmp_path / "c0")
+    known = "--map", compared / "map.safetensors"
+    run("compare", *pair, *known, "--truth", tmp_path / "truth.npz", "--out", tmp_path / "c3")
+    expected = report_of(compared)
     forms = (
         ["4"],
         [tmp_path / "all.csv"],
@@ -96,12 +105,11 @@ def test_coordinates_in_image_names_are_a_truth(tmp_path: Path) -> None:
             Image.fromarray(image).save(path)
     both = (tmp_path / "first", tmp_path / "second")
     run("compare", *both, "--truth", "utm:4", "--tolerance", "0", "--out", tmp_path / "compare")
-    run("compare", *both, "--truth", "0", "--tolerance", "0", "--out", tmp_path / "zero")
+    matches = tmp_path / "compare" / "matches.csv"
+    run("evaluate", matches, "--truth", "0", "--tolerance", "0", "--out", tmp_path / "zero")
     assert report_of(tmp_path / "compare")["auc"] == report_of(tmp_path / "zero")["auc"]
     options = ("--truth", "utm:4", "--tolerance", "0", "--out", tmp_path / "evaluate")
-    run(
-        "evaluate", tmp_path / "compare" / "matches.csv", *options, "--reference", both[0], "--query", both[1]
-    )
+    run("evaluate", matches, *options, "--reference", both[0], "--query", both[1])
     assert report_of(tmp_path / "evaluate")["auc"] == report_of(tmp_path / "zero")["auc"]
 
 
@@ -156,7 +164,8 @@ def test_what_is_taken_for_the_truth_is_told(
 def test_a_reference_tells_evaluate_where_the_map_ends(
     pair: tuple[Path, Path], matches: Path, tmp_path: Path
 ) -> None:
-    run("compare", *pair, "--truth", "20", "--out", tmp_path / "compare")
+    known = "--map", matches.parent / "map.safetensors"
+    run("compare", *pair, *known, "--truth", "20", "--out", tmp_path / "compare")
     options = ("--truth", "20", "--out", tmp_path / "evaluate")
     run("evaluate", tmp_path / "compare" / "matches.csv", "--reference", pair[0], *options)
     both = [report_of(tmp_path / name) for name in ("compare", "evaluate")]
@@ -170,7 +179,7 @@ def test_a_reference_tells_evaluate_where_the_map_ends(
 def test_the_threshold_that_is_named_accepts_right_places_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flights = ("sim:aerial?frames=128", "sim:aerial?frames=128&traverse=1")
+    flights = ("sim:aerial?frames=96", "sim:aerial?frames=96&traverse=1")
     run("compare", *flights, "--out", tmp_path / "first")
     first = report_of(tmp_path / "first")
     assert f"--threshold {first['threshold_of_full_precision']:.9g}" in capsys.readouterr().out
@@ -197,7 +206,7 @@ def test_a_curve_that_starts_late_is_marked(
 
 
 def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(
-    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pair: tuple[Path, Path], compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
@@ -205,7 +214,7 @@ def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(
         Image.fromarray(image).save(folder / f"{i}.png")
     assert "expected another" in fails(capsys, "compare", f"{folder}?step=1", folder, "--out", folder)
     assert len(list(folder.iterdir())) == 16
-    run("compare", *pair, "--truth", "4", "--out", tmp_path / "out")
+    shutil.copytree(compared, tmp_path / "out")
     assert (tmp_path / "out" / "pr.png").exists()
     run("compare", *pair, "--out", tmp_path / "out")
     assert not (tmp_path / "out" / "pr.png").exists()
@@ -334,7 +343,8 @@ def test_a_tolerance_beyond_the_route_is_a_tolerance(
     wide = ("--tolerance", str(2**53), "--truth", "4")
     run("compare", *pair, *wide, "--out", tmp_path / "compare", *TEMPLATES, "--leave_out", str(2**53))
     assert report_of(tmp_path / "compare")["recall_at_1"] == 1
-    run("compare", *pair, *wide, "--out", tmp_path / "filter", "--filter")
+    known = "--map", matches.parent / "map.safetensors"
+    run("compare", *pair, *known, *wide, "--out", tmp_path / "filter", "--filter")
     assert report_of(tmp_path / "filter")["recall_at_1"] == 1
 
 

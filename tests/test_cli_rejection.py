@@ -10,6 +10,8 @@ import pytest
 from command_line import fails, report_of, run
 
 from dejavu_torch import DejaVu
+from dejavu_torch.features.views import FEWEST
+from dejavu_torch.features.whitening import VIEWS, VIEWS_PER_COMPONENT
 
 ROUTE, AGAIN, THIRD, SEA = (
     f"sim:{name}"
@@ -25,7 +27,12 @@ ROUTE, AGAIN, THIRD, SEA = (
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("learned") / "map.safetensors"
-    run("learn", ROUTE, "--map", path)
+    with pytest.MonkeyPatch.context() as patch:
+        # as many copies of frames as outside of tests, for the probabilities of a filter
+        patch.setattr("dejavu_torch.features.whitening.VIEWS", VIEWS)
+        patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", VIEWS_PER_COMPONENT)
+        patch.setattr("dejavu_torch.features.views.FEWEST", FEWEST)
+        run("learn", ROUTE, "--map", path)
     return path
 
 

@@ -214,24 +214,44 @@ def test_an_interrupt_that_was_turned_into_another_exception_is_one() -> None:
 # standard streams
 
 
-@pytest.mark.parametrize(
-    ("redirected", "status", "said"),
-    [
-        ("| head -1", 0, ""),
-        (">&- 2>&- <&-", 0, ""),
-        ("> /dev/full", 2, "No space left on device"),
-    ],
-)
-def test_files_are_written_whatever_becomes_of_what_is_printed(
-    folder: Path, redirected: str, status: int, said: str
-) -> None:
-    words = " ".join((*DEJAVU, "learn", "a.npy", *PLAIN, "--map", "new.safetensors", redirected))
-    command = f"set -o pipefail; {words}"
-    done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True)
-    assert (done.returncode, done.stderr.count("\n")) == (status, status // 2)
-    assert said in done.stderr
-    assert (folder / "new.safetensors").read_bytes()[8:9] == b"{"  # and nothing that was printed
-    assert DejaVu.load(folder / "new.safetensors").map.places == 64
+LATE = """
+import os, sys
+from dejavu_torch.cli import commands, main, parser, process  # and torch, once for all that are forked
+
+def opened(number, mode):
+    try: os.fstat(number)
+    except OSError: return None
+    return open(number, mode, closefd=False)
+
+for redirected in sys.argv[1:]:
+    read, write = os.pipe()
+    if not os.fork():  # a command with its streams as a shell opens them, and Python upon them
+        os.close(read)
+        if redirected == "closed": [os.close(number) for number in range(3)]
+        elif redirected == "full": os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
+        else: os.dup2(write, 1)
+        os.close(write)
+        for number, name in enumerate(("stdin", "stdout", "stderr")):
+            stream = opened(number, "w" if number else "r")
+            setattr(sys, name, stream); setattr(sys, f"__{name}__", stream)
+        sys.argv[1:] = ["learn", "a.npy", "--map", f"{redirected}.safetensors", "--whitening.views", "1"]
+        main()
+        sys.exit()
+    os.close(write); os.close(read)
+    print(redirected, os.waitstatus_to_exitcode(os.wait()[1]), flush=True)
+"""
+
+
+def test_files_are_written_whatever_becomes_of_what_is_printed(folder: Path) -> None:
+    """Where who reads has left, as `head` does, where streams are closed, and where a disk is full."""
+    words = [sys.executable, "-c", LATE, "left", "closed", "full"]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["left 0", "closed 0", "full 2"]
+    assert (done.stderr.count("\n"), done.stderr.count("No space left on device")) == (1, 1)
+    for name in ("left", "closed", "full"):
+        path = folder / f"{name}.safetensors"
+        assert path.read_bytes()[8:9] == b"{"  # and nothing that was printed
+        assert DejaVu.load(path).map.places == 64
 
 
 def test_without_anybody_to_read_help_is_silent() -> None:
@@ -273,8 +293,10 @@ def test_names_that_are_no_text_do_not_fail_a_report(tmp_path: Path) -> None:
             os.rename(image, os.fsencode(plain) + b"/\xff\n$_{$" + os.fsencode(image.name))
         plain.rename(Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)))
     words = [b"compare", b"caf\xe9\n\x1b[31m", "\xe9$_{$".encode(), b"--truth", b"0", b"--out", b"out"]
-    words += map(os.fsencode, PLAIN)
+    words += map(os.fsencode, (*PLAIN, "--calibration", "none"))
+    (tmp_path / "matplotlibrc").write_text("savefig.dpi: 20")  # names are drawn, in few pixels
     plain_c = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    plain_c["MATPLOTLIBRC"] = str(tmp_path)
     done = subprocess.run([*map(os.fsencode, DEJAVU), *words], cwd=tmp_path, env=plain_c, capture_output=True)
     assert (done.returncode, done.stderr.count(b"\n")) == (0, done.stderr.count(b"dejavu: "))
     assert b"\x1b" not in done.stdout
@@ -363,17 +385,33 @@ def mounted(folder: Path, options: str, *commands: str) -> list[str]:
     return [*done.stdout.splitlines(), *done.stderr.splitlines()]
 
 
+def commands_of_one_process(*lines: str) -> str:
+    """For a shell: commands, and behind a `!` lines of a shell, in one process, which loads torch once and
+    whose pictures are bytes without their drawing."""
+    code = (
+        "import os, sys; from dejavu_torch.cli import main; from dejavu_torch.evaluation import report\n"
+        "report.as_png = lambda picture: bytes(5000)\n"
+        "for line in sys.argv[1:]:\n"
+        "    try: os.system(line[1:]) if line[0] == '!' else main(line.split())\n"
+        "    except SystemExit as stop: print('status', stop.code, flush=True)"
+    )
+    return shlex.join([sys.executable, "-c", code, *lines])
+
+
 def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None:
-    dejavu, plain = " ".join(DEJAVU), " ".join(PLAIN)
+    plain = " ".join(PLAIN)
+    words = commands_of_one_process(
+        f"compare a.npy b.npy {plain} --truth 0 --out disk/old",
+        "!dd if=/dev/zero of=disk/full bs=1k count=64 status=none 2> /dev/null",
+        f"learn a.npy {plain} --map disk/map.safetensors",
+        "learn b.npy --append disk/map.safetensors",
+    )
     found = mounted(
         folder,
         "size=64k",
         "mkdir disk/old; echo old > disk/old/matches.csv; echo old > disk/old/pr.png",
         "cp map.safetensors disk; dd if=/dev/zero of=disk/full bs=1k count=36 status=none",
-        f"{dejavu} compare a.npy b.npy {plain} --truth 0 --out disk/old > /dev/null; echo status $?",
-        "dd if=/dev/zero of=disk/full bs=1k count=64 status=none 2> /dev/null",
-        f"{dejavu} learn a.npy {plain} --map disk/map.safetensors > /dev/null; echo status $?",
-        f"{dejavu} learn b.npy --append disk/map.safetensors > /dev/null; echo status $?",
+        f"{words} | grep ^status",
         "find disk -mindepth 1 | sort; cat disk/old/*; cmp map.safetensors disk/map.safetensors",
     )
     said = [line for line in found if line.startswith("dejavu: ")]
@@ -386,15 +424,9 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None
 
 
 def test_a_place_to_read_only_is_told_ahead_of_the_work(folder: Path) -> None:
-    code = (
-        "import sys; from dejavu_torch.cli import main\n"
-        "for line in sys.argv[1:]:\n"
-        "    try: main(line.split())\n"
-        "    except SystemExit as stop: print('status', stop.code)"
-    )
     learn = "learn sim:aerial?frames=1000000 --map disk/map.safetensors"
-    words = [sys.executable, "-c", code, learn, "compare a.npy b.npy --out disk/report"]
-    found = mounted(folder, "ro", shlex.join(words))
+    words = commands_of_one_process(learn, "compare a.npy b.npy --out disk/report")
+    found = mounted(folder, "ro", words)
     assert found[:2] == ["status 2"] * 2
     assert [line.startswith("dejavu: ") and "no permission" in line for line in found[2:]] == [True] * 2
 

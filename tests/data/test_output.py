@@ -8,10 +8,10 @@ import shutil
 import signal
 import socket
 import stat
-import subprocess
-import sys
 import tempfile
-from contextlib import suppress
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 import pytest
@@ -26,10 +26,6 @@ from dejavu_torch.data.output import (
     whole_folder,
 )
 from dejavu_torch.types import InputError
-
-HOLD = "; print(flush=True); import sys; sys.stdin.read()"
-WRITER = "from pathlib import Path; from dejavu_torch.data.output import {0}; context = {0}(Path({1!r})); \
-part = context.__enter__(); (part / 'a' if part.is_dir() else part).write_text('half')"
 
 
 def full_disk(*_: object, **__: object) -> None:
@@ -356,20 +352,26 @@ def test_signals_wait_until_all_files_are_in_their_places(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize(("kind", "name"), [("whole_file", "a"), ("whole_folder", "new")])
+@pytest.mark.parametrize(("kind", "name"), [(whole_file, "a"), (whole_folder, "new")])
 def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(
-    tmp_path: Path, kind: str, name: str
+    tmp_path: Path, kind: Callable[[Path], AbstractContextManager[Path]], name: str
 ) -> None:
-    code = WRITER.format(kind, str(tmp_path / name)) + HOLD
-    command = [sys.executable, "-c", code]
     (tmp_path / "a.txt.part").touch()  # of somebody else
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"\n"
-        write(tmp_path / "b")
-        assert len(list(tmp_path.glob(".dejavu-*"))) == 1  # it is alive
-        process.kill()
-        process.wait()
+    read, written = os.pipe()
+    child = os.fork()
+    if not child:
+        with suppress(BaseException), kind(tmp_path / name) as part:
+            (part / "a" if part.is_dir() else part).write_text("half")
+            os.write(written, b"\n")
+            time.sleep(60)
+        os._exit(1)
+    assert os.read(read, 1) == b"\n"
+    write(tmp_path / "b")
+    assert len(list(tmp_path.glob(".dejavu-*"))) == 1  # it is alive
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    os.close(read)
+    os.close(written)
     assert len(list(tmp_path.glob(".dejavu-*"))) == 1
     write(tmp_path / "b")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt.part", "b"]

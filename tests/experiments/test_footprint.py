@@ -154,7 +154,7 @@ def test_why_a_process_failed_that_does_not_import_from_the_current_folder(
 ) -> None:
     (tmp_path / "kornia.py").write_text("raise SystemExit('the wrong module')")
     monkeypatch.chdir(tmp_path)
-    facts = measured(Task("dejavu", 150, 10, 1), drives)  # nothing learned so many
+    facts = measured(Task("HOG, float32", 150, 10, 1), drives)  # nothing learned so many
     assert list(facts) == ["skipped"]
     assert "150" in facts["skipped"]
 

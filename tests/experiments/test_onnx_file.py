@@ -62,6 +62,7 @@ def flights() -> tuple[Tensor, Tensor]:
     return road, query
 
 
+@pytest.mark.figures  # frames of `flights` are in other tests
 def test_real_frames_score_as_in_torch(data_dir: Path, tmp_path: Path) -> None:
     strips = (f"strip:{data_dir}/aerial_road/pass{i}.png?halve=1&rows=32:128&width=96" for i in (1, 2))
     road, query = (torch.cat(list(open_source(strip).between(0, 50))) for strip in strips)
@@ -120,23 +121,18 @@ def test_a_map_of_features_takes_features(settings: dict[str, Any], tmp_path: Pa
     torch.testing.assert_close(found, model(queries), rtol=0, atol=1e-5)
 
 
-def assert_streams(file: Path, route: DejaVu, model: SequenceModel, state: list[int]) -> dict[str, Any]:
+def assert_streams(
+    file: Path, route: DejaVu, model: SequenceModel, state: list[int], queries: Tensor
+) -> dict[str, Any]:
     """A file goes from state to state as a sequence model does; its facts."""
-    session, queries = session_of(str(file)), torch.rand(20, 4)
+    session, (_, *shape) = session_of(str(file)), queries.shape
     facts = facts_of(session)
-    assert facts["inputs"] == {"features": [1, 4], "state": state}
-    assert facts["outputs"] == {"scores": [1, 30], "next_state": state}
+    assert facts["inputs"] == {"features" if len(shape) == 1 else "frames": [1, *shape], "state": state}
+    assert facts["outputs"] == {"scores": [1, route.map.places], "next_state": state}
     with torch.no_grad():
         (expected,) = model.stream([route(queries)])
     torch.testing.assert_close(run_session(session, queries), expected, rtol=0, atol=1e-4)
     return facts
-
-
-def test_a_filter_goes_from_state_to_state(tmp_path: Path) -> None:
-    route, model = of_features(), PlaceFilter(within=2)
-    facts = export_onnx(route, tmp_path / "map.onnx", model).facts
-    assert facts == assert_streams(tmp_path / "map.onnx", route, model, [31])
-    assert facts["threshold"] == model.threshold_of(None)
 
 
 class Solves(nn.Module):
@@ -237,7 +233,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     out = capsys.readouterr().out
     for told in ("features (1, 4)", "state (4, 30)", f"opset {OPSET}", f"written to {tmp_path / 'map.onnx'}"):
         assert told in out
-    facts = assert_streams(tmp_path / "map.onnx", model, SequenceMatcher(5, (1, 0.5)), [4, 30])
+    facts = assert_streams(
+        tmp_path / "map.onnx", model, SequenceMatcher(5, (1, 0.5)), [4, 30], torch.rand(20, 4)
+    )
     assert (facts["threshold"], facts["first_state"]) == (0.5, "nan")
     before = (tmp_path / "map.onnx").read_bytes()
     assert "such as route.onnx" in fails(capsys, *words, tmp_path / "map.pt")
@@ -253,7 +251,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert (tmp_path / "map.onnx").read_bytes() == before
 
 
-def test_the_documentation_runs(
+def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
@@ -268,3 +266,7 @@ def test_the_documentation_runs(
             run(*shlex.split(line)[1:])
     found = re.findall(r"^(\d+) (?:True|False)$", capsys.readouterr().out, re.MULTILINE)
     assert [abs(int(place) - 40) <= 5 for place in found] == [True] * 4
+    route, model = DejaVu.load("road.safetensors").eval(), PlaceFilter()
+    queries = next(open_source("sim:aerial?frames=64&traverse=1").between(30, 42))
+    facts = assert_streams(Path("drive.onnx"), route, model, [65], queries)
+    assert facts["threshold"] == model.threshold_of(None)
