@@ -57,9 +57,14 @@ FEW_VIEWS = {
         "test_demo",
         "test_cli_networks",
         "test_pretrained",
+        "test_reproduce",
+        "test_train_command",
+        "test_compare",
+        "test_routes",
+        "test_spectral_training",
     ),
 }
-PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes", "test_reproduce", "test_cli_rejection"}
+PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes", "test_cli_rejection"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
