@@ -58,8 +58,6 @@ FEW_VIEWS = {
         "test_cli_networks",
         "test_pretrained",
         "test_reproduce",
-        "test_train_command",
-        "test_compare",
         "test_routes",
         "test_spectral_training",
     ),
