@@ -59,9 +59,12 @@ FEW_VIEWS = {
         "test_pretrained",
         "test_cli_rejection",
         "test_onnx_file",
+        "test_reproduce",
+        "test_routes",
+        "test_spectral_training",
     ),
 }
-PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes", "test_reproduce"}
+PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -236,15 +236,14 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
     assert report["template_numbers"] == 53 * 192
 
 
+@pytest.mark.figures
 @pytest.mark.parametrize(
     ("column", "options"),
     [
-        pytest.param(0, (), id="road", marks=pytest.mark.figures),
-        pytest.param(
-            1, ("--mapper.route_bytes_per_place", "2.5"), id="road, small", marks=pytest.mark.figures
-        ),
+        pytest.param(0, (), id="road"),
+        pytest.param(1, ("--mapper.route_bytes_per_place", "2.5"), id="road, small"),
         pytest.param(2, ("--tolerance", "0"), id="corridor"),
-        pytest.param(3, (), id="railway", marks=pytest.mark.figures),
+        pytest.param(3, (), id="railway"),
     ],
 )
 def test_spectral_maps(column: int, options: tuple[str, ...], data_dir: Path, tmp_path: Path) -> None:

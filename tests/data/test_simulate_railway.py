@@ -93,7 +93,7 @@ def test_frames_do_not_depend_on_the_batch_size(kind: type[Railway], traverse: i
 
 @both
 def test_frames_depend_on_the_arguments_alone(kind: type[Railway]) -> None:
-    route = 500.0 if kind is Outdoor else 2000.0  # less to paint, and room for the stations
+    route = 200.0 if kind is Outdoor else 2000.0  # less to paint, and room for the stations
     brief: type[Railway] = type("Brief", (kind,), {"route": route})
     first = all_of(brief(traverse=1, frames=4))
     torch.manual_seed(5)
@@ -344,7 +344,7 @@ def test_the_ground_is_a_strip_beside_the_sleepers(kind: type[Railway], height: 
 @pytest.mark.parametrize("traverse", [0, 1])
 @both
 def test_the_ground_moves_as_the_train_does(kind: type[Railway], traverse: int) -> None:
-    train, start, stop = ride_of(kind, traverse), 700, 800
+    train, start, stop = ride_of(kind, traverse), 700, 750
     frames = frames_at(train, torch.arange(start, stop))
     shift, confidence = GroundOdometry(train.corners, (32, 32))(frames)
     metres = float(shift.sum()) * train.ground_span / 31

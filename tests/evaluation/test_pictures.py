@@ -78,9 +78,7 @@ def drawn(
     pictures = draw_pictures(run, contenders)
     assert pictures.keys() <= set(PICTURES)
     for picture in pictures.values():
-        buffer = io.BytesIO()
-        picture.plot[0].savefig(buffer, format="png", dpi=50)
-        assert buffer.tell() > 2000
+        picture.plot[0].draw_without_rendering()
         assert picture.heading
         assert picture.caption.endswith(".")
     return pictures
@@ -98,6 +96,10 @@ def test_every_picture_of_frames_that_repeat() -> None:
     other = Match(torch.arange(120), torch.zeros(120), torch.ones(120, dtype=torch.bool))
     pictures = drawn(short(), frames(0), frames(1), same_places(), stride=other, leave_out=other)
     assert list(pictures) == ALL
+    for picture in pictures.values():
+        buffer = io.BytesIO()
+        picture.plot[0].savefig(buffer, format="png", dpi=50)
+        assert buffer.tell() > 2000
     labels = [text.get_text() for text in pictures["auc"].plot[1].texts]
     assert {"this map", "the stride"} < set(labels)
     assert "the leave_out" not in labels

@@ -44,18 +44,43 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import Match
 
 PAPER = {"min_period": 8, "peaks": "bins", "false_alarm": None, "short": "refuse"}
-FRAMES, LENGTHS = 1024, (512, 1024, 2048)
+FRAMES, LENGTHS = 512, (256, 512, 1024)
+
+
+def shorter(dataset: str, window: int) -> DejaVu:
+    """The paper's settings with shorter chunks."""
+    paper = paper_model(open_source(f"sim:{dataset}?frames=1"))
+    paper.mapper = TemplateMapper(SpectrogramAnalysis(window, **PAPER), reduction="sum")
+    return paper
 
 
 @pytest.fixture(scope="module")
 def aerial() -> Comparison:
-    return reproduce("aerial", frames=FRAMES, lengths=LENGTHS)
+    """The first 512 frames, one chunk."""
+    return reproduce("aerial", shorter("aerial", 512), frames=FRAMES, lengths=LENGTHS)
+
+
+def test_the_paper_s_settings_are_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Asked(Exception):
+        pass
+
+    asked = create_autospec(compare, side_effect=Asked)
+    monkeypatch.setattr("dejavu_torch.experiments.reproduce.compare", asked)
+    for dataset in PUBLISHED:
+        with pytest.raises(Asked):
+            reproduce(dataset)
+        model, expected = asked.call_args.kwargs["model"], paper_model(open_source(f"sim:{dataset}?frames=1"))
+        assert str(model) == str(expected)
+        assert (model.velocity is None) == (dataset == "aerial")
+        assert [reference.name for reference in asked.call_args.args] == [
+            open_source(f"sim:{dataset}?seed=0{traverse}").name for traverse in ("", "&traverse=1")
+        ]
 
 
 @pytest.mark.slow
 def test_the_second_traverse_stands_at_top_level(aerial: Comparison) -> None:
     pair = [open_source(f"sim:aerial?frames={FRAMES}&traverse={traverse}") for traverse in (0, 1)]
-    alone = compare(pair[0], pair[1], model=paper_model()).report.as_json()
+    alone = compare(pair[0], pair[1], model=shorter("aerial", 512)).report.as_json()
     report = aerial.report.as_json()
     for key in (
         "auc",
@@ -82,15 +107,15 @@ def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial: Comparis
 @pytest.mark.slow
 def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> None:
     rows = aerial.report.facts["chunk_lengths"]
-    assert [row["window"] for row in rows] == [512, 1024]  # 2048 is longer than the route
+    assert [row["window"] for row in rows] == [256, 512]  # 1024 is longer than the route
     assert rows[1]["auc"] == aerial.report.as_json()["auc"]
     assert rows[1]["map_bytes"] == pytest.approx(aerial.report.facts["map_bytes"], abs=200)  # calibrated
-    mapper = TemplateMapper(SpectrogramAnalysis(512, **PAPER), reduction="sum")
+    mapper = TemplateMapper(SpectrogramAnalysis(256, **PAPER), reduction="sum")
     other = DejaVu(mapper=mapper).learn_features(aerial.run.reference_features)
     scores = evaluate(other.localize(aerial.run.query_features), aerial.run.truth, 5)
     assert (rows[0]["auc"], rows[0]["recall_at_1"]) == (scores.auc, scores.recall_at_1)
     assert rows[0]["bytes_per_place"] == rows[0]["map_bytes"] / FRAMES
-    other = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(512, **PAPER)))
+    other = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(256, **PAPER)))
     other.learn_features(aerial.run.reference_features)
     again = evaluate(other.localize(aerial.run.query_features), aerial.run.truth, 5)
     assert rows[0]["recall_at_1_comparable"] == again.recall_at_1
@@ -182,8 +207,7 @@ def drawn_once(draw: Callable[[Railway, Tensor], Tensor]) -> Callable[[Railway, 
 @pytest.fixture(scope="module")
 def outdoor() -> Comparison:
     """The first 420 frames, from the start of the train on, in chunks of 64."""
-    paper = paper_model(open_source("sim:outdoor?frames=1"))
-    paper.mapper = TemplateMapper(SpectrogramAnalysis(64, **PAPER), reduction="sum")
+    paper = shorter("outdoor", 64)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Railway, "_frames", drawn_once(Railway._frames))
         return reproduce("outdoor", paper, frames=420, lengths=(32, 64))

@@ -1,13 +1,15 @@
-"""Trainings of a few steps by one process, or by one of several: `python several_processes.py COUNT FOLDER`.
+"""Trainings of a few steps by one process, or by two: `python several_processes.py FOLDER`.
 
-What each step logs and the weights behind it are kept in FOLDER, in a file for each case and process. Each of
-several processes is started by itself, with its number in LOCAL_RANK.
+First `dejavu train` trains by two processes with the config in FOLDER. It starts the second, which runs this
+file as well, and both go on with the cases. What each step logs and the weights behind it are kept in FOLDER,
+in a file for each case and process.
 """
 
 from __future__ import annotations
 
 import copy
 import logging
+import os
 import sys
 import warnings
 from pathlib import Path
@@ -19,6 +21,7 @@ from small_training import backbone, data_of, footage, mapper
 from torch import nn
 
 from dejavu_torch import Embedding, SpectralMapper
+from dejavu_torch.cli import main
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.training.export import LastCheckpoint
 from dejavu_torch.training.task import PlaceRecognitionTask
@@ -95,5 +98,10 @@ def run(case: str, processes: int, folder: Path) -> None:
 if __name__ == "__main__":
     logging.getLogger("pytorch_lightning").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore")
+    folder = Path(sys.argv[1])
+    os.chdir(folder)
+    words = ["fit", "--config", "train.yaml", "--data.batch_size", "10", "--trainer.devices", "2"]
+    main(["train", *words, "--trainer.strategy", "ddp"])
+    del os.environ["PL_GLOBAL_SEED"]  # with which Lightning would begin the cases
     for case in CASES:
-        run(case, int(sys.argv[1]), Path(sys.argv[2]))
+        run(case, 2, folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from dejavu_torch import DejaVu, RouteData, SpectralMapper
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.training.task import PlaceRecognitionTask
 
-STEPS = 12
+STEPS, BROKEN = 9, 6
+INTERRUPTED = {"in the first epoch": 3, "between": 5, "in the second": 7}  # steps
 
 
 def spectral(rate: float) -> PlaceRecognitionTask:
@@ -61,30 +63,69 @@ class Break(Stop):
         pass
 
 
-@pytest.mark.parametrize(
-    "make",
-    [lambda: spectral(0.0), lambda: spectral(1.0), code, templates],
-    ids=["spectral", "rate", "code", "plain"],
-)
-@pytest.mark.parametrize("step", [3, 5, 7], ids=["in the first epoch", "between", "in the second"])
-def test_it_ends_in_the_same_map(tmp_path: Path, make: Callable[[], Any], step: int) -> None:
-    whole = tensors(run(tmp_path / "whole", make, None))
-    part = tmp_path / "part.ckpt"
-    run(tmp_path / "first", make, None, Stop(step, part))
-    again = tensors(run(tmp_path / "again", make, part))
+class Keep(Stop):
+    """Saves a checkpoint wherever a training is interrupted, and ends it at the last."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(max(INTERRUPTED.values()))
+        self.folder = folder
+
+    def on_train_batch_end(self, trainer: Any, *rest: Any) -> None:
+        if trainer.global_step in INTERRUPTED.values():
+            trainer.save_checkpoint(self.folder / f"{trainer.global_step}.ckpt")
+        super().on_train_batch_end(trainer, *rest)
+
+
+MAKE: dict[str, Callable[[], PlaceRecognitionTask]] = {
+    "spectral": lambda: spectral(0.0),
+    "rate": lambda: spectral(1.0),
+    "code": code,
+    "plain": templates,
+}
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A folder for each kind of training."""
+    return {name: tmp_path_factory.mktemp(name) for name in MAKE}
+
+
+@pytest.fixture(scope="module")
+def maps(folders: dict[str, Path]) -> Callable[[str], dict[str, Tensor]]:
+    """The map of a training that was not interrupted."""
+    return cache(lambda name: tensors(run(folders[name] / "whole", MAKE[name], None)))
+
+
+@pytest.fixture(scope="module")
+def parts(folders: dict[str, Path]) -> Callable[[str], Path]:
+    """Where the checkpoints of one that was lie."""
+
+    @cache
+    def interrupted(name: str) -> Path:
+        run(folders[name] / "first", MAKE[name], None, Keep(folders[name]))
+        return folders[name]
+
+    return interrupted
+
+
+def assert_same(again: dict[str, Tensor], whole: dict[str, Tensor]) -> None:
     assert whole.keys() == again.keys()
     for name, value in whole.items():
         assert torch.allclose(again[name].double(), value.double(), rtol=1e-4, atol=1e-5), name
 
 
-def test_a_step_that_was_broken_off_is_taken_again(tmp_path: Path) -> None:
-    whole = tensors(run(tmp_path / "whole", lambda: spectral(1.0), None))
+@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize("step", INTERRUPTED.values(), ids=INTERRUPTED)
+def test_it_ends_in_the_same_map(tmp_path: Path, maps: Any, parts: Any, name: str, step: int) -> None:
+    again = run(tmp_path / "again", MAKE[name], parts(name) / f"{step}.ckpt")
+    assert_same(tensors(again), maps(name))
+
+
+def test_a_step_that_was_broken_off_is_taken_again(tmp_path: Path, maps: Any) -> None:
     part = tmp_path / "part.ckpt"
     with pytest.raises(RuntimeError, match="power cut"):
-        run(tmp_path / "first", lambda: spectral(1.0), None, Break(6, part))
-    again = tensors(run(tmp_path / "again", lambda: spectral(1.0), part))
-    for name, value in whole.items():
-        assert torch.allclose(again[name].double(), value.double(), rtol=1e-4, atol=1e-5), name
+        run(tmp_path / "first", MAKE["rate"], None, Break(BROKEN, part))
+    assert_same(tensors(run(tmp_path / "again", MAKE["rate"], part)), maps("rate"))
 
 
 @pytest.mark.parametrize(
@@ -98,21 +139,19 @@ def test_a_step_that_was_broken_off_is_taken_again(tmp_path: Path) -> None:
         lambda random: random.update(views=torch.zeros(7, dtype=torch.uint8)),
     ],
 )
-def test_damaged_random_numbers_are_refused(tmp_path: Path, change: Callable[[Any], Any]) -> None:
+def test_damaged_random_numbers_are_refused(tmp_path: Path, parts: Any, change: Callable[[Any], Any]) -> None:
     part = tmp_path / "part.ckpt"
-    run(tmp_path / "first", lambda: spectral(0.0), None, Stop(3, part))
-    checkpoint = torch.load(part, weights_only=True)
+    checkpoint = torch.load(parts("spectral") / "3.ckpt", weights_only=True)
     change(checkpoint["random"])
     torch.save(checkpoint, part)
     with refused("its random numbers are no state of torch's"):
-        run(tmp_path / "again", lambda: spectral(0.0), part)
+        run(tmp_path / "again", MAKE["spectral"], part)
 
 
 @pytest.mark.parametrize("routes", [7, None, ["a"], "one"])
-def test_damaged_routes_are_refused(tmp_path: Path, routes: Any) -> None:
+def test_damaged_routes_are_refused(tmp_path: Path, parts: Any, routes: Any) -> None:
     part = tmp_path / "part.ckpt"
-    run(tmp_path / "first", lambda: spectral(0.0), None, Stop(3, part))
-    checkpoint = torch.load(part, weights_only=True)
+    checkpoint = torch.load(parts("spectral") / "3.ckpt", weights_only=True)
     torch.save(checkpoint | {"routes": routes}, part)
     with refused(f"routes of the checkpoint are {routes}", "names and lengths"):
-        run(tmp_path / "again", lambda: spectral(0.0), part)
+        run(tmp_path / "again", MAKE["spectral"], part)
