@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.database.template_map import log_posterior
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -150,7 +148,7 @@ def test_features_that_spill_to_a_file_give_the_same_map(
     spilled: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain = template_model(batch_size=5).learn(pictures())
-    monkeypatch.setattr(model_module, "concatenate", partial(concatenate, in_memory=spilled))
+    monkeypatch.setattr(model_module, "IN_MEMORY", spilled)
     other = template_model(batch_size=5).learn(pictures())
     assert other.map.plan == plain.map.plan
     assert torch.equal(other.map.templates, plain.map.templates)

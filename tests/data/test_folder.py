@@ -221,7 +221,7 @@ def test_a_folder_of_folders_is_told(tmp_path: Path) -> None:
 
 def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
     write(tmp_path, *(f"{j}.png" for j in range(10)))
-    for broken in (0, 4, 9):
+    for broken in (4, 9):  # the first one tells how large frames are
         (tmp_path / f"{broken}.png").write_bytes(b"")
     folder = ImageFolder(tmp_path)
     assert torch.cat(list(folder.select(range(1, 9, 2), 3)))[:, 0, 0, 0].mul(255).tolist() == [1, 3, 5, 7]
