@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import signal
@@ -74,6 +75,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         path = item.path.relative_to(here) if item.path.is_relative_to(here) else item.path
         if str(path).startswith(SLOW) or path.suffix == ".ipynb":
             item.add_marker("slow")
+
+
+def pytest_collection_finish() -> None:
+    """Thousands of tests are objects by the million: let no garbage collection go through them again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -45,7 +45,7 @@ def code_on(
                 if len(failed) == FAILURES:
                     break
     if failed:
-        part, failure = failed[0]
+        part, failure = min(failed, key=lambda one: one[0].start)
         start, stop = coder.span(part)
         read = "" if failure.host is None else f", read on {failure.host}"
         more = f", and {len(failed) - 1} more such parts" if len(failed) > 1 else ""

@@ -179,6 +179,7 @@ def in_this_process(module: str, arguments: Any) -> dict[str, Any]:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scale, "in_process", in_this_process)
+    monkeypatch.setattr(scale, "give_back", lambda: None)  # of a process of its own
     for name, value in {
         "RENDERED": 600,
         "SHUFFLED": 600,
