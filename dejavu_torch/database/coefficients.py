@@ -44,12 +44,26 @@ def coefficients_of(small: Tensor, escapes: Tensor) -> Coefficients:
                      feature=tensor([2, 0, 1], dtype=torch.uint8),
                      level=tensor([ 5, -1,  2], dtype=torch.int8))
     """
+    return with_escapes(nonzero_of(small), escapes)
+
+
+def nonzero_of(small: Tensor) -> Coefficients:
+    """`coefficients_of` of levels (W,K) int8 in which escapes are marked."""
     width, parts = small.shape[1], []
     for rows in small.split(max(1, AT_ONCE // max(1, width))):
         there = rows != 0
         counts = there.sum(1).to(_type_for(width))
         parts.append(Coefficients(counts, there.nonzero()[:, 1].to(_type_for(width - 1)), rows[there]))
-    counts, feature, level = (torch.cat(column) for column in zip(*parts, strict=True))
+    return joined(parts)
+
+
+def with_escapes(marked: Coefficients, escapes: Tensor) -> Coefficients:
+    """The coefficients with the escapes (E,) int32 where `nonzero_of` has their marks.
+
+    Raises:
+        InputError: other escapes than there are marks.
+    """
+    counts, feature, level = marked
     marks = level == ESCAPE
     if int(marks.sum()) != len(escapes) or bool((escapes.abs() <= 127).any()):
         raise InputError(

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.database.codec import (
-    ESCAPE,
     Stream,
     check_claim,
     decode,
@@ -31,6 +30,8 @@ from dejavu_torch.database.coefficients import (
     joined,
     levels_of,
     lines_of,
+    nonzero_of,
+    with_escapes,
 )
 from dejavu_torch.database.place_map import Mapper, PlaceMap
 from dejavu_torch.database.quantisation import RouteLines, dead_zone, quantise
@@ -49,7 +50,6 @@ BLOCK = 2**19  # numbers made at a time: they stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk made at a time, which is gone through for each
 ROWS = 2**14  # of descriptors, looked at together
 COPIES = 4  # numbers held for a place of a long chunk and a query: line, transform, score, is it best
-TOGETHER = 32  # chunks decoded before theirs are joined: many small tensors would split up the heap
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
 LINE_COST = 150  # of a coded line in a query's sum
@@ -104,20 +104,19 @@ def _decoded(streams: Sequence[Stream], lengths: list[int], escapes: Tensor, col
     """
     check_sizes(sum(lengths))
     check_claim(max(lengths), columns)
-    whole: list[Coefficients] = []
-    parts: list[Coefficients] = []
-    used = total = 0
+    # many small tensors, each made beside large ones that go, would leave the heap full of holes
+    held = [bytearray() for _ in Coefficients._fields]
     for stream, length in zip(streams, lengths, strict=True):
-        small = decode(stream, length, columns)
-        marks = int((small == ESCAPE).sum())
-        parts.append(coefficients_of(small, escapes[used : used + marks]))
-        used, total = used + marks, total + len(parts[-1].level)
-        check_sizes(sum(lengths), total)
-        if len(parts) == TOGETHER:
-            whole, parts = [*whole, joined(parts)], []
-    if used != len(escapes):
-        raise InputError(f"{len(escapes)} escapes; expected {used}")
-    return joined([*whole, *parts])
+        part = nonzero_of(decode(stream, length, columns))
+        for buffer, column in zip(held, part, strict=True):
+            buffer += column.numpy().data
+        check_sizes(sum(lengths), len(held[-1]))
+    types = (column.dtype for column in part)
+    marked = [
+        torch.frombuffer(buffer, dtype=dtype) if buffer else torch.empty(0, dtype=dtype)
+        for buffer, dtype in zip(held, types, strict=True)
+    ]
+    return with_escapes(Coefficients(*marked), escapes)
 
 
 def _streams_of(tensors: dict[str, Tensor]) -> list[Stream]:

@@ -125,7 +125,8 @@ def scan(route: PlaceMap, queries: Tensor, n: int) -> Best:
 
     Shape: (Q,K) -> Best of (Q,n).
     """
-    parts = []
+    # a few small tensors for each query, made beside large ones that go, would leave the heap full of holes
+    found, done = none_yet(queries, n), 0
     for some in queries.split(max(1, SCORES_AT_ONCE // max(1, route.block_places))):
         best: Best | None = None
         for start, scores in route.score_blocks(some):
@@ -133,8 +134,11 @@ def scan(route: PlaceMap, queries: Tensor, n: int) -> Best:
                 best = lowest(scores, n, start)
             else:
                 best = improved(none_yet(some, n) if best is None else best, scores, start)
-        parts.append(none_yet(some, n) if best is None else best)
-    return _joined(parts)
+        if best is not None:
+            for column, part in zip(found, best, strict=True):
+                column[done : done + len(some)] = part
+        done += len(some)
+    return found
 
 
 class Bound:
@@ -155,19 +159,19 @@ class Bound:
     def __init__(self, route: SpectralMap) -> None:
         self.metric = route.metric
         self.low = _low_lines(route)
-        residual, least, most, silent = [], [], [], []
+        # one small tensor for each chunk, made beside large ones that go, would leave the heap full of holes
+        self.residual, self.least, self.most = (route.steps.new_empty(len(route.chunks)) for _ in range(3))
+        self.silent = torch.zeros_like(self.residual, dtype=torch.bool)
         for g, (start, stop) in enumerate(route.chunks):
             samples = self.low.rebuilt(g)
             nearest = _nearest_sample(stop - start, len(samples), route.transform)
             norms = route.norms[start:stop]
             heard = norms > route.audible
             away = route.rebuilt(g) - samples[nearest.to(samples.device)]
-            residual.append(torch.linalg.vector_norm(away, dim=1).max())
-            least.append(torch.where(heard, norms, math.inf).min())
-            most.append(norms.max())
-            silent.append(~heard.all())
-        columns = (residual, least, most, silent)
-        self.residual, self.least, self.most, self.silent = (torch.stack(column) for column in columns)
+            self.residual[g] = torch.linalg.vector_norm(away, dim=1).max()
+            self.least[g] = torch.where(heard, norms, math.inf).min()
+            self.most[g] = norms.max()
+            self.silent[g] = ~heard.all()
 
     def __call__(self, queries: Tensor) -> Tensor:
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
