@@ -44,6 +44,14 @@ def matches(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def refuses(folder: Path, capsys: pytest.CaptureFixture[str], said: list[str], *words: str) -> None:
+    """A command fails in a line that says so, and leaves all files as they were."""
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    error = fails(capsys, *words)
+    assert [one for one in said if one not in error] == [], error
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
 def test_a_map_grows_in_its_own_file_or_in_another(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -126,10 +134,7 @@ def test_what_is_refused_leaves_the_map(
     said: list[str],
 ) -> None:
     monkeypatch.chdir(folder)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    error = fails(capsys, "learn", *words.split())
-    assert [one for one in said if one not in error] == [], error
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    refuses(folder, capsys, said, "learn", *words.split())
 
 
 # maps of several routes
@@ -239,11 +244,8 @@ def test_what_cannot_be_merged_or_done_with_several_routes(
     monkeypatch.chdir(folder)
     (folder / "r.csv").write_text("query,place,score,route\n0,0,.1,first\n1,3,.1,other\n2,-1,inf,\n")
     (folder / "p.csv").write_text("query,place,score\n0,0,.1\n")
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
     more = () if words.split()[0] != "merge" or "--map" in words else ("--map", "new.safetensors")
-    error = fails(capsys, *words.split(), *more)
-    assert [one for one in said if one not in error] == [], error
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    refuses(folder, capsys, said, *words.split(), *more)
 
 
 def test_a_route_that_no_answer_is_on_is_told(
@@ -338,7 +340,4 @@ def test_what_cannot_be_averaged(
 ) -> None:
     monkeypatch.chdir(folder)
     np.save(folder / "e.npy", np.load(folder / "d.npy"))
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    error = fails(capsys, "learn", *words.split())
-    assert [one for one in said if one not in error] == [], error
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    refuses(folder, capsys, said, "learn", *words.split())
