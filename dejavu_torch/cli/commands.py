@@ -982,7 +982,7 @@ def _with_calibration(
 
 
 def _check_calibration(model: DejaVu, traverse: Traverse, calibration: str | None, told: str) -> None:
-    """Refuse a precision, told by its name, that nothing will tell of."""
+    """Refuse a precision that nothing can be calibrated for; `told` is how a message names it."""
     if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
         seen = f"{told} and {traverse.name}, which has no frames to calibrate by"
         raise InputError(f"{seen}; expected --calibration SOURCE, or --threshold in place of the precision")
