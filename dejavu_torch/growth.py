@@ -71,7 +71,7 @@ def append(
         tensor([ 50, 450])
     """
     route = growing(model)
-    added = model.resample(as_traverse(traverse), model.step, progress)
+    added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_alike(model, added)
     before, places = route.coded(), added.count()
     frames = len(added.positions) if isinstance(added, ResampledTraverse) else places
@@ -190,7 +190,7 @@ def shown_on_map(model: DejaVu, traverse: Traverse, truth: str | None = None) ->
         InputError: nothing says which places the frames show, or they show none.
     """
     route = one_route(model)
-    traverse = model.resample(traverse, model.step)
+    traverse = model.resample(traverse, model.step, shape=model.frame_shape)
     frames, shown = len(route.positions) or route.places, traverse.count()
     resampled = model.step is not None
     numbers = traverse.frame if isinstance(traverse, ResampledTraverse) else shown

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from dejavu_torch.data.arrays import ArrayTraverse, as_traverse
+from dejavu_torch.data.fitted import at_size
 from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
@@ -48,6 +49,7 @@ from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Search, Searcher, check_scanned, check_search
+from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
 from dejavu_torch.streaming import sample as streaming
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread, with_visits
 from dejavu_torch.streaming.sample import sample_of
@@ -486,7 +488,7 @@ class DejaVu(nn.Module):
         Raises:
             InputError: nothing says which places it shows, or it shows none.
         """
-        second = self.resample(second, getattr(reference, "step", None))
+        second = self.resample(second, getattr(reference, "step", None), shape=reference.frame_shape)
         frames, shown = reference.count(), second.count()
         found = ground_truth_of(truth, reference, second, frames, shown)
         if found is None:
@@ -536,9 +538,53 @@ class DejaVu(nn.Module):
             seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
             raise InputError(f"{seen} to learn from {name}; expected one that is learned")
 
-    def resample(self, traverse: Traverse, step: float | None = None, progress: bool = False) -> Traverse:
-        """`resampled` by the model's `velocity`; of queries, `step` is the map's, `self.step`."""
-        return resampled(traverse, self.velocity, self.batch_size, step, progress)
+    def resample(
+        self,
+        traverse: Traverse,
+        step: float | None = None,
+        progress: bool = False,
+        shape: tuple[int, ...] | None = None,
+    ) -> Traverse:
+        """A traverse as the model takes it: `fit`, then `resampled` by the model's `velocity`.
+
+        Args:
+            step, shape: of queries those of the map, `self.step` and `self.frame_shape`; None of a reference.
+        """
+        return resampled(self.fit(traverse, shape), self.velocity, self.batch_size, step, progress)
+
+    def fit(self, traverse: Traverse, shape: tuple[int, ...] | None = None) -> Traverse:
+        """Frames at the size of the map's, or of `preprocess.size`; images and videos are decoded at it.
+
+        Args:
+            shape: (C,H,W) of the map's frames, or of the reference's. Frames of another aspect ratio, by over
+                5 %, stay as they are. None is a reference: the longer side of its frames is reduced to
+                `preprocess.size`, less where the features resize frames to more, and not at all where the
+                source asks for a size, such as `clip.mp4?width=320`.
+
+        Returns:
+            The traverse itself where its frames, or ready features, have that size.
+        """
+        own = traverse.frame_shape
+        if len(own) != 3 or isinstance(traverse, ResampledTraverse):
+            return traverse
+        height, width = own[1:]
+        if shape is None:
+            needed = getattr(self.features, "resize", None)
+            longest = None if traverse.sized else self.preprocess.size
+            size, why = reduced_size((height, width), longest, needed), "see preprocess.size"
+        else:
+            size, why = _size_like((height, width), shape), "as the map's"
+        if size == (height, width):
+            return traverse
+        seen = f"frames of {height} x {width} pixels"
+        log.warning("%s: %s are brought to %d x %d, %s", traverse.name, seen, *size, why)
+        return at_size(traverse, size)
+
+    def fit_frames(self, frames: Tensor) -> Tensor:
+        """As `fit`, of a batch of queries: frames (B,C,H,W) at the size of the map's."""
+        if frames.ndim != 4 or self.frame_shape is None:
+            return frames
+        return resize_frames(frames, _size_like((frames.shape[2], frames.shape[3]), self.frame_shape))
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
         """As `learn`, from descriptors that are there already.
@@ -624,9 +670,10 @@ class DejaVu(nn.Module):
         if views is None:
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
+            reference = self.fit(as_traverse(reference), self.frame_shape or ())
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
             places = torch.arange(self.map.places) if places is None else places
-            stretches = Stretches(as_traverse(reference), len(places), strengths, places=self.map.places)
+            stretches = Stretches(reference, len(places), strengths, places=self.map.places)
             views, length = Views(stretches, places[stretches.places]), stretches.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
@@ -672,6 +719,7 @@ class DejaVu(nn.Module):
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
+        queries = self.fit_frames(queries) if isinstance(queries, Tensor) else queries
         features = features_of(queries, self.describe, "the query")
         self.check_queries(tuple(queries.shape[1:]), features.shape[1], "the query")
         return self.map.scores(self.whitened(features))
@@ -805,11 +853,11 @@ class DejaVu(nn.Module):
         self, queries: Traverse | Tensor, progress: str | None, sequence: SequenceModel | None
     ) -> Iterator[Tensor]:
         """Descriptors of queries that fit the map, in batches; resampled as the map's places are."""
-        queries = as_traverse(queries)
+        queries = self.fit(as_traverse(queries), self.frame_shape or ())
         if sequence is not None:
             sequence.check(queries.length, self.map.places)
         if self.step is not None:
-            queries = self.resample(queries, self.step, progress is not None)
+            queries = self.resample(queries, self.step, progress is not None, self.frame_shape)
         shape = queries.frame_shape
         for i, features in enumerate(self._features(queries, progress)):
             if i == 0:
@@ -1084,6 +1132,12 @@ def check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
         )
         raise InputError(f"{seen}; expected as many, as frames of one size give")
     return counts[0]
+
+
+def _size_like(own: tuple[int, int], shape: tuple[int, ...]) -> tuple[int, int]:
+    """The size of frames of a shape (C,H,W), for frames of one aspect ratio with it; else their own."""
+    same = len(shape) == 3 and not is_stretched(own, (shape[1], shape[2]))
+    return (shape[1], shape[2]) if same else own
 
 
 def check_precision(precision: float | None) -> None:

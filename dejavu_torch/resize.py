@@ -10,6 +10,7 @@ from torch.nn.functional import interpolate
 from dejavu_torch.types import InputError
 
 MOST_PIXELS = 2**26  # of a frame: a number in a file or an option can be any
+STRETCHED = 1.05  # the ratio of the sides may change by this factor
 
 
 def check_size(size: tuple[int, int], least: int, what: str) -> None:
@@ -44,3 +45,28 @@ def resize_frames(frames: Tensor, size: tuple[int, int] | None) -> Tensor:
     if size is None or tuple(frames.shape[-2:]) == tuple(size):
         return frames
     return interpolate(frames, (size[0], size[1]), mode="bilinear", antialias=True)
+
+
+def is_stretched(own: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether another size (height, width) changes the aspect ratio of frames by over 5 %."""
+    ratio = own[0] * size[1] / (own[1] * size[0])
+    return not 1 / STRETCHED < ratio < STRETCHED
+
+
+def reduced_size(
+    own: tuple[int, int], longest: int | None, least: tuple[int, int] | None = None
+) -> tuple[int, int]:
+    """The size (height, width) of frames whose longer side is to have at most `longest` pixels.
+
+    Args:
+        own: their size. longest: None keeps it. least: of each side, such as what a network needs.
+
+    Example:
+        >>> reduced_size((540, 960), 160), reduced_size((540, 960), 160, (224, 224))
+        ((90, 160), (224, 398))
+    """
+    if longest is None:
+        return own
+    needed = (0, 0) if least is None else least
+    scale = max(longest / max(own), needed[0] / own[0], needed[1] / own[1])
+    return own if scale >= 1 else (max(1, round(scale * own[0])), max(1, round(scale * own[1])))

@@ -46,12 +46,14 @@ class Traverse(ABC):
         place: (N,) float64, the true position of each frame in units of reference frames,
             or None where it is unknown.
         seeks: whether `between` reads nothing ahead of the first frame that is asked for.
+        sized: whether the size of the frames was asked for, as by `width=` of a video.
     """
 
     name: str = "traverse"
     length: int | None = None
     place: Tensor | None = None
     seeks: bool = False
+    sized: bool = False
 
     @abstractmethod
     def batches(self, size: int) -> Iterator[Tensor]:

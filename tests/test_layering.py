@@ -45,7 +45,7 @@ ARROWS = {
     "recognition": "types database",
     "motion": "data memory types",
     "streaming": "types data features database",
-    "model": "types text version data features periods database recognition motion streaming",
+    "model": "types text version resize data features periods database recognition motion streaming",
     "growth": "types data features database streaming model motion",
     "cluster": "types text data database recognition streaming",
     "live": "types data features recognition model",

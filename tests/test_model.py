@@ -10,14 +10,17 @@ from typing import Any
 import pytest
 import torch
 from helpers import Fixed, refused, template_model
+from PIL import Image
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.source import open_source
 from dejavu_torch.database.template_map import log_posterior
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match
@@ -390,7 +393,7 @@ def test_queries_are_read_as_they_are_matched() -> None:
     matches = model.matches(stream)
     assert next(matches).index.tolist() == [0, 1, 2, 3]
     before = stream.given
-    assert before <= 3
+    assert before <= 4
     assert next(matches).index.tolist() == [4, 5, 6, 7]
     assert stream.given == before + 1
 
@@ -455,6 +458,44 @@ def test_frames_of_another_size_are_refused() -> None:
         model.localize(torch.rand(3, 1, 32, 32))
     with refused("8 x 8", "16 x 16"):
         model.localize(torch.rand(3, 1, 8, 8))
+
+
+def test_large_frames_are_reduced_and_queries_follow(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    small = torch.rand(24, 1, 20, 40, generator=torch.Generator().manual_seed(0))
+    large = nn.functional.interpolate(small, scale_factor=8, mode="nearest")  # 160 x 320
+    model = DejaVu(HOG(cell=4), Whitening(views=1)).learn(large)
+    assert model.frame_shape == (1, 80, 160)
+    assert [text for text in caplog.messages if "160 x 320 pixels are brought to 80 x 160" in text]
+    model.save(tmp_path / "map.safetensors")
+    for known in (model.eval(), DejaVu.load(tmp_path / "map.safetensors")):
+        for frames in (large, large[..., ::2, ::2], nn.functional.interpolate(small, scale_factor=3)):
+            assert known.localize(frames).index.tolist() == [*range(24)]
+            assert known(frames).argmin(1).tolist() == [*range(24)]
+    views = model.places_shown(model.fit(ArrayTraverse(large)), ArrayTraverse(large))
+    assert views.traverse.frame_shape == (1, 80, 160)
+    large.requires_grad_()
+    model(large[:1]).sum().backward()
+    assert large.grad is not None
+    assert large.grad.isfinite().all()
+
+
+def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for i in range(3):
+        Image.new("L", (400, 200), 40 * i).save(images / f"{i}.png")
+    model = DejaVu()
+    assert model.fit(open_source(images)).frame_shape == (1, 80, 160)
+    assert model.fit(open_source(f"{images}?start=1")).frame_shape == (1, 80, 160)
+    assert model.fit(open_source(f"{images}?width=300&start=1")).frame_shape == (1, 150, 300)
+    assert DejaVu(HOG(resize=(100, 100))).fit(open_source(images)).frame_shape == (1, 100, 200)
+    assert DejaVu(preprocess=Preprocess(size=None)).fit(open_source(images)).frame_shape == (1, 200, 400)
+    assert DejaVu(preprocess=Preprocess(size=50)).fit(open_source(images)).frame_shape == (1, 25, 50)
+    for size in (0, 1.5):
+        with refused("size is", "at least 1"):
+            Preprocess(size=size)  # type: ignore[arg-type]
 
 
 def test_frames_on_a_map_of_ready_features_are_refused() -> None:

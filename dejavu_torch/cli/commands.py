@@ -157,7 +157,8 @@ def run_learn(
     _check_average(average, average_truth, sources, calibration)
     visits: Views | None = None
     if sources:
-        traverse = model.resample(chained([open_source(one) for one in sources]), model.step, progress=True)
+        chain = chained([open_source(one) for one in sources])
+        traverse = model.resample(chain, model.step, True, model.frame_shape)
         _print_steps(traverse)
         traverse, views = _with_second(model, traverse, second, second_truth)
         if average is not None:
@@ -277,7 +278,7 @@ def run_localize(
         check_candidates(top, APART, model.map.places)
     query = open_source(source)
     if model.step is not None:
-        query = model.resample(query, model.step, progress=True)
+        query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
     matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold, search_every)
     if matcher is not None:
@@ -952,7 +953,7 @@ def _with_second(
     traverse = open_source(second)
     if query is not None and _same_as(traverse, [query]):
         raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
-    reference = model.resample(reference, progress=True)
+    reference = model.resample(reference, progress=True, shape=model.frame_shape)
     return reference, model.views(reference, traverse, truth)
 
 
@@ -976,8 +977,9 @@ def _with_calibration(
     same = _same_as(traverse, [*parts_of(source_of(reference)), *([] if query is None else [query])])
     if same is not None:
         raise InputError(f"--calibration {source} is {same.name} itself; expected another traverse")
+    reference = model.resample(reference, model.step, True, model.frame_shape)
+    traverse = model.fit(traverse, reference.frame_shape)
     check_sizes(model, reference, traverse)
-    reference = model.resample(reference, model.step, progress=True)
     return reference, model.places_shown(reference, traverse, truth)
 
 

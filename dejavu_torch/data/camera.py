@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.data.folder import check_pixels
 from dejavu_torch.data.video import FORMATS, pixels_of
-from dejavu_torch.resize import MOST_PIXELS
+from dejavu_torch.resize import MOST_PIXELS, is_stretched
 from dejavu_torch.text import one_line, printable
 from dejavu_torch.types import InputError, Traverse
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 PIPE = "-"  # standard input
 PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,rtmp,rtmps,rtmpt,srt,crypto,data"
 OPENING = 10.0  # seconds that an address may take to answer
-STRETCHED = 1.05  # a side may be so much longer beside the other than it was
 
 
 class Shot(NamedTuple):
@@ -177,10 +176,7 @@ def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> 
         >>> stretched("clip", (480, 640), (120, 160)), bool(stretched("clip", (480, 640), (90, 160)))
         ('', True)
     """
-    if size is None:
-        return ""
-    ratio = own[0] * size[1] / (own[1] * size[0])
-    if 1 / STRETCHED < ratio < STRETCHED:
+    if size is None or not is_stretched(own, size):
         return ""
     seen = f"frames of {own[0]} x {own[1]} pixels are brought to the map's {size[0]} x {size[1]}"
     return f"{name}: {seen}, which stretches them"

@@ -46,6 +46,7 @@ class Chain(Traverse):
                 raise InputError(f"{seen}; expected {told[1]} as {first.name}, which it follows")
         self.name = " + ".join(one.name for one in self.traverses)
         self.seeks = all(one.seeks for one in self.traverses)
+        self.sized = any(one.sized for one in self.traverses)
         lengths = [one.length for one in self.traverses]
         if None not in lengths:
             self.length = sum(length or 0 for length in lengths)

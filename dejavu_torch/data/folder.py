@@ -65,8 +65,8 @@ class ImageFolder(IndexedTraverse):
             )
             raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
         self.files = sorted(files, key=lambda file: natural(file.name))
-        self.width, self.height = width, height
-        self.name = printable(folder)
+        self.width, self.height, self.sized = width, height, bool(width or height)
+        self.path, self.name = folder, printable(folder)
         self.length = len(self.files)
         self._first: tuple[str, str] | None = None  # name and shape of the first image that was read
 
@@ -84,7 +84,7 @@ class ImageFolder(IndexedTraverse):
         return state_of(*self.files[start:stop])
 
     def _image(self, file: Path) -> Tensor:
-        image = read_image(file)
+        image = read_image(file, max(self.width, self.height))
         size = fitted_size(file, image.shape[1], image.shape[2], self.width, self.height)
         if size != image.shape[1:]:
             image = resize_frames(image[None], size)[0].clamp(0, 1)
@@ -132,10 +132,14 @@ def fitted_size(path: Path, rows: int, columns: int, width: int, height: int) ->
     return high, wide
 
 
-def read_image(path: Path) -> Tensor:
+def read_image(path: Path, least: int = 0) -> Tensor:
     """One image file as (C,H,W) float32 in [0, 1]; C is 1 for grey images, else 3.
 
     Of a file of several images it is the first.
+
+    Args:
+        least: pixels that each side needs, as the image is reduced afterwards: a JPEG is decoded at a half, a
+            quarter or an eighth of its size where that has as many. 0 decodes it whole.
 
     Raises:
         InputError: the file cannot be read as an image, has over 2^28 pixels, more than there is memory for,
@@ -145,6 +149,8 @@ def read_image(path: Path) -> Tensor:
         reading(path, "cannot be read as an image", "an image such as .png or .jpg"),
         Image.open(path, formats=FORMATS) as opened,
     ):
+        if least:
+            opened.draft(None, (least, least))
         check_pixels(path, opened.height, opened.width, MOST_READ)
         ImageOps.exif_transpose(opened, in_place=True)
         mode = opened.mode

@@ -75,7 +75,7 @@ class FrameRange(Traverse):
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
         if length is not None:
             self.length = len(self.frames)
-        self.seeks = traverse.seeks
+        self.seeks, self.sized = traverse.seeks, traverse.sized
         if traverse.place is not None:
             self.place = traverse.place[start : stop or None : self.frames.step].contiguous()
         self._least = len(self.frames) if stop else 1

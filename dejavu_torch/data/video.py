@@ -62,7 +62,7 @@ class Video(Traverse):
     def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
         self.path, self.name = Path(path), printable(path)
         check_size(self.path, width, height)
-        self.width, self.height = width, height
+        self.width, self.height, self.sized = width, height, bool(width or height)
         check_regular(self.path, "a video file")
         self._seconds: list[float] = []  # of the frames that were read so far
         self._complete = False  # whether these are all frames

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -12,8 +12,7 @@ from dejavu_torch.data.ground_truth import counted, is_right
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Picture, canvas
 from dejavu_torch.recognition.calibration import calibration_error
-from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+from dejavu_torch.types import GroundTruth, Match
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions that a report tells of
 BINS = 10
@@ -28,31 +27,6 @@ class Accepted(NamedTuple):
     asked: float
     precision: float | None
     kept: float
-
-
-class Fitted(Traverse):
-    """Frames brought to another shape (C,H,W): sizes are resized, colours made grey or grey ones repeated.
-
-    Raises:
-        InputError: ready features.
-    """
-
-    def __init__(self, traverse: Traverse, shape: tuple[int, ...]) -> None:
-        if len(traverse.frame_shape) != 3 or len(shape) != 3:
-            raise InputError(f"{traverse.name} has no frames of the map's kind; expected frames")
-        self.traverse, self.shape = traverse, shape
-        self.name, self.length = traverse.name, traverse.length
-
-    def batches(self, size: int) -> Iterator[Tensor]:
-        from kornia.color import rgb_to_grayscale  # kornia takes a second to import
-
-        channels, *sides = self.shape
-        for batch in self.traverse.batches(size):
-            frames = resize_frames(batch, (sides[0], sides[1]))
-            if frames.shape[1] != channels:
-                grey = rgb_to_grayscale(frames) if frames.shape[1] == 3 else frames
-                frames = grey.expand(-1, channels, -1, -1)
-            yield frames
 
 
 def rejection_facts(

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import UNNAMED, as_traverse
+from dejavu_torch.data.fitted import Fitted
 from dejavu_torch.data.ground_truth import (
     as_ground_truth,
     check_ground_truth,
@@ -30,7 +31,7 @@ from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqsl
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.rejection import Fitted, draw_reliability, rejection_facts
+from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
@@ -118,9 +119,11 @@ def compare(
     reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
     check_candidates(top, tolerance)
+    has_map = model.map.places > 0
+    reference = model.fit(reference, model.frame_shape if has_map else None)
+    query = model.fit(query, reference.frame_shape)
     features = check_sizes(model, reference, query)
     seconds: dict[str, float] = defaultdict(float)
-    has_map = model.map.places > 0
     work = "describe" if has_map else "learn"
     with timed(seconds, work):
         reference = model.resample(reference, model.step if has_map else None, progress)

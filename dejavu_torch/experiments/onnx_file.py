@@ -36,6 +36,7 @@ PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 METADATA = "dejavu_torch"  # the key of the file's metadata whose value is a JSON mapping
 MOST_BYTES = 2**31 - 2**24  # of the constants: protobuf writes files below 2 GB
 TOLERANCE = 1e-3  # of the file's scores beside torch's, relative above 1
+MOST_SIZE = 2**16  # frames of a batch, pixels of a side
 TRIED = 3  # frames that the file is tried on before it is kept
 LONGEST = 200  # characters of what torch says
 
@@ -79,6 +80,18 @@ class Rebuilt(nn.Module):
         return (length.square() - 2 * products + self.norms.square()).clamp(min=0)
 
 
+class Resized(nn.Module):
+    """Frames at the size of the map's: (B,C,any,any) -> (B,C,H,W)."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        super().__init__()
+        self.size = size
+
+    def forward(self, frames: Tensor) -> Tensor:
+        # also where they have that size, which changes nothing: a graph does not branch
+        return nn.functional.interpolate(frames, self.size, mode="bilinear", antialias=True)
+
+
 class Graph(nn.Module):
     """A model as what is exported: frames (B,C,H,W), or features (B,D), -> scores (B,N).
 
@@ -94,7 +107,10 @@ class Graph(nn.Module):
     def __init__(self, model: DejaVu, step: Step | None = None) -> None:
         super().__init__()
         parts: dict[str, nn.Module] = {}
-        if model.frame_shape is None or len(model.frame_shape) == 3:
+        shape = model.frame_shape or ()
+        if len(shape) == 3:
+            parts |= {"size": Resized((shape[1], shape[2]))}
+        if len(shape) != 1:
             parts |= {"preprocess": model.preprocess, "features": model.features}
         if model.whitening is not None and model.whitening.learned:
             whitening = copy.deepcopy(model.whitening)
@@ -119,9 +135,9 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         sequence: a `SequenceMatcher` or a `PlaceFilter`: the file then takes one frame at a time and the
             state behind the one before, and gives the state behind it; see `SequenceStep` and `FilterStep`.
 
-    Shape: `frames` (B,C,H,W) float32 in [0, 1], of the size of the map's -> `scores` (B,N), for any B. On a
-        map of ready features the input is `features` (B,D). With a sequence `frames` (1,C,H,W), `state` ->
-        `scores` (1,N), `next_state`.
+    Shape: `frames` (B,C,H,W) float32 in [0, 1] -> `scores` (B,N), for any B, H and W: frames of another size
+        than the map's are resized to it. On a map of ready features the input is `features` (B,D). With a
+        sequence `frames` (1,C,H,W), `state` -> `scores` (1,N), `next_state`.
 
     Convention: the metadata's entry "dejavu_torch" is JSON: the names and shapes of inputs and outputs, the
         places, the threshold where there is one, of single frames the calibration where there is one, the
@@ -164,7 +180,9 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
             inputs = noise[:1], step.start(model.map.places).to(device)
         try:
             names = [*facts["inputs"]], [*facts["outputs"]]
-            written = _serialised(_program(graph, inputs, names, step is None), facts)
+            free = {0: "batch"} if step is None else {}
+            free |= {2: "height", 3: "width"} if noise.ndim == 4 else {}
+            written = _serialised(_program(graph, inputs, names, free), facts)
             difference = _difference(written, graph, noise, facts)
         except Exception as error:  # of torch, onnx or onnxruntime, each of which has many
             raise _refusal(graph, noise, error) from error
@@ -221,16 +239,16 @@ def _require_packages() -> None:
 def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
     """The metadata; dimensions that are free have a name."""
     shape, places = list(model.frame_shape or ()), model.map.places
-    name = "frames" if len(shape) == 3 else "features"
+    name, taken = ("frames", [*shape[:1], "height", "width"]) if len(shape) == 3 else ("features", shape)
     facts: dict[str, Any] = {"version": dejavu_torch.__version__, "opset": OPSET, "places": places}
     facts |= {
         "frame_shape": shape,
-        "inputs": {name: ["batch", *shape]},
+        "inputs": {name: ["batch", *taken]},
         "outputs": {"scores": ["batch", places]},
     }
     if sequence is not None:
         first = step_of(sequence).start(places)
-        facts["inputs"] = {name: [1, *shape], "state": list(first.shape)}
+        facts["inputs"] = {name: [1, *taken], "state": list(first.shape)}
         facts["outputs"] = {"scores": [1, places], "next_state": list(first.shape)}
         facts |= {
             "first_state": "nan" if isinstance(sequence, SequenceMatcher) else "0",
@@ -246,12 +264,12 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
 
 
 def _program(
-    graph: nn.Module, inputs: tuple[Tensor, ...], names: tuple[list[str], list[str]], any_batch: bool
+    graph: nn.Module, inputs: tuple[Tensor, ...], names: tuple[list[str], list[str]], free: dict[int, str]
 ) -> Any:
-    """What `torch.onnx.export` makes of a module; `any_batch` leaves the first input's first size free."""
-    free = {0: torch.export.Dim("batch")} if any_batch else None
+    """What `torch.onnx.export` makes of a module; `free` names the sizes of the first input that may vary."""
     # not within torch.onnx.export, which would try other ways, some for one batch size only
-    shapes = (free, *[None] * (len(inputs) - 1))
+    sizes = {axis: torch.export.Dim(name, min=1, max=MOST_SIZE) for axis, name in free.items()}
+    shapes = (sizes or None, *[None] * (len(inputs) - 1))
     program = torch.export.export(graph, inputs, dynamic_shapes=shapes)
     return torch.onnx.export(
         program,
@@ -335,7 +353,7 @@ def _refusal(graph: Graph, frames: Tensor, error: Exception) -> InputError:
     for name, part in graph.parts.items():
         try:
             after = part(frames)
-            session_of(_serialised(_program(part, (frames,), (["input"], ["output"]), True), {}))
+            session_of(_serialised(_program(part, (frames,), (["input"], ["output"]), {0: "batch"}), {}))
         except Exception as own:
             return InputError(f"the {name}, {type(part).__name__}, cannot be exported: {_reason(own)}")
         frames = after

@@ -13,6 +13,7 @@ from dejavu_torch.types import InputError
 MOST_CLIP = 1e6
 Contrast = Literal["patch", "clahe"]
 COLOURS = "RGB"
+SIZE = 160  # pixels of the longer side of a frame, unless said otherwise
 FLAT = 1 / 255  # one step of an 8-bit image: a smaller standard deviation says nothing
 
 
@@ -207,6 +208,8 @@ class Preprocess(nn.Module):
         clip_limit: for "clahe": a grey level counts at most this many times as often as in a flat
             histogram; 0 is no limit.
         grid: (rows, columns) of tiles for "clahe".
+        size: pixels that the longer side of a traverse's frames is reduced to where it has more; None keeps
+            the frames' size. `DejaVu` does so as frames are read, ahead of all else; forward does not.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) where `channel` is None.
 
@@ -214,7 +217,7 @@ class Preprocess(nn.Module):
         a difference of channels d in [-1, 1] becomes (d + 1) / 2, in [0, 1].
 
     Raises:
-        InputError: an unknown channel or contrast, a bad patch, clip limit or grid; forward: frames
+        InputError: an unknown channel or contrast, a bad patch, clip limit, grid or size; forward: frames
             that do not fit them.
 
     Example:
@@ -229,15 +232,18 @@ class Preprocess(nn.Module):
         patch: int = 9,
         clip_limit: float = 2.0,
         grid: tuple[int, int] = (8, 8),
+        size: int | None = SIZE,
     ) -> None:
         super().__init__()
+        if size is not None and (not isinstance(size, int) or size < 1):
+            raise InputError(f"size is {size!r}; expected pixels of the longer side, at least 1, or null")
         if contrast is not None and contrast not in get_args(Contrast):
             raise InputError(f"contrast {contrast!r} is unknown; expected 'patch', 'clahe' or None")
         check_patch(patch)
         check_clahe(clip_limit, grid)
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
-        self.patch = patch
+        self.patch, self.size = patch, size
         self.clip_limit = float(clip_limit)
         self.grid = (int(grid[0]), int(grid[1]))  # a map gives a list
 
@@ -255,5 +261,5 @@ class Preprocess(nn.Module):
     def extra_repr(self) -> str:
         return (
             f"channel={self.channel!r}, contrast={self.contrast!r}, patch={self.patch}, "
-            f"clip_limit={self.clip_limit}, grid={self.grid}"
+            f"clip_limit={self.clip_limit}, grid={self.grid}, size={self.size}"
         )

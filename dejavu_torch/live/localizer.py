@@ -135,6 +135,7 @@ class LiveLocalizer:
 
     def _describe(self, batch: Tensor) -> Tensor:
         """The descriptor of a frame that fits the map, (1,K)."""
+        batch = self.model.fit_frames(batch)
         with in_mode(self._pipeline, False):
             features = features_of(batch, self._pipeline, "the frame")
         if batch.shape[1:] != self._shape:

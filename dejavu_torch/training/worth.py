@@ -6,11 +6,11 @@ import copy
 import logging
 from collections.abc import Mapping
 
+from dejavu_torch.data.fitted import Fitted
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.rejection import Fitted
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.matching import SINGLE
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse

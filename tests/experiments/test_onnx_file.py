@@ -96,6 +96,9 @@ def test_a_file_says_what_it_is(flights: tuple[Tensor, Tensor], tmp_path: Path) 
     with torch.no_grad():  # more frames than HOG takes at a time in torch, some of them flat
         frames = torch.cat([*[flights[1]] * 3, torch.zeros(2, 3, 32, 32)])
         torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
+        for size in ((48, 48), (20, 20)):  # brought to the map's
+            frames = torch.rand(2, 3, *size)
+            torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
 
 
 def test_other_parts_score_as_in_torch(flights: tuple[Tensor, Tensor], tmp_path: Path) -> None:
@@ -127,7 +130,8 @@ def assert_streams(
     """A file goes from state to state as a sequence model does; its facts."""
     session, (_, *shape) = session_of(str(file)), queries.shape
     facts = facts_of(session)
-    assert facts["inputs"] == {"features" if len(shape) == 1 else "frames": [1, *shape], "state": state}
+    given = {"features": [1, *shape]} if len(shape) == 1 else {"frames": [1, shape[0], "height", "width"]}
+    assert facts["inputs"] == {**given, "state": state}
     assert facts["outputs"] == {"scores": [1, route.map.places], "next_state": state}
     with torch.no_grad():
         (expected,) = model.stream([route(queries)])

@@ -131,7 +131,7 @@ def test_ready_features() -> None:
         (np.zeros((0, 32, 3), np.uint8), ("(0, 32, 3)", "nothing")),
         (torch.full(SHAPE, 2.0), ("2", "0 to 1")),
         (torch.full(SHAPE, math.nan), ("nan", "0 to 1")),
-        (np.zeros((48, 64, 3), np.uint8), ("48 x 64", "24 x 32")),
+        (np.zeros((64, 48, 3), np.uint8), ("64 x 48", "24 x 32")),
         ("photo.jpg", ("str", "uint8")),
         (7, ("int", "uint8")),
         (np.array("photo"), ("expected",)),
@@ -147,6 +147,13 @@ def test_what_is_no_frame_of_the_map_is_refused_and_changes_nothing(
     after = answers(localizer, drive[6:9])
     expected = answers(LiveLocalizer(spectral), drive[:9])
     assert [one[:6] for one in before + after] == [one[:6] for one in expected]
+
+
+def test_a_frame_of_another_size_is_brought_to_the_maps(spectral: DejaVu, drive: Tensor) -> None:
+    large = torch.nn.functional.interpolate(drive[:6], scale_factor=3, mode="nearest")
+    found = [one.place for one in answers(LiveLocalizer(spectral, None), large)]
+    assert found == spectral.localize(large).index.tolist()
+    assert found == [one.place for one in answers(LiveLocalizer(spectral, None), drive[:6])]
 
 
 def test_another_size_is_told_once(

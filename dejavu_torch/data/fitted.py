@@ -1,0 +1,82 @@
+"""Frames of a traverse brought to another size, as they are decoded where the reader can."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+
+from torch import Tensor
+
+from dejavu_torch.data.chain import Chain
+from dejavu_torch.data.folder import ImageFolder
+from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.video import Video
+from dejavu_torch.resize import resize_frames
+from dejavu_torch.types import InputError, Traverse
+
+
+class Fitted(Traverse):
+    """Frames brought to another shape (C,H,W): sizes are resized, colours made grey or grey ones repeated.
+
+    Raises:
+        InputError: ready features.
+    """
+
+    def __init__(self, traverse: Traverse, shape: tuple[int, ...]) -> None:
+        if len(traverse.frame_shape) != 3 or len(shape) != 3:
+            raise InputError(f"{traverse.name} has no frames of the map's kind; expected frames")
+        self.traverse, self.shape = traverse, shape
+        self.name, self.length, self.place = traverse.name, traverse.length, traverse.place
+        self.seeks, self.sized = traverse.seeks, True
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        return map(self._fit, self.traverse.batches(min(size, self.traverse.batch_size(size))))
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        return map(self._fit, self.traverse.between(start, stop))
+
+    def _fit(self, batch: Tensor) -> Tensor:
+        channels, height, width = self.shape
+        frames = resize_frames(batch, (height, width))
+        if frames.shape[1] == channels:
+            return frames
+        if frames.shape[1] == 3:
+            from kornia.color import rgb_to_grayscale  # kornia takes a second to import
+
+            frames = rgb_to_grayscale(frames)
+        return frames.expand(-1, channels, -1, -1)
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.shape
+
+    def identity(self) -> str:
+        return f"{self.traverse.identity()} {' x '.join(map(str, self.shape))}"
+
+    def state(self, start: int, stop: int) -> str:
+        return self.traverse.state(start, stop)
+
+    def frame_name(self, i: int) -> str:
+        return self.traverse.frame_name(i)
+
+    def frame_time(self, i: int) -> float:
+        return self.traverse.frame_time(i)
+
+
+def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
+    """The frames of a traverse at another size (height, width): images and videos are decoded at it.
+
+    Example:
+        >>> from dejavu_torch.data.source import open_source
+        >>> at_size(open_source("sim:aerial?frames=40"), (32, 32)).frame_shape
+        (3, 32, 32)
+    """
+    if isinstance(traverse, (Video, ImageFolder)):
+        return type(traverse)(traverse.path, width=size[1], height=size[0])
+    if isinstance(traverse, Chain):
+        return Chain([at_size(one, size) for one in traverse.traverses])
+    if isinstance(traverse, FrameRange):
+        part = copy.copy(traverse)
+        part.traverse, part.sized = at_size(traverse.traverse, size), True
+        return part
+    return Fitted(traverse, (traverse.frame_shape[0], *size))
