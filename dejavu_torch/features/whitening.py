@@ -21,6 +21,7 @@ PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
 COMPONENTS = 400  # that whitening works on
 VIEWS = 4  # of a frame, on a long route
 VIEWS_PER_COMPONENT = 30  # on any: what 4 views of each of 3000 frames are
+ENOUGH = 12  # views of a frame: more take time and change nothing
 SHRINKAGE = 0.03  # at least
 SPARE = 32  # further directions of the randomised subspace, which make it near the true one
 ROUNDS = 3  # of its iteration
@@ -130,7 +131,7 @@ class Whitening(nn.Module):
         numbers: K. None is 128, fewer on a short route (a quarter of its places), and at most the rank.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, and more where there are few views.
-        views: augmented copies of each frame. None is 4, and more on a short route: 30 for each component.
+        views: augmented copies of each frame. None is 4, and up to 12 on a short route: 30 for each component.
             Frames are drawn evenly where there would be more than `most_views`.
         most_views: copies in all.
         strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
@@ -249,7 +250,7 @@ class Whitening(nn.Module):
         if self.views is not None:
             return self.views
         components = min(frames, features, self.components)
-        return max(VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames))
+        return min(ENOUGH, max(VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames)))
 
     @torch.no_grad()
     def learn(self, places: Tensor, views: Iterable[tuple[Tensor, Tensor]] | None = None) -> None:

@@ -221,13 +221,8 @@ def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogC
 
 
 def test_short_routes_are_looked_at_more_often() -> None:
-    assert [Whitening().copies(frames, 1764) for frames in (60, 400, 1000, 3000, 90_000)] == [
-        30,
-        30,
-        12,
-        4,
-        4,
-    ]
+    frames = 60, 400, 1000, 2700, 3000, 90_000
+    assert [Whitening().copies(count, 1764) for count in frames] == [12, 12, 12, 5, 4, 4]
     assert Whitening().copies(400, 40) == 4  # 40 features have no more components
     assert Whitening(components=100).copies(400, 1764) == 8
     assert Whitening(views=2).copies(60, 1764) == 2
