@@ -38,7 +38,7 @@ from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
-from dejavu_torch.features.whitening import STRENGTHS, Whitening
+from dejavu_torch.features.whitening import STRENGTHS, WIDEST, Whitening
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.periods.finder import ForeignPeriods
@@ -108,7 +108,9 @@ class DejaVu(nn.Module):
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
         whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; "none"
-            keeps the features; None is Whitening ahead of a SpectralMapper, "none" ahead of templates.
+            keeps the features, though of ready ones of over 256 numbers a SpectralMapper gets the principal
+            components, as of `Whitening(views=0)`; None is Whitening ahead of a SpectralMapper, "none" ahead
+            of templates.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
         precision: accept a match instead where it is at least as probably right, above 0 and below 1; of a
@@ -232,6 +234,7 @@ class DejaVu(nn.Module):
             InputError: no frames, too few, NaN, or mixed sizes.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
+        self._reduce(traverse)
         text = "learning" if progress else None
         before = None if self.whitening is None else self.whitening.state_dict()
         try:
@@ -319,7 +322,7 @@ class DejaVu(nn.Module):
             descriptors = self._averaged(descriptors, shown)
         # what the file holds once counts for the sample by its share alone
         share, once = len(descriptors) / frames, 2 * descriptors.shape[1]
-        other = copy.copy(mapper.beside(round(share * taken - (1 - share) * once)))
+        other = copy.copy(mapper.beside(round(share * taken - (1 - share) * once), _is_ready(traverse)))
         other.chunk = sample.stretch
         with torch.no_grad():
             route = other(descriptors)
@@ -397,7 +400,7 @@ class DejaVu(nn.Module):
 
     def _say_reached(self, route: SpectralMap, taken: int) -> None:
         """What a long route takes, where the sample told wrongly."""
-        wanted, places = getattr(self.mapper, "route_bytes_per_place", None), route.places
+        wanted, places = getattr(self.mapper, "budget", None), route.places
         if wanted is None:
             return
         reached = (route.summary().route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
@@ -426,9 +429,10 @@ class DejaVu(nn.Module):
         Raises:
             InputError: as `learn`, or a second traverse that no whitening learns from.
         """
-        whitening = self.whitening
         if second is not None:
             self._require_learning_whitening(second.traverse.name)
+        self._reduce(traverse)
+        whitening = self.whitening
         spectral = isinstance(self.mapper, SpectralMapper)
         if whitening is not None and not whitening.fixed and spectral and self._has_many_features(traverse):
             sample = sample_of(traverse.count(), streaming.SAMPLE)
@@ -441,7 +445,7 @@ class DejaVu(nn.Module):
             return concatenate(batches, few, half=spectral and whitening is not None)
         device = self.map.positions.device
         features = concatenate(self._features(traverse, progress))
-        if second is None and len(traverse.frame_shape) == 3:
+        if second is None and not _is_ready(traverse) and whitening.views != 0:
             second = AugmentedTraverse(
                 traverse,
                 len(features),
@@ -457,6 +461,12 @@ class DejaVu(nn.Module):
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
         return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
+
+    def _reduce(self, traverse: Traverse) -> None:
+        """Ready features too wide for a spectral map become principal components without whitening, too."""
+        spectral = isinstance(self.mapper, SpectralMapper)
+        if self.whitening is None and spectral and _is_ready(traverse) and traverse.frame_shape[0] > WIDEST:
+            self.whitening = Whitening(views=0).to(self.map.positions.device)
 
     def _has_many_features(self, traverse: Traverse) -> bool:
         """Whether the features of a traverse are too many to be held, so that a sample has to do."""
@@ -555,7 +565,7 @@ class DejaVu(nn.Module):
                 features.shape[1],
             )
         names, positions = self._beside(traverse, len(features))
-        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names))
+        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names), _is_ready(traverse))
         with torch.no_grad():
             route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
         if route.places != len(features) or route.dimension != features.shape[1]:
@@ -1094,6 +1104,11 @@ def check_precision(precision: float | None) -> None:
     """
     if precision is not None and not 0 < precision < 1:
         raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
+
+
+def _is_ready(traverse: Traverse | None) -> bool:
+    """Whether a traverse is known to hold ready features, not frames."""
+    return traverse is not None and len(traverse.frame_shape) == 1
 
 
 def _stretches_of(views: Views, length: int, most: int) -> Views:
