@@ -128,8 +128,8 @@ class Whitening(nn.Module):
     second traverse.
 
     Args:
-        numbers: K. None is 128, fewer on a short route (a quarter of its places), 256 without views, and at most
-            the rank.
+        numbers: K. None is 128, fewer on a short route (a quarter of its places); without views 256;
+            at most the rank.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, and more where there are few views.
         views: augmented copies of each frame, 0 for none. None is 4, and more on a short route: 30 for each
