@@ -32,7 +32,13 @@ from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.database.weights import BITS, is_rounded, packed, round_weights, unpacked
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.extract import check_queries, feature_batches, features_of
+from dejavu_torch.features.extract import (
+    check_alone,
+    check_queries,
+    feature_batches,
+    features_of,
+    warn_of_bright,
+)
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.pixels import PatchPixels
@@ -222,16 +228,16 @@ class DejaVu(nn.Module):
             visits: see `growth.learn_mean`.
 
         Returns:
-            self, with the map in `self.map`. A route in which nothing repeats gives a template map without
-            layers, on which every place scores +inf. Features beyond `concatenate`'s share of the memory
-            spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
+            self, in eval mode, with the map in `self.map`. A route in which nothing repeats gives a template
+            map without layers, on which every place scores +inf. Features beyond `concatenate`'s share of
+            the memory spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
 
         Convention: of a route of over `SAMPLE` frames a spectral map with an integer chunk learns whitening,
             mean and step from a sample of them, see `sample_of`, and its chunks are made one by one. Memory
             holds a chunk, the sample and the map, whatever the number of frames.
 
         Raises:
-            InputError: no frames, too few, NaN, or mixed sizes.
+            InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
         self._reduce(traverse)
@@ -440,11 +446,11 @@ class DejaVu(nn.Module):
             self.describe_reference(part, second and sample.views(second), progress and "sampling")
             return concatenate(self.extract(traverse, progress), FEW_DESCRIPTORS, half=True)
         if whitening is None or whitening.fixed:
-            batches = self.extract(traverse, progress)
+            batches = self.extract(traverse, progress, self._look_at(traverse))
             few = FEW_DESCRIPTORS if spectral else IN_MEMORY
             return concatenate(batches, few, half=spectral and whitening is not None)
         device = self.map.positions.device
-        features = concatenate(self._features(traverse, progress))
+        features = concatenate(self._features(traverse, progress, self._look_at(traverse)))
         if second is None and not _is_ready(traverse) and whitening.views != 0:
             second = AugmentedTraverse(
                 traverse,
@@ -467,6 +473,15 @@ class DejaVu(nn.Module):
         spectral = isinstance(self.mapper, SpectralMapper)
         if self.whitening is None and spectral and _is_ready(traverse) and traverse.frame_shape[0] > WIDEST:
             self.whitening = Whitening(views=0).to(self.map.positions.device)
+
+    def _look_at(self, traverse: Traverse) -> Callable[[Tensor, Tensor], None]:
+        """What the first batch of a reference is checked by."""
+
+        def look(frames: Tensor, features: Tensor) -> None:
+            warn_of_bright(frames, traverse.name)
+            check_alone(self.pipeline, frames, features, traverse.name)
+
+        return look
 
     def _has_many_features(self, traverse: Traverse) -> bool:
         """Whether the features of a traverse are too many to be held, so that a sample has to do."""
@@ -551,7 +566,7 @@ class DejaVu(nn.Module):
         return resampled(traverse, self.velocity, self.batch_size, step, progress)
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
-        """As `learn`, from descriptors that are there already.
+        """As `learn`, from descriptors that are there already. It ends in eval mode.
 
         Args:
             features: (N,K) float, whitened where the model whitens.
@@ -596,7 +611,7 @@ class DejaVu(nn.Module):
         step = traverse.step if isinstance(traverse, ResampledTraverse) else None
         self.map, self.step, self.frame_names, self._searcher = route, step, names, None
         self.frame_shape, self.trained, self.calibration = shape or None, None, None
-        return self
+        return self.eval()
 
     def calibrate(
         self,
@@ -821,9 +836,12 @@ class DejaVu(nn.Module):
         if self.step is not None:
             queries = self.resample(queries, self.step, progress is not None)
         shape = queries.frame_shape
-        for i, features in enumerate(self._features(queries, progress)):
-            if i == 0:
-                self.check_queries(shape, features.shape[1], queries.name)
+
+        def look(frames: Tensor, features: Tensor) -> None:
+            self.check_queries(shape, features.shape[1], queries.name)
+            warn_of_bright(frames, queries.name)
+
+        for features in self._features(queries, progress, look):
             yield self.whitened(features)
 
     def matching(self, sequence: SequenceModel | None, search: Search = "auto") -> Matching:
@@ -896,13 +914,24 @@ class DejaVu(nn.Module):
         """Find best places by a searcher of the map that is made already, such as one of a cluster."""
         self._searcher = searcher
 
-    def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
-        """Descriptors of a traverse in batches (B,K), without gradients."""
-        return map(self.whitened, self._features(traverse, progress))
+    def extract(
+        self,
+        traverse: Traverse,
+        progress: str | None = None,
+        look: Callable[[Tensor, Tensor], None] | None = None,
+    ) -> Iterator[Tensor]:
+        """Descriptors of a traverse in batches (B,K), without gradients; `look` as of `feature_batches`."""
+        return map(self.whitened, self._features(traverse, progress, look))
 
-    def _features(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
+    def _features(
+        self,
+        traverse: Traverse,
+        progress: str | None = None,
+        look: Callable[[Tensor, Tensor], None] | None = None,
+    ) -> Iterator[Tensor]:
         """What whitening takes: features of a traverse in batches (B,D), without gradients."""
-        return feature_batches(traverse, self.pipeline, self._at_once, self.map.positions.device, progress)
+        device = self.map.positions.device
+        return feature_batches(traverse, self.pipeline, self._at_once, device, progress, look)
 
     @property
     def _at_once(self) -> int:

@@ -204,7 +204,7 @@ def test_networks_are_described_in_eval_mode() -> None:
     network = SmallCNN(16, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4).train()
     before = {name: value.clone() for name, value in network.state_dict().items()}
     DejaVu(network, whitening=Whitening(), mapper=SpectralMapper(20.0)).learn(route)
-    assert network.training
+    assert not network.training
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 
