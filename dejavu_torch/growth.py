@@ -54,7 +54,7 @@ def append(
         visits: frames of another traverse of its places, averaged in ahead of the coding, see `learn_mean`.
 
     Returns:
-        The model. What is refused leaves it as it was.
+        The model, in eval mode. What is refused leaves it as it was.
 
     Convention: where the map's places are a multiple of `chunk`, its file is, byte for byte, that of all
         places learned at once with this whitening, mean and step. Else its last chunk stays short. One chunk
@@ -97,7 +97,7 @@ def append(
         [len(route.positions) or route.places, frames],
     )
     model.map, model.frame_names, model.calibration = grown, names, None
-    return model
+    return model.eval()
 
 
 def learn_mean(
@@ -152,7 +152,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
 
     Returns:
         How many places are the mean of more visits than before. The calibration is gone: it was of another
-        map.
+        map. The model is in eval mode.
 
     Raises:
         InputError: no spectral map of one route, or visits that do not fit.
@@ -177,6 +177,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     made.count_visits((counts + seen).to(route.visits.device))
     made.check()
     model.map, model.calibration = made, None
+    model.eval()
     return int((seen > 0).sum())
 
 
@@ -294,7 +295,7 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     merged.trained = first.trained if all(model.trained == first.trained for model in models) else None
     counts = [len(model.map.positions) or model.map.places for model in models]
     merged.frame_names = joined_names([model.frame_names for model in models], counts)
-    merged.train(first.training)
+    merged.eval()
     lost = [
         *["thresholds"] * (len(thresholds) > 1),
         *["calibration"] * any(model.calibration is not None for model in models),

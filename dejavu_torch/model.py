@@ -33,13 +33,19 @@ from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.database.weights import BITS, is_rounded, packed, round_weights, unpacked
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.extract import check_queries, feature_batches, features_of
+from dejavu_torch.features.extract import (
+    check_alone,
+    check_queries,
+    feature_batches,
+    features_of,
+    warn_of_bright,
+)
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
-from dejavu_torch.features.whitening import STRENGTHS, Whitening
+from dejavu_torch.features.whitening import STRENGTHS, WIDEST, Whitening
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.periods.finder import ForeignPeriods
@@ -110,7 +116,9 @@ class DejaVu(nn.Module):
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
         whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; "none"
-            keeps the features; None is Whitening ahead of a SpectralMapper, "none" ahead of templates.
+            keeps the features, though of ready ones of over 256 numbers a SpectralMapper gets the principal
+            components, as of `Whitening(views=0)`; None is Whitening ahead of a SpectralMapper, "none" ahead
+            of templates.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match when its score is below; None accepts every finite score.
         precision: accept a match instead where it is at least as probably right, above 0 and below 1; of a
@@ -222,18 +230,19 @@ class DejaVu(nn.Module):
             visits: see `growth.learn_mean`.
 
         Returns:
-            self, with the map in `self.map`. A route in which nothing repeats gives a template map without
-            layers, on which every place scores +inf. Features beyond `concatenate`'s share of the memory
-            spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
+            self, in eval mode, with the map in `self.map`. A route in which nothing repeats gives a template
+            map without layers, on which every place scores +inf. Features beyond `concatenate`'s share of
+            the memory spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
 
         Convention: of a route of over `SAMPLE` frames a spectral map with an integer chunk learns whitening,
             mean and step from a sample of them, see `sample_of`, and its chunks are made one by one. Memory
             holds a chunk, the sample and the map, whatever the number of frames.
 
         Raises:
-            InputError: no frames, too few, NaN, or mixed sizes.
+            InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
+        self._reduce(traverse)
         text = "learning" if progress else None
         before = None if self.whitening is None else self.whitening.state_dict()
         try:
@@ -321,7 +330,7 @@ class DejaVu(nn.Module):
             descriptors = self._averaged(descriptors, shown)
         # what the file holds once counts for the sample by its share alone
         share, once = len(descriptors) / frames, 2 * descriptors.shape[1]
-        other = copy.copy(mapper.beside(round(share * taken - (1 - share) * once)))
+        other = copy.copy(mapper.beside(round(share * taken - (1 - share) * once), _is_ready(traverse)))
         other.chunk = sample.stretch
         with torch.no_grad():
             route = other(descriptors)
@@ -399,7 +408,7 @@ class DejaVu(nn.Module):
 
     def _say_reached(self, route: SpectralMap, taken: int) -> None:
         """What a long route takes, where the sample told wrongly."""
-        wanted, places = getattr(self.mapper, "route_bytes_per_place", None), route.places
+        wanted, places = getattr(self.mapper, "budget", None), route.places
         if wanted is None:
             return
         reached = (route.summary().route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
@@ -428,9 +437,10 @@ class DejaVu(nn.Module):
         Raises:
             InputError: as `learn`, or a second traverse that no whitening learns from.
         """
-        whitening = self.whitening
         if second is not None:
             self._require_learning_whitening(second.traverse.name)
+        self._reduce(traverse)
+        whitening = self.whitening
         spectral = isinstance(self.mapper, SpectralMapper)
         if whitening is not None and not whitening.fixed and spectral and self._has_many_features(traverse):
             sample = sample_of(traverse.count(), streaming.SAMPLE)
@@ -438,12 +448,12 @@ class DejaVu(nn.Module):
             self.describe_reference(part, second and sample.views(second), progress and "sampling")
             return concatenate(self.extract(traverse, progress), FEW_DESCRIPTORS, half=True)
         if whitening is None or whitening.fixed:
-            batches = self.extract(traverse, progress)
+            batches = self.extract(traverse, progress, self._look_at(traverse))
             few = FEW_DESCRIPTORS if spectral else IN_MEMORY
             return concatenate(batches, few, half=spectral and whitening is not None)
         device = self.map.positions.device
-        features = concatenate(self._features(traverse, progress))
-        if second is None and len(traverse.frame_shape) == 3:
+        features = concatenate(self._features(traverse, progress, self._look_at(traverse)))
+        if second is None and not _is_ready(traverse) and whitening.views != 0:
             second = AugmentedTraverse(
                 traverse,
                 len(features),
@@ -459,6 +469,21 @@ class DejaVu(nn.Module):
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
         return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
+
+    def _reduce(self, traverse: Traverse) -> None:
+        """Ready features too wide for a spectral map become principal components without whitening, too."""
+        spectral = isinstance(self.mapper, SpectralMapper)
+        if self.whitening is None and spectral and _is_ready(traverse) and traverse.frame_shape[0] > WIDEST:
+            self.whitening = Whitening(views=0).to(self.map.positions.device)
+
+    def _look_at(self, traverse: Traverse) -> Callable[[Tensor, Tensor], None]:
+        """What the first batch of a reference is checked by."""
+
+        def look(frames: Tensor, features: Tensor) -> None:
+            warn_of_bright(frames, traverse.name)
+            check_alone(self.pipeline, frames, features, traverse.name)
+
+        return look
 
     def _has_many_features(self, traverse: Traverse) -> bool:
         """Whether the features of a traverse are too many to be held, so that a sample has to do."""
@@ -587,7 +612,7 @@ class DejaVu(nn.Module):
         return resize_frames(frames, _size_like((frames.shape[2], frames.shape[3]), self.frame_shape))
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
-        """As `learn`, from descriptors that are there already.
+        """As `learn`, from descriptors that are there already. It ends in eval mode.
 
         Args:
             features: (N,K) float, whitened where the model whitens.
@@ -601,7 +626,7 @@ class DejaVu(nn.Module):
                 features.shape[1],
             )
         names, positions = self._beside(traverse, len(features))
-        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names))
+        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names), _is_ready(traverse))
         with torch.no_grad():
             route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
         if route.places != len(features) or route.dimension != features.shape[1]:
@@ -632,7 +657,7 @@ class DejaVu(nn.Module):
         step = traverse.step if isinstance(traverse, ResampledTraverse) else None
         self.map, self.step, self.frame_names, self._searcher = route, step, names, None
         self.frame_shape, self.trained, self.calibration = shape or None, None, None
-        return self
+        return self.eval()
 
     def calibrate(
         self,
@@ -859,9 +884,12 @@ class DejaVu(nn.Module):
         if self.step is not None:
             queries = self.resample(queries, self.step, progress is not None, self.frame_shape)
         shape = queries.frame_shape
-        for i, features in enumerate(self._features(queries, progress)):
-            if i == 0:
-                self.check_queries(shape, features.shape[1], queries.name)
+
+        def look(frames: Tensor, features: Tensor) -> None:
+            self.check_queries(shape, features.shape[1], queries.name)
+            warn_of_bright(frames, queries.name)
+
+        for features in self._features(queries, progress, look):
             yield self.whitened(features)
 
     def matching(self, sequence: SequenceModel | None, search: Search = "auto") -> Matching:
@@ -934,13 +962,24 @@ class DejaVu(nn.Module):
         """Find best places by a searcher of the map that is made already, such as one of a cluster."""
         self._searcher = searcher
 
-    def extract(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
-        """Descriptors of a traverse in batches (B,K), without gradients."""
-        return map(self.whitened, self._features(traverse, progress))
+    def extract(
+        self,
+        traverse: Traverse,
+        progress: str | None = None,
+        look: Callable[[Tensor, Tensor], None] | None = None,
+    ) -> Iterator[Tensor]:
+        """Descriptors of a traverse in batches (B,K), without gradients; `look` as of `feature_batches`."""
+        return map(self.whitened, self._features(traverse, progress, look))
 
-    def _features(self, traverse: Traverse, progress: str | None = None) -> Iterator[Tensor]:
+    def _features(
+        self,
+        traverse: Traverse,
+        progress: str | None = None,
+        look: Callable[[Tensor, Tensor], None] | None = None,
+    ) -> Iterator[Tensor]:
         """What whitening takes: features of a traverse in batches (B,D), without gradients."""
-        return feature_batches(traverse, self.pipeline, self._at_once, self.map.positions.device, progress)
+        device = self.map.positions.device
+        return feature_batches(traverse, self.pipeline, self._at_once, device, progress, look)
 
     @property
     def _at_once(self) -> int:
@@ -1148,6 +1187,11 @@ def check_precision(precision: float | None) -> None:
     """
     if precision is not None and not 0 < precision < 1:
         raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
+
+
+def _is_ready(traverse: Traverse | None) -> bool:
+    """Whether a traverse is known to hold ready features, not frames."""
+    return traverse is not None and len(traverse.frame_shape) == 1
 
 
 def _stretches_of(views: Views, length: int, most: int) -> Views:

@@ -254,10 +254,12 @@ def test_training_and_deployed_path_give_equal_scores(training: bool) -> None:
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_the_mode_of_the_features_is_restored(training: bool) -> None:
-    model = template_model(Tiny(), layers(8)).train(training)
+def test_learning_ends_in_eval_mode_and_matching_restores_the_mode(training: bool) -> None:
+    model = template_model(Tiny(), layers(8)).train()
     before = {name: value.clone() for name, value in model.features.state_dict().items()}
     model.learn(pictures())
+    assert not any(module.training for module in model.modules())
+    model.train(training)
     model.localize(pictures(5))
     with refused("NaN"):
         model.localize(torch.full((2, 1, SIZE, SIZE), torch.nan))
@@ -266,10 +268,76 @@ def test_the_mode_of_the_features_is_restored(training: bool) -> None:
 
 
 def test_the_mode_of_each_part_of_the_features_is_restored() -> None:
-    model = template_model(Tiny(), layers(8)).train()
+    model = template_model(Tiny(), layers(8)).learn(pictures()).train()
     model.features.norm.eval()
-    model.learn(pictures())
+    model.localize(pictures(5))
+    assert model.features.training
     assert not model.features.norm.training
+
+
+def test_a_batch_of_frames_finds_what_each_frame_finds() -> None:
+    """As in the README: `model(frames)` after `learn`, of a network with BatchNorm."""
+    model = template_model(Tiny(), layers(8, 9)).learn(pictures())
+    frames = pictures(6)
+    torch.testing.assert_close(model(frames), torch.cat([model(frame[None]) for frame in frames]))
+    assert int(model.features.norm.num_batches_tracked) == 0
+
+
+@pytest.mark.parametrize("most", [1.4, 255.0])
+def test_frames_that_are_not_in_0_to_1_are_warned_of_once(
+    most: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = pictures(40)
+    frames = frames / frames.max() * most
+    model = DejaVu(Tiny(), Whitening(views=2)).learn(frames)
+    lines = [line for line in caplog.messages if "[0, 1]" in line]
+    assert [("255" in line, "40" in line) for line in lines] == [(True, False)] * (most > 2)
+    caplog.clear()
+    model.localize(frames[:30])
+    assert len([line for line in caplog.messages if "255" in line]) == (most > 2)
+    caplog.clear()
+    DejaVu().learn(torch.rand(40, 9) * most)  # ready features
+    assert not caplog.text
+
+
+# networks that look at other frames of a batch
+
+
+class Attending(nn.Module):
+    """Adds to each frame's features a share of the mean of its batch."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+        self.sizes: list[int] = []
+
+    def forward(self, frames: Tensor) -> Tensor:
+        self.sizes.append(len(frames))
+        features = nn.functional.avg_pool2d(frames, 4).flatten(1)
+        return features + self.share * (features.mean(0) - features)
+
+
+def test_a_network_that_attends_to_its_batch_is_refused_but_frame_by_frame() -> None:
+    frames = pictures(40)
+    with refused("frame 0", "39 others", "--batch_size 1"):
+        DejaVu(Attending(0.1), "none").learn(frames)
+    with refused("frame 0", "39 others"):
+        DejaVu(Attending(0.1)).learn(frames)
+    network = Attending(0.1)
+    model = DejaVu(network, "none", batch_size=1).learn(frames)
+    found = model.localize(frames[5:15]).index
+    assert torch.equal(found, torch.arange(5, 15))
+    assert set(network.sizes) == {1}
+
+
+def test_what_rounding_changes_is_not_refused() -> None:
+    frames = pictures(40)
+    network = Attending(1e-4)
+    DejaVu(network, "none").learn(frames)
+    assert network.sizes == [40, 1]  # one frame more is described
+    DejaVu(Attending(0.1), "none").learn(frames.flatten(1)[:, :60])  # ready features
+    with torch.autocast("cpu", torch.bfloat16):
+        DejaVu(Attending(2e-2), "none").learn(frames)
 
 
 # gradients

@@ -204,7 +204,7 @@ def test_networks_are_described_in_eval_mode() -> None:
     network = SmallCNN(16, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4).train()
     before = {name: value.clone() for name, value in network.state_dict().items()}
     DejaVu(network, whitening=Whitening(), mapper=SpectralMapper(20.0)).learn(route)
-    assert network.training
+    assert not network.training
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 
@@ -212,3 +212,52 @@ def test_networks_are_described_in_eval_mode() -> None:
 def test_routes_that_cannot_be_whitened_are_refused(frames: Tensor) -> None:
     with refused("expected"):
         spectral().learn(frames)
+
+
+# ready features ---------------------------------------------------------------------------------------
+
+
+def isolated(places: int = 300, features: int = 600, rank: int = 100) -> tuple[Tensor, Tensor]:
+    """Features of places that have nothing in common with those beside them, and of another visit."""
+    random = torch.Generator().manual_seed(0)
+    own = torch.randn(places, rank, generator=random) @ torch.randn(rank, features, generator=random)
+    return own + 8, own + 8 + 40 * torch.randn(places, features, generator=random)
+
+
+def share_found(model: DejaVu, queries: Tensor) -> float:
+    return float((model.localize(queries).index == torch.arange(len(queries))).float().mean())
+
+
+@pytest.mark.parametrize("whitening", [None, "none"])
+def test_ready_features_are_found_as_by_their_cosine(whitening: str | None) -> None:
+    places, queries = isolated()
+    plain = torch.nn.functional.cosine_similarity(queries[:, None], places[None], dim=2).argmax(1)
+    cosine = float((plain == torch.arange(300)).float().mean())
+    held = DejaVu(whitening=whitening).learn(places)  # type: ignore[arg-type]
+    few = DejaVu(mapper=SpectralMapper(5.0)).learn(places)
+    assert share_found(held, queries) > cosine - 0.05 > 0.9
+    assert share_found(few, queries) < cosine - 0.2
+    assert held.map.dimension <= 257
+    sizes = [model.summary().route_bytes / 300 for model in (held, few)]
+    assert sizes[1] <= 5 < 2 * sizes[1] < sizes[0]
+
+
+def test_the_variance_that_a_map_of_ready_features_holds() -> None:
+    places, _ = isolated()
+    model = DejaVu().learn(places)
+    assert model.whitening is not None
+    described, rebuilt = model.whitening(places), model.map.rebuilt(0)  # type: ignore[operator]
+    error = (described - rebuilt).square().sum() / (described - described.mean(0)).square().sum()
+    assert 1 - error == pytest.approx(0.85, abs=0.01)
+    assert DejaVu(whitening="none").learn(places[:, :200]).map.dimension == 200  # as they are
+
+
+def test_frames_that_five_bytes_are_too_few_for(reference: Traverse) -> None:
+    """The mean of 1764 numbers alone takes 58.8 bytes of each of 60 places."""
+    few = FrameRange(reference, 0, 60, 1)
+    with refused("route_bytes_per_place is 5;", "expected more than 59.3"):
+        DejaVu(whitening="none", mapper=SpectralMapper(5.0)).learn(few)
+    assert DejaVu(whitening="none").learn(few).map.dimension == 1764
+    plain = DejaVu(whitening=Whitening(views=0)).learn(few)
+    assert plain.map.dimension == 60  # their rank, 59, and one constant number
+    assert plain.summary().route_bytes <= 5 * 60

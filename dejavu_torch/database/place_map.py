@@ -305,8 +305,11 @@ class Mapper(nn.Module, ABC):
     def empty(self) -> PlaceMap:
         """A map without places, which can load any map of this mapper."""
 
-    def beside(self, taken: int) -> Mapper:
+    def beside(self, taken: int, ready: bool = False) -> Mapper:
         """The mapper that leaves room for so many bytes, which a file holds of the places beside the map.
+
+        Args:
+            ready: whether the descriptors are of ready features, not of frames.
 
         A mapper without a budget is itself.
         """

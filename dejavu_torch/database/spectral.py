@@ -51,6 +51,8 @@ LONG = 2**22  # numbers of a long chunk made at a time, which is gone through fo
 ROWS = 2**14  # of descriptors, looked at together
 COPIES = 4  # numbers held for a place of a long chunk and a query: line, transform, score, is it best
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
+ROUTE_BYTES = 5.0  # per place, where nothing is asked for
+HELD = 0.85  # of the variance, where these are no measure
 # measured, in multiplications of a matrix product:
 LINE_COST = 150  # of a coded line in a query's sum
 TRANSFORM_COST = 280  # of a place in a query's inverse transform
@@ -646,7 +648,9 @@ class SpectralMapper(Mapper):
     Args:
         route_bytes_per_place: what the map may take for each place, without what does not grow with the
             route; the step is chosen so that its coded lines fit. Names and positions of frames count, but
-            come on top, and a line says so, where they would leave the lines less than half.
+            come on top, and a line says so, where they would leave the lines less than half. None, with no
+            step either, is 5 for frames. Ready features need not be smooth along the route: None holds .85 of
+            their variance, whatever that takes, as it does where 5 bytes are too few to code anything.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -676,7 +680,7 @@ class SpectralMapper(Mapper):
 
     def __init__(
         self,
-        route_bytes_per_place: float | None = 5.0,
+        route_bytes_per_place: float | None = None,
         step: float | None = None,
         chunk: int | Literal["route"] = "route",
         transform: Transform = "dft",
@@ -684,7 +688,7 @@ class SpectralMapper(Mapper):
         resolution: float = 0.0,
     ) -> None:
         super().__init__()
-        if (route_bytes_per_place is None) == (step is None):
+        if route_bytes_per_place is not None and step is not None:
             raise InputError(
                 f"route_bytes_per_place is {route_bytes_per_place} and step is {step}; expected one of them, "
                 "the other None"
@@ -695,7 +699,13 @@ class SpectralMapper(Mapper):
         check_settings(metric, transform, chunk, resolution)
         self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
         self.transform, self.metric, self.resolution = transform, metric, resolution
-        self.taken = 0  # bytes of the budget, see `beside`
+        self.taken, self.ready = 0, False  # see `beside`
+
+    @property
+    def budget(self) -> float | None:
+        """Bytes per place; None where a step, or the variance that is held, decides."""
+        own = self.route_bytes_per_place is not None or self.step is not None or self.ready
+        return self.route_bytes_per_place if own else ROUTE_BYTES
 
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
@@ -707,7 +717,7 @@ class SpectralMapper(Mapper):
             raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
         overhead = lines.mean.nbytes + CHUNK_BYTES * len(lengths)
         overhead += self._within(places, overhead)
-        step = self._step(lines, overhead) if self.step is None else self.step
+        step = self._step(lines, overhead)
         step = float(torch.tensor(step))  # as the file holds it
         needed = None
         if lines.held(step) < LITTLE:
@@ -738,34 +748,39 @@ class SpectralMapper(Mapper):
             metric=self.metric, transform=self.transform, chunk=self.chunk, resolution=self.resolution
         )
 
-    def beside(self, taken: int) -> SpectralMapper:
+    def beside(self, taken: int, ready: bool = False) -> SpectralMapper:
         other = copy.copy(self)
-        other.taken = taken
+        other.taken, other.ready = taken, ready
         return other
 
     def _within(self, places: int, overhead: int) -> int:
         """What is taken beside the map, where it counts: over half of the lines' room comes on top of it."""
-        if self.route_bytes_per_place is None or not self.taken:
+        if self.budget is None or not self.taken:
             return 0
-        if self.taken <= (self.route_bytes_per_place * places - overhead) / 2:
+        if self.taken <= (self.budget * places - overhead) / 2:
             return self.taken
         log.warning(
             "names and positions of frames take %.3g bytes per place, over half of what "
             "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
             self.taken / places,
-            self.route_bytes_per_place,
+            self.budget,
         )
         return 0
 
     def _step(self, lines: RouteLines, overhead: int) -> float:
-        """The smallest step whose coded lines fit into the budget, to 2 %."""
-        assert self.route_bytes_per_place is not None
+        """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
+        if self.step is not None:
+            return self.step
+        if self.budget is None:
+            return lines.step_that_holds(HELD)
         places, numbers = lines.lines.shape
-        room = self.route_bytes_per_place * places - overhead
+        room = self.budget * places - overhead
         least = lines.coded_bytes(lines.steps[1])  # none of them
-        if room <= least or self.route_bytes_per_place > 4 * numbers:
+        if room <= least or self.budget > 4 * numbers:
+            if self.route_bytes_per_place is None:  # nobody asked for them
+                return lines.step_that_holds(HELD)
             raise InputError(
-                f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
+                f"route_bytes_per_place is {self.budget:g}; expected more than "
                 f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
                 f"and at most {4 * numbers}, {numbers} numbers as floats"
             )

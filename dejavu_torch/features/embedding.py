@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +17,7 @@ from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
 WIDEST = 256  # cells along a side of a grid
+SHOWN = 4  # shapes in a message
 
 
 class Coder(nn.Module):
@@ -105,8 +107,8 @@ class Embedding(nn.Module):
 
     Args:
         network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K) or vectors (B,K), such as
-            `kornia.feature.HardNet()`, which takes 1 channel of 32 x 32. Of a list, tuple or dict of such
-            the last counts.
+            `kornia.feature.HardNet()`, which takes 1 channel of 32 x 32. Of a tuple, list or dict the first
+            vectors (B,K) are taken, or its only tensor.
         dimension: D, number of features; None gives the pooled output itself.
         channels: that the network takes, 3 or 1; grey frames are repeated, colours become luminance.
         resize: (height, width) in pixels that frames are brought to, antialiased.
@@ -119,6 +121,7 @@ class Embedding(nn.Module):
         mean, std: of each channel, or one number for all, subtracted from the frames in [0, 1] and divided
             out last ahead of the network; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet
             trained. None is 0, and 1.
+        output: index of what to take of a tuple, list or dict instead, negative from its end.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
@@ -126,9 +129,9 @@ class Embedding(nn.Module):
         running it once on a frame, in eval mode.
 
     Raises:
-        InputError: settings out of range, a network that cannot take such frames, has no such layer or gives
-            neither maps nor vectors; forward: frames that are neither grey nor colour, a network that gives
-            another number of channels than before.
+        InputError: settings out of range, a network that cannot take such frames, has no such layer or
+            output, gives neither maps nor vectors, or several maps or tokens and no vectors; forward: frames
+            that are neither grey nor colour, a network that gives another number of channels than before.
 
     Example:
         >>> net = Embedding(nn.Conv2d(1, 4, 3), dimension=8, channels=1, resize=(16, 16), grid=2)
@@ -156,6 +159,7 @@ class Embedding(nn.Module):
         layer: str | None = None,
         mean: float | list[float] | None = None,
         std: float | list[float] | None = None,
+        output: int | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(network, nn.Module):
@@ -178,7 +182,7 @@ class Embedding(nn.Module):
         self.hidden = hidden
         self.noise = noise
         self.kept = kept
-        self.layer, self.mean, self.std = layer, mean, std
+        self.layer, self.mean, self.std, self.output = layer, mean, std, output
         # the settings say the same
         self.register_buffer("offset", _of_channels("mean", mean, channels, 0.0), persistent=False)
         self.register_buffer("factor", 1 / _of_channels("std", std, channels, 1.0), persistent=False)
@@ -187,14 +191,14 @@ class Embedding(nn.Module):
         try:
             self.network = network if layer is None else up_to(network, layer, frame)
             with torch.no_grad(), in_mode(self.network, False):
-                output = run(self.network, frame)
+                made = run(self.network, frame)
         except InputError:
             raise
         except Exception as error:  # a network may raise anything
             raise InputError(
                 f"{type(network).__name__} does not take frames {size}: {' '.join(str(error).split())}"
             ) from error
-        self.inputs = inputs = self._pooled(output).shape[1]
+        self.inputs = inputs = self._pooled(made).shape[1]
         self.linear: nn.Module = nn.Identity()
         self.standardise: nn.Module = nn.Identity()
         if dimension is not None:
@@ -202,19 +206,47 @@ class Embedding(nn.Module):
             self.linear = coded
             self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
-    def _pooled(self, output: object) -> Tensor:
-        """The network's output, one row per frame."""
-        while isinstance(output, (list, tuple, dict)) and output:
-            output = [*(output.values() if isinstance(output, dict) else output)][-1]
-        if isinstance(output, Tensor) and output.ndim == 4:
+    def _pooled(self, made: object) -> Tensor:
+        """What the network made, one row per frame."""
+        output = self._chosen(made)
+        if output.ndim == 4:
             return nn.functional.adaptive_avg_pool2d(output, self.grid).flatten(1)
-        if isinstance(output, Tensor) and output.ndim == 3:
+        if output.ndim == 3:
             return output.mean(1)
-        if isinstance(output, Tensor) and output.ndim == 2:
+        if output.ndim == 2:
             return output
-        seen = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
+        seen = tuple(output.shape)
         raise InputError(
             f"{type(self.network).__name__} made {seen}; expected maps (B,K,h,w) or vectors (B,K)"
+        )
+
+    def _chosen(self, made: object) -> Tensor:
+        """The tensor that counts of what the network made."""
+        name = type(self.network).__name__
+        if self.output is not None:
+            parts = _parts(made)
+            if not -len(parts) <= self.output < len(parts):
+                raise InputError(
+                    f"output is {self.output}, but {name} made {len(parts)}; expected one of them"
+                )
+            made = parts[self.output]
+        tensors = [*_tensors(made)]
+        if len(tensors) == 1:
+            return tensors[0]
+        for tensor in tensors:
+            if tensor.ndim == 2:
+                return tensor
+        if not tensors:
+            raise InputError(
+                f"{name} made {type(made).__name__}; expected maps (B,K,h,w) or vectors (B,K), or an output "
+                "that is of this kind"
+            )
+        seen = ", ".join(str(tuple(tensor.shape)) for tensor in tensors[:SHOWN]) + ", .." * (
+            len(tensors) > SHOWN
+        )
+        raise InputError(
+            f"{name} made {len(tensors)} tensors, {seen}, none of them vectors (B,K); expected output, the "
+            "index of one, or layer, where the network is to end"
         )
 
     @property
@@ -224,7 +256,7 @@ class Embedding(nn.Module):
 
     def without_code(self) -> Embedding:
         """An Embedding of the same network that gives the descriptor itself."""
-        settings = {name: getattr(self, name) for name in ("layer", "mean", "std")}
+        settings = {name: getattr(self, name) for name in ("layer", "mean", "std", "output")}
         return Embedding(self.network, None, self.channels, self.resize, self.grid, self.cell, **settings)
 
     def describe(self, frames: Tensor) -> Tensor:
@@ -261,8 +293,25 @@ class Embedding(nn.Module):
     def extra_repr(self) -> str:
         return (
             f"dimension={self.dimension}, channels={self.channels}, resize={self.resize}, grid={self.grid}, "
-            f"cell={self.cell}, hidden={self.hidden}, layer={self.layer}, mean={self.mean}, std={self.std}"
+            f"cell={self.cell}, hidden={self.hidden}, layer={self.layer}, mean={self.mean}, std={self.std}, "
+            f"output={self.output}"
         )
+
+
+def _parts(made: object) -> list[object]:
+    """The members of a tuple, list or dict; anything else is one of its own."""
+    if isinstance(made, dict):
+        return [*made.values()]
+    return [*made] if isinstance(made, (tuple, list)) else [made]
+
+
+def _tensors(made: object) -> Iterator[Tensor]:
+    """The tensors of what a network made, in order."""
+    if isinstance(made, Tensor):
+        yield made
+    elif isinstance(made, (tuple, list, dict)):
+        for part in _parts(made):
+            yield from _tensors(part)
 
 
 def _of_channels(name: str, given: float | list[float] | None, channels: int, default: float) -> Tensor:

@@ -14,6 +14,11 @@ from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
+BRIGHTEST = 1.5  # of a frame in [0, 1], whatever was done to it
+APART = 1e-3  # of its length: by how much the features of a frame may differ alone and among others
+ULPS = 4  # and where numbers are coarser than that
+TF32 = 2**-10  # what it rounds by
+
 
 def feature_batches(
     traverse: Traverse,
@@ -21,6 +26,7 @@ def feature_batches(
     batch_size: int = 64,
     device: torch.device | str = "cpu",
     progress: str | None = None,
+    look: Callable[[Tensor, Tensor], None] | None = None,
 ) -> Iterator[Tensor]:
     """Features of the frames of a traverse, in order, without gradients.
 
@@ -29,6 +35,7 @@ def feature_batches(
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time; fewer where they are large.
         progress: text of a progress bar on stderr, shown on a terminal only; None is no bar.
+        look: is given the first batch and its features.
 
     Shape: yields (B,D) float.
 
@@ -51,11 +58,56 @@ def feature_batches(
                 raise InputError(
                     f"{traverse.name}: frame {first} gives NaN or infinite features; expected finite numbers"
                 )
+            if look is not None and done == 0:
+                look(batch, features)
             done += len(features)
             bar.update(len(features))
             yield features
     if done == 0:
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
+
+
+def warn_of_bright(frames: Tensor, name: str) -> None:
+    """A line where frames (B,C,H,W) are no numbers in [0, 1]; of ready features (B,D) nothing."""
+    most = float(frames.detach().amax()) if frames.ndim == 4 and len(frames) else 0.0
+    if most > BRIGHTEST:
+        log.warning(
+            "%s has frames with values up to %.4g; expected floats in [0, 1], such as frames / 255",
+            name,
+            most,
+        )
+
+
+def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
+    """Refuse a network whose features of a frame depend on the other frames of the batch.
+
+    Args:
+        module: in eval mode. frames: (B,C,H,W), or ready features (B,D), which nothing describes.
+        features: (B,D) that it made of the frames.
+
+    Raises:
+        InputError: the first frame's differ by over 1e-3 of their length, or more where a part of the network
+            computes in 16 bits.
+    """
+    if frames.ndim != 4 or len(frames) < 2:
+        return
+    with torch.no_grad():
+        alone = features_of(frames[:1].to(features.device), module, name).to(features)
+    apart = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
+    if apart > max(APART, ULPS * _rounding(module, features.device.type)):
+        raise InputError(
+            f"frame 0 of {name} has other features alone than in a batch with {len(frames) - 1} others, by "
+            f"{apart:.2g} of their length; expected --batch_size 1, where every frame is alone"
+        )
+
+
+def _rounding(module: nn.Module, device: str) -> float:
+    """Of the coarsest numbers that a network computes with."""
+    kinds = {one.dtype for one in module.parameters() if one.is_floating_point()}
+    if torch.is_autocast_enabled(device):
+        kinds.add(torch.get_autocast_dtype(device))
+    fast = 0.0 if device == "cpu" else TF32  # which a GPU may compute with in one batch and not in another
+    return max([fast, *(torch.finfo(kind).eps for kind in kinds)])
 
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:

@@ -17,6 +17,7 @@ log = logging.getLogger("dejavu_torch")
 ROWS = 1024  # in double precision at a time
 SAMPLED = 4096  # rows that principal components are found in
 NUMBERS = 128  # of a descriptor, unless said otherwise
+WIDEST = 256  # of one that is not whitened
 PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
 COMPONENTS = 400  # that whitening works on
 VIEWS = 4  # of a frame, on a long route
@@ -128,11 +129,12 @@ class Whitening(nn.Module):
     second traverse.
 
     Args:
-        numbers: K. None is 128, fewer on a short route (a quarter of its places), and at most the rank.
+        numbers: K. None is 128, fewer on a short route (a quarter of its places); without views 256;
+            at most the rank.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, and more where there are few views.
-        views: augmented copies of each frame. None is 4, and up to 12 on a short route, 30 a component.
-            Frames are drawn evenly where there would be more than `most_views`.
+        views: augmented copies of each frame, 0 for none. None is 4, and up to 12 on a short route: 30 for each
+            component. Frames are drawn evenly where there would be more than `most_views`.
         most_views: copies in all.
         strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
         seed: of the copies.
@@ -142,10 +144,10 @@ class Whitening(nn.Module):
 
     Shape: (B,D) -> (B,K).
 
-    Convention: whitened descriptors have length 1. Without views, as for ready features, the descriptors are
-        principal components, centred, their variances kept, and one constant number behind them, the root
-        mean square of their length: it lets a cosine tell long from short. Before `learn` there is no
-        projection, and descriptors pass as they are.
+    Convention: descriptors have length 1. Without views, as for ready features, nothing is whitened: they are
+        the principal components of the centred features, with their variances, and one constant number behind
+        them, the root mean square of these numbers: where they are few, a cosine tells long from short by it.
+        Before `learn` there is no projection, and descriptors pass as they are.
 
     Raises:
         InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
@@ -177,11 +179,12 @@ class Whitening(nn.Module):
         power: float = 1.0,
     ) -> None:
         super().__init__()
-        least = min(1 if count is None else count for count in (numbers, views, most_views))
-        if least < 1 or components < (numbers or 1):
+        least = min(1 if count is None else count for count in (numbers, most_views))
+        if least < 1 or (views or 0) < 0 or components < (numbers or 1):
             raise InputError(
                 f"Whitening got numbers={numbers}, components={components}, views={views}, "
-                f"most_views={most_views}; expected at least 1 each, and no more numbers than components"
+                f"most_views={most_views}; expected at least 1 each, 0 views or more, and no more numbers "
+                "than components"
             )
         if not (shrinkage is None or 0 < shrinkage <= 1) or not 0 < power <= 1 or bits not in BITS:
             raise InputError(
@@ -197,7 +200,7 @@ class Whitening(nn.Module):
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), as `stored`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
         self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
-        self.register_buffer("length", torch.zeros(0))  # (1,), the constant number; (0,): to length 1
+        self.register_buffer("length", torch.zeros(0))  # (1,), the constant number, or (0,)
 
     @property
     def whole(self) -> Tensor:
@@ -239,8 +242,8 @@ class Whitening(nn.Module):
             whole = self.whole if unpacked is None else unpacked
             whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
-                return torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
-            if self.power < 1:
+                whitened = torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
+            elif self.power < 1:
                 # the least size keeps gradients finite
                 whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
             return nn.functional.normalize(whitened, dim=1)
@@ -274,7 +277,7 @@ class Whitening(nn.Module):
         # many descriptors lie in a file, wherever the model is
         mean, basis, variances = (one.to(self.scale.device) for one in (mean, basis[:, :rank], variances))
         if views is None:
-            self.take(mean, basis[:, :kept], variances[:kept].sum().sqrt())
+            self.take(mean, basis[:, :kept], variances[:kept].mean().sqrt())
             return
         pairs = []
         for view, place in views:
@@ -298,7 +301,7 @@ class Whitening(nn.Module):
         """How many numbers are kept of so many features: K, unless the route turns out to have fewer."""
         if self.numbers is not None:
             return self.numbers
-        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else NUMBERS
+        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else WIDEST
 
     def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
         """Take over a projection in whole numbers, and its mean."""

@@ -345,7 +345,8 @@ def make_map(task: PlaceRecognitionTask) -> None:
         if whitening is not None:
             torch.manual_seed(whitening.seed)
             views = views_of(task, whitening.copies(*features.shape), whitening.most_views)
-            whitening.learn(features, ((view, places[:, 0]) for view, places in views))
+            pairs = ((view, places[:, 0]) for view, places in views)
+            whitening.learn(features, None if whitening.views == 0 else pairs)
         alone = task.data.reference if len(task.data.routes) == 1 else None
         model.learn_features(model.whitened(features), alone)
 

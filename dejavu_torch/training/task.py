@@ -279,6 +279,7 @@ class PlaceRecognitionTask(pl.LightningModule):
                 make_map(self)
         else:
             self._start_templates()
+        self.dejavu.map.train(self.training)
         if self.data.resize is not None and len(self.data.routes) == 1:
             self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
 
@@ -289,7 +290,7 @@ class PlaceRecognitionTask(pl.LightningModule):
                 features = coded_places(self, shuffled=first)
             else:
                 features = stored_features(self, self.dejavu.describe, shuffled=first)
-        self.dejavu.learn_features(features, self.data.reference)
+            self.dejavu.learn_features(features, self.data.reference)
         if not self.route.plan:
             raise InputError(
                 f"nothing repeats in the features of {self.data.reference.name}; expected imposed periods"

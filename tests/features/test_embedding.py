@@ -195,7 +195,7 @@ def test_of_tokens_the_mean_counts() -> None:
         (lambda frames: frames[..., None], "(1, 3, 96, 96, 1)"),
         (lambda frames: frames.mean(), "()"),
         (lambda frames: [], "list"),
-        (lambda frames: {"maps": frames, "sizes": "96"}, "str"),
+        (lambda frames: {"sizes": "96"}, "dict"),
     ],
 )
 def test_a_network_that_makes_neither_maps_nor_vectors_is_refused(
@@ -205,16 +205,47 @@ def test_a_network_that_makes_neither_maps_nor_vectors_is_refused(
         Embedding(Maker(make))
 
 
-@pytest.mark.parametrize(
-    "make", [lambda maps: [maps[0], maps[1]], tuple, lambda maps: {"fine": maps[0], "coarse": (maps[1],)}]
-)
-def test_of_several_outputs_the_last_counts(make: Callable[[list[Tensor]], Any]) -> None:
-    def maps(frames: Tensor) -> list[Tensor]:
-        return [frames, 2 * frames[:, :2, ::2, ::2]]
+MEAN = lambda frames: frames.mean((2, 3))  # noqa: E731
+TOKENS = lambda frames: frames.flatten(2).mT  # noqa: E731
 
+
+@pytest.mark.parametrize(
+    ("make", "output", "expected"),
+    [
+        (lambda f: (MEAN(f), f[:, :2, 0]), None, MEAN),  # as Bag of Queries: descriptor, attention
+        (lambda f: (TOKENS(f), MEAN(f), 2 * MEAN(f)), None, MEAN),
+        (lambda f: {"tokens": TOKENS(f), "more": [f, MEAN(f)]}, None, MEAN),
+        (lambda f: (2 * f, None), None, lambda f: 2 * MEAN(f)),  # the only tensor
+        (lambda f: (2 * f, MEAN(f)), 0, lambda f: 2 * MEAN(f)),
+        (lambda f: [f, 2 * f, 3 * f], -1, lambda f: 3 * MEAN(f)),
+        (lambda f: {"maps": f, "more": (TOKENS(f), MEAN(f))}, 1, MEAN),
+        (MEAN, 0, MEAN),
+    ],
+)
+def test_of_several_outputs_the_first_vectors_count_or_the_one_named(
+    make: Callable[[Tensor], Any], output: int | None, expected: Callable[[Tensor], Tensor]
+) -> None:
     frames = torch.rand(4, 3, 96, 96)
-    several = Embedding(Maker(lambda f: make(maps(f))), dimension=None)
-    torch.testing.assert_close(several(frames), maps(frames)[1].mean((2, 3)))
+    several = Embedding(Maker(make), dimension=None, output=output)
+    torch.testing.assert_close(several(frames), expected(frames))
+    torch.testing.assert_close(several.without_code()(frames), expected(frames))
+
+
+@pytest.mark.parametrize(
+    ("make", "output", "words"),
+    [
+        (lambda f: [f, f[:, :2]], None, ("2 tensors", "(1, 3, 96, 96), (1, 2, 96, 96)", "output", "layer")),
+        (lambda f: (TOKENS(f), f), None, ("(1, 9216, 3)", "(1, 3, 96, 96)", "output", "layer")),
+        (lambda f: (MEAN(f), f), 2, ("output is 2", "made 2")),
+        (lambda f: (MEAN(f), None), 1, ("NoneType", "output")),
+        (MEAN, 1, ("output is 1", "made 1")),
+    ],
+)
+def test_no_output_is_taken_silently(
+    make: Callable[[Tensor], Any], output: int | None, words: tuple[str, ...]
+) -> None:
+    with refused("Maker", *words):
+        Embedding(Maker(make), output=output)
 
 
 def test_a_network_that_changes_its_output_size_is_refused() -> None:

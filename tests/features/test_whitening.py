@@ -195,12 +195,20 @@ def test_without_views_components_keep_their_variances() -> None:
     whitening.learn(places)
     described = whitening(places)
     assert described.shape == (600, 13)  # the rank, and one constant number
-    constant = described[:, -1]
-    torch.testing.assert_close(constant, constant[:1].expand(600))
-    distances = torch.cdist(described, described)
+    torch.testing.assert_close(described.norm(dim=1), torch.ones(600))
+    number = ((places - places.mean(0)).square().sum(1).mean() / 12).sqrt()  # the constant, before that
+    components = described[:, :-1] / described[:, -1:] * number
+    distances = torch.cdist(components, components)
     torch.testing.assert_close(distances, torch.cdist(places, places), rtol=1e-2, atol=5e-2)
-    length = (places - places.mean(0)).square().sum(1).mean().sqrt()
-    torch.testing.assert_close(constant[0], length, rtol=1e-3, atol=0)
+
+
+def test_without_views_there_are_at_most_256_numbers() -> None:
+    random = torch.Generator().manual_seed(0)
+    places, numbers = torch.randn(400, 300, generator=random), []
+    for whitening in (Whitening(), Whitening(numbers=20)):
+        whitening.learn(places)
+        numbers.append(len(whitening.scale))
+    assert numbers == [256, 20]
 
 
 def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogCaptureFixture) -> None:
@@ -268,7 +276,7 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
     [
         ({"numbers": 0}, ("numbers=0", "at least 1")),
         ({"numbers": 500}, ("numbers=500", "components=400")),
-        ({"views": 0}, ("views=0",)),
+        ({"views": -1}, ("views=-1", "0 views")),
         ({"shrinkage": 0.0}, ("shrinkage=0.0", "above 0")),
         ({"bits": 6}, ("bits=6", "4, 8, 16")),
         ({"power": 0.0}, ("power=0.0", "above 0")),
