@@ -133,7 +133,7 @@ class Whitening(nn.Module):
             at most the rank.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, and more where there are few views.
-        views: augmented copies of each frame, 0 for none. None is 4, and up to 12 on a short route: 30 for each
+        views: augmented copies of each frame, 0 for none. None is 4, up to 12 on a short route: 30 for each
             component. Frames are drawn evenly where there would be more than `most_views`.
         most_views: copies in all.
         strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
