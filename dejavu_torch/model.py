@@ -274,7 +274,7 @@ class DejaVu(nn.Module):
         size = int(mapper.chunk)
         counts = visits and 1 + shown_by(visits, frames)
         names, positions = self._beside(traverse, frames)
-        taken = positions.nbytes + _bytes_of(names)
+        taken = positions.nbytes
         if work is not None:
             sampled = runs(sample_of(frames, size).frame)
             states = [traverse.state(run.start, run.stop) for run in sampled]
@@ -398,9 +398,10 @@ class DejaVu(nn.Module):
     def _say_reached(self, route: SpectralMap, taken: int) -> None:
         """What a long route takes, where the sample told wrongly."""
         wanted, places = getattr(self.mapper, "route_bytes_per_place", None), route.places
-        if wanted is None:
-            return
-        reached = (route.summary().route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
+        summary = route.summary()
+        if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
+            return  # no budget, or one that gave way
+        reached = (summary.route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
         if abs(reached / wanted - 1) > OFF:
             log.warning(
                 "route_bytes_per_place is %g, and the route takes %.3g: its step is of %d of its %d places",
@@ -555,7 +556,7 @@ class DejaVu(nn.Module):
                 features.shape[1],
             )
         names, positions = self._beside(traverse, len(features))
-        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names))
+        mapper = self.mapper.beside(positions.nbytes)
         with torch.no_grad():
             route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
         if route.places != len(features) or route.dimension != features.shape[1]:
@@ -1032,7 +1033,8 @@ class DejaVu(nn.Module):
             name: sum(tensor.nbytes for tensor in self._weights(part).values())
             for name, part in (("backbone", "features"), ("whitening", "whitening"))
         }
-        summary = self.map.summary().with_parts(route={"names": _bytes_of(self.frame_names)})
+        fixed["names"] = len(encode_names(self.frame_names)) if self.frame_names else 0
+        summary = self.map.summary()
         rest = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
         return summary.with_parts(fixed=fixed | {"header": rest})
 
@@ -1146,11 +1148,6 @@ def _state_of(views: Views | None) -> list[Any] | None:
         return None
     traverse, places = views
     return [traverse.identity(), traverse.state(0, len(places)), places.tolist()]
-
-
-def _bytes_of(names: list[str]) -> int:
-    """What the names of frames take in a map file."""
-    return len(encode_names(names)) if names else 0
 
 
 class Header(NamedTuple):

@@ -640,13 +640,18 @@ class SpectralMap(PlaceMap):
         )
 
 
+class Default(float):
+    """A budget that nobody gave: on a route too short for it the mean and the chunks come on top of it."""
+
+
 class SpectralMapper(Mapper):
     """Codes descriptors along the route: the transform of each number over a chunk, in steps of one size.
 
     Args:
         route_bytes_per_place: what the map may take for each place, without what does not grow with the
-            route; the step is chosen so that its coded lines fit. Names and positions of frames count, but
-            come on top, and a line says so, where they would leave the lines less than half.
+            route; the step is chosen so that its coded lines fit. Positions of frames count, but come on top,
+            and a line says so, where they would leave the lines less than half; so do mean and chunks where
+            they alone, as on a short route, take the 5 of the default.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -676,7 +681,7 @@ class SpectralMapper(Mapper):
 
     def __init__(
         self,
-        route_bytes_per_place: float | None = 5.0,
+        route_bytes_per_place: float | None = Default(5.0),
         step: float | None = None,
         chunk: int | Literal["route"] = "route",
         transform: Transform = "dft",
@@ -747,10 +752,10 @@ class SpectralMapper(Mapper):
         """What is taken beside the map, where it counts: over half of the lines' room comes on top of it."""
         if self.route_bytes_per_place is None or not self.taken:
             return 0
-        if self.taken <= (self.route_bytes_per_place * places - overhead) / 2:
+        if self.taken <= max(0, self.route_bytes_per_place * places - overhead) / 2:
             return self.taken
         log.warning(
-            "names and positions of frames take %.3g bytes per place, over half of what "
+            "positions of frames take %.3g bytes per place, over half of what "
             "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
             self.taken / places,
             self.route_bytes_per_place,
@@ -759,17 +764,27 @@ class SpectralMapper(Mapper):
 
     def _step(self, lines: RouteLines, overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %."""
-        assert self.route_bytes_per_place is not None
+        wanted = self.route_bytes_per_place
+        assert wanted is not None
         places, numbers = lines.lines.shape
-        room = self.route_bytes_per_place * places - overhead
-        least = lines.coded_bytes(lines.steps[1])  # none of them
-        if room <= least or self.route_bytes_per_place > 4 * numbers:
+        nothing = lines.coded_bytes(lines.steps[1])
+        least = (overhead + nothing) / places
+        most = math.floor(least) + 4 * numbers  # all numbers as floats
+        if isinstance(wanted, Default):
+            if wanted <= least:
+                log.warning(
+                    "mean and chunks of %d places take %.3g bytes for each, which the default "
+                    "route_bytes_per_place of %g has no room for: they come on top of it",
+                    *(places, least, wanted),
+                )
+                overhead = 0
+        elif not least < wanted <= most:
+            works = math.ceil(least + min(5, 2 * numbers))
             raise InputError(
-                f"route_bytes_per_place is {self.route_bytes_per_place:g}; expected more than "
-                f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
-                f"and at most {4 * numbers}, {numbers} numbers as floats"
+                f"route_bytes_per_place is {wanted:g}; expected more than {least:.3g}, which the mean, "
+                f"chunks and positions take, such as {works}, and at most {most}, with all numbers as floats"
             )
-        return lines.step_of(room)
+        return lines.step_of(max(wanted * places - overhead, nothing))
 
 
 def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:
