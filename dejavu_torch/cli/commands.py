@@ -343,7 +343,7 @@ def run_live(
         threshold: accept a match whose score is below
         precision: accept instead what is at least as probably right, such as .99
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
-            for any that is free
+            for any that is free. A file is then played in real time, and the page stays until Ctrl-C
         reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
         realtime: take the frames of a video at their times, and drop those that come too fast
         timeout: seconds without a frame after which a camera, address or pipe, the only ones it is for, has
