@@ -442,6 +442,8 @@ class DejaVu(nn.Module):
             return concatenate(batches, few, half=spectral and whitening is not None)
         device = self.map.positions.device
         features = concatenate(self._features(traverse, progress))
+        if len(features) < 2 and len(traverse.frame_shape) == 3:
+            raise InputError(f"{traverse.name} has 1 frame; expected at least 2, as of a traverse")
         if second is None and len(traverse.frame_shape) == 3:
             second = AugmentedTraverse(
                 traverse,
@@ -494,7 +496,7 @@ class DejaVu(nn.Module):
             steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
             raise InputError(
                 f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
-                "many, frame i being place i, or a second_truth that says which places it shows"
+                "many, frame i being place i, or a truth that says which places it shows"
             )
         if isinstance(reference, ResampledTraverse):
             found = ground_truth_in_places(found, partial(place_of, reference.positions))

@@ -161,16 +161,19 @@ def run_learn(
         _print_steps(traverse)
         traverse, views = _with_second(model, traverse, second, second_truth)
         if average is not None:
-            visits = model.places_shown(traverse, open_source(average), average_truth)
+            with _truth_by("--average_truth"):
+                visits = model.places_shown(traverse, open_source(average), average_truth)
         _check_calibration(model, traverse, calibration, precision)
         traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
     else:
-        visits = growth.shown_on_map(model, open_source(str(average)), average_truth)
+        with _truth_by("--average_truth"):
+            visits = growth.shown_on_map(model, open_source(str(average)), average_truth)
         traverse, views = visits.traverse, None
         _check_calibration(model, traverse, calibration, precision)
         known = None
         if calibration not in UNREAD:
-            known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
+            with _truth_by("--calibration_truth"):
+                known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
     done, start, work = "", model.map.places, WorkFolder(work_folder_of(map))
     with _making(cluster) as make:
@@ -730,6 +733,8 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
         twice = next((one for one in maps[:i] if one.exists() and path.exists() and one.samefile(path)), None)
         if twice is not None:
             raise InputError(f"{path} and {twice} are one file; expected each map once")
+    if len(maps) < 2:
+        raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
     models = [_load_map(path, copy.deepcopy(features)) for path in maps]
     try:
         model = growth.merge(models, [path.stem for path in maps])
@@ -953,7 +958,8 @@ def _with_second(
     if query is not None and _same_as(traverse, [query]):
         raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
     reference = model.resample(reference, progress=True)
-    return reference, model.views(reference, traverse, truth)
+    with _truth_by("--second_truth"):
+        return reference, model.views(reference, traverse, truth)
 
 
 def _with_calibration(
@@ -978,7 +984,17 @@ def _with_calibration(
         raise InputError(f"--calibration {source} is {same.name} itself; expected another traverse")
     check_sizes(model, reference, traverse)
     reference = model.resample(reference, model.step, progress=True)
-    return reference, model.places_shown(reference, traverse, truth)
+    with _truth_by("--calibration_truth"):
+        return reference, model.places_shown(reference, traverse, truth)
+
+
+@contextmanager
+def _truth_by(option: str) -> Iterator[None]:
+    """What is refused within names the option that a truth would be given by."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace("or a truth that", f"or {option}, which")) from error
 
 
 def _check_calibration(model: DejaVu, traverse: Traverse, calibration: str | None, told: str) -> None:

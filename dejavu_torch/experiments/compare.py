@@ -233,7 +233,10 @@ def _check_arguments(
         if value is not None and value < 0:
             raise InputError(f"{name} is {value}; expected at least 0")
     if leave_out is not None and not isinstance(model.mapper, TemplateMapper):
-        raise InputError(f"leave_out is {leave_out}, but it is of template maps: expected a TemplateMapper")
+        raise InputError(
+            f"leave_out is {leave_out}, but it is of template maps: expected a TemplateMapper, "
+            "as of --config local_maxima"
+        )
     if leave_out is not None and model.map.places and model.trained is not None:
         raise InputError(
             f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"
