@@ -213,7 +213,7 @@ class DejaVu(nn.Module):
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
             second: see `describe_reference`; `views` makes it.
-            progress: show a progress bar on a terminal.
+            progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
             work: keeps the finished chunks of a long route, so that learning goes on from there after a
                 kill; it is the caller's to remove.
             make: what makes the chunks of a long route: `code_here`, or a cluster.
@@ -416,7 +416,7 @@ class DejaVu(nn.Module):
         Args:
             second: another traverse of the same places, from which whitening learns, in place of augmented
                 copies, what changes between two visits.
-            progress: text of a progress bar on a terminal; None is no bar.
+            progress: text of a progress bar on a terminal, elsewhere of a line a minute; None shows nothing.
 
         Shape: -> (N,K).
 
@@ -444,19 +444,21 @@ class DejaVu(nn.Module):
         features = concatenate(self._features(traverse, progress))
         if len(features) < 2 and len(traverse.frame_shape) == 3:
             raise InputError(f"{traverse.name} has 1 frame; expected at least 2, as of a traverse")
+        looks = "" if second is None else f"by {second.traverse.name}"
         if second is None and len(traverse.frame_shape) == 3:
-            second = AugmentedTraverse(
+            augmented = AugmentedTraverse(
                 traverse,
                 len(features),
                 whitening.copies(*features.shape),
                 whitening.most_views,
                 whitening.strengths,
                 whitening.seed,
-            ).views
+            )
+            second, looks = augmented.views, augmented.looks
         if second is None:
             whitening.learn(features)
         else:
-            batches = self._features(second.traverse, progress and "whitening")
+            batches = self._features(second.traverse, progress and f"learning what changes: {looks}")
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
         return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
