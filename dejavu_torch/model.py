@@ -223,7 +223,7 @@ class DejaVu(nn.Module):
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
             second: see `describe_reference`; `views` makes it.
-            progress: show a progress bar on a terminal.
+            progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
             work: keeps the finished chunks of a long route, so that learning goes on from there after a
                 kill; it is the caller's to remove.
             make: what makes the chunks of a long route: `code_here`, or a cluster.
@@ -285,7 +285,7 @@ class DejaVu(nn.Module):
         size = int(mapper.chunk)
         counts = visits and 1 + shown_by(visits, frames)
         names, positions = self._beside(traverse, frames)
-        taken = positions.nbytes + _bytes_of(names)
+        taken = positions.nbytes
         if work is not None:
             sampled = runs(sample_of(frames, size).frame)
             states = [traverse.state(run.start, run.stop) for run in sampled]
@@ -301,7 +301,7 @@ class DejaVu(nn.Module):
         route.needed = fit.needed
         if counts is not None:
             route.count_visits(counts)
-        self._say_reached(route, taken)
+        self._say_reached(route, taken, _is_ready(traverse))
         return self._take(route, traverse, names, positions)
 
     def _fit(
@@ -406,12 +406,14 @@ class DejaVu(nn.Module):
         sources = digests(source=[traverse.identity(), frames, states], visits=_state_of(visits))
         return sources | {"settings": sums.pop(HEADER), **sums}
 
-    def _say_reached(self, route: SpectralMap, taken: int) -> None:
+    def _say_reached(self, route: SpectralMap, taken: int, ready: bool) -> None:
         """What a long route takes, where the sample told wrongly."""
         wanted, places = getattr(self.mapper, "budget", None), route.places
-        if wanted is None:
+        summary = route.summary()
+        gave_way = ready and getattr(self.mapper, "route_bytes_per_place", None) is None
+        if wanted is None or gave_way or summary.route_bytes - summary.route["lines"] >= wanted * places:
             return
-        reached = (route.summary().route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
+        reached = (summary.route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
         if abs(reached / wanted - 1) > OFF:
             log.warning(
                 "route_bytes_per_place is %g, and the route takes %.3g: its step is of %d of its %d places",
@@ -426,7 +428,7 @@ class DejaVu(nn.Module):
         Args:
             second: another traverse of the same places, from which whitening learns, in place of augmented
                 copies, what changes between two visits.
-            progress: text of a progress bar on a terminal; None is no bar.
+            progress: text of a progress bar on a terminal, elsewhere of a line a minute; None shows nothing.
 
         Shape: -> (N,K).
 
@@ -453,19 +455,23 @@ class DejaVu(nn.Module):
             return concatenate(batches, few, half=spectral and whitening is not None)
         device = self.map.positions.device
         features = concatenate(self._features(traverse, progress, self._look_at(traverse)))
+        if len(features) < 2 and not _is_ready(traverse):
+            raise InputError(f"{traverse.name} has 1 frame; expected at least 2, as of a traverse")
+        looks = "" if second is None else f"by {second.traverse.name}"
         if second is None and not _is_ready(traverse) and whitening.views != 0:
-            second = AugmentedTraverse(
+            augmented = AugmentedTraverse(
                 traverse,
                 len(features),
                 whitening.copies(*features.shape),
                 whitening.most_views,
                 whitening.strengths,
                 whitening.seed,
-            ).views
+            )
+            second, looks = augmented.views, augmented.looks
         if second is None:
             whitening.learn(features)
         else:
-            batches = self._features(second.traverse, progress and "whitening")
+            batches = self._features(second.traverse, progress and f"learning what changes: {looks}")
             whitening.learn(features, _labelled(batches, second.places.to(device)))
         whitening.to(device)
         return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
@@ -520,7 +526,7 @@ class DejaVu(nn.Module):
             steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
             raise InputError(
                 f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
-                "many, frame i being place i, or a second_truth that says which places it shows"
+                "many, frame i being place i, or a truth that says which places it shows"
             )
         if isinstance(reference, ResampledTraverse):
             found = ground_truth_in_places(found, partial(place_of, reference.positions))
@@ -626,7 +632,7 @@ class DejaVu(nn.Module):
                 features.shape[1],
             )
         names, positions = self._beside(traverse, len(features))
-        mapper = self.mapper.beside(positions.nbytes + _bytes_of(names), _is_ready(traverse))
+        mapper = self.mapper.beside(positions.nbytes, _is_ready(traverse))
         with torch.no_grad():
             route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
         if route.places != len(features) or route.dimension != features.shape[1]:
@@ -1119,7 +1125,8 @@ class DejaVu(nn.Module):
             name: sum(tensor.nbytes for tensor in self._weights(part).values())
             for name, part in (("backbone", "features"), ("whitening", "whitening"))
         }
-        summary = self.map.summary().with_parts(route={"names": _bytes_of(self.frame_names)})
+        fixed["names"] = len(encode_names(self.frame_names)) if self.frame_names else 0
+        summary = self.map.summary()
         rest = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
         return summary.with_parts(fixed=fixed | {"header": rest})
 
@@ -1244,11 +1251,6 @@ def _state_of(views: Views | None) -> list[Any] | None:
         return None
     traverse, places = views
     return [traverse.identity(), traverse.state(0, len(places)), places.tolist()]
-
-
-def _bytes_of(names: list[str]) -> int:
-    """What the names of frames take in a map file."""
-    return len(encode_names(names)) if names else 0
 
 
 class Header(NamedTuple):

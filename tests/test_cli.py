@@ -411,6 +411,71 @@ def test_a_map_that_cannot_be_judged(trained_map: Path, capsys: pytest.CaptureFi
 
 # what is refused
 
+WRONG = {  # a line of words behind `dejavu`, and what its one line holds
+    "demo --seed x": ("--seed is x", "whole number"),
+    "learn a.npy --map m.safetensors --batch_size 2.5": ("--batch_size is 2.5", "whole number"),
+    "learn a.npy --map m.safetensors --threshold high": ("--threshold is high", "a number"),
+    "learn a.npy --map m.safetensors --weight_bits 4": ("--weight_bits is 4", "8 or 32"),
+    "learn a.npy --map m.safetensors --seed 99999999999999999999": ("--seed is 99999999999999999999", "most"),
+    "learn a.npy --map m.safetensors --features short": ("--features is short", "import path"),
+    "learn a.npy --map m.safetensors --features no.such.Net": ("--features", "'no'"),
+    "learn a.npy --map m.safetensors --features.cell big": ("--features.cell is big", "whole number"),
+    "learn a.npy --map m.safetensors --features.cel 3": ("--features.cel", "not accepted"),
+    "learn a.npy --map m.safetensors --features.bins soft": ("--features.bins is soft", "hard or linear"),
+    "learn a.npy --map m.safetensors --features torch.nn.Linear": ("--features.in_features", "required"),
+    "learn a.npy --map m.safetensors --whitening some": ("--whitening is some", "Whitening", "or none"),
+    "learn a.npy --map m.safetensors --whitening none --whitening.bits 4": (
+        "--whitening.bits",
+        "no settings",
+    ),
+    "learn a.npy --map m.safetensors --whitening.bits 5": ("shrinkage=null", "bits=5"),
+    "learn a.npy --map m.safetensors --mapper HOG": ("--mapper is HOG", "Mapper"),
+    "learn a.npy --map m.safetensors --mapper.chunk some": ("--mapper.chunk is some", "number or route"),
+    "learn a.npy --map m.safetensors --mapper.step 1": ("route_bytes_per_place is 5.0", "step is 1", "null"),
+    "learn a.npy --map m.safetensors --config local_maxima --mapper.periods Foo": (
+        "--mapper.periods is Foo",
+    ),
+    "learn a.npy --map m.safetensors --velocity.corners 3": ("--velocity.corners is 3", "a list"),
+    "learn a.npy --map m.safetensors --config key.yaml": ("--mapper.stepp", "not accepted", "key.yaml"),
+    "learn a.npy --map m.safetensors --config value.yaml": ("--batch_size is many", "value.yaml"),
+    "learn a.npy --map m.safetensors --second c.npy": ("6 frames", "--second_truth"),
+    "learn a.npy --map m.safetensors --average c.npy": ("6 frames", "--average_truth"),
+    "learn a.npy --map m.safetensors --calibration c.npy": ("6 frames", "--calibration_truth"),
+    "learn one.npy --map m.safetensors": ("one.npy has 1 frame", "at least 2"),
+    "learn sim:aerial?frames=many --map m.safetensors": ("frames is 'many'", "integer"),
+    "localize m a.npy --out m.csv --top some": ("--top is some", "whole number"),
+    "localize m a.npy --out m.csv --speeds [fast]": ("--speeds is", "fast", "a list"),
+    "localize m a.npy --out m.csv --search fast": ("--search is fast", "auto, scan, bound or ivf"),
+    "compare a.npy b.npy --out r --config paper": ("18 places", "1024", "--mapper.periods.short shrink"),
+    "compare a.npy b.npy --out r --leave_out 3": ("leave_out is 3", "--config local_maxima"),
+    "evaluate a.csv --truth 0 --out r --tolerance some": ("--tolerance is some", "whole number"),
+    "live m a.npy --page many": ("--page is many", "whole number"),
+    "merge m.safetensors --map n.safetensors": ("m.safetensors", "at least two maps"),
+    "bench scale --out r --places few": ("--places is few", "whole number"),
+    "train": ("fit, validate, test",),
+    "train fit --data.source a.npy --model.lr fast": ("--model.lr is fast", "a number"),
+    "train fit --data.source a.npy --trainer.accelerator abacus": ("--trainer.accelerator abacus", "cpu"),
+    "train fit --data.source a.npy --model.mapper Nothing": ("--model.mapper is Nothing", "Mapper"),
+}
+
+
+@pytest.mark.parametrize(
+    "line", [pytest.param(one, marks=[pytest.mark.slow] * one.startswith("train")) for one in WRONG]
+)
+def test_what_is_wrong_is_told_by_options_and_without_python(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, count in (("a", 18), ("b", 18), ("c", 6), ("one", 1)):
+        np.save(f"{name}.npy", frames(count))
+    Path("key.yaml").write_text("mapper:\n  class_path: SpectralMapper\n  init_args: {stepp: 3}\n")
+    Path("value.yaml").write_text("batch_size: many\n")
+    there = {*tmp_path.iterdir()}
+    error = fails(capsys, *line.split())
+    assert [word for word in WRONG[line] if word not in error] == [], error
+    assert not re.search(r"<class|typing\.|Parser key|NoneType|\bNone\b|='|import path string", error), error
+    assert {*tmp_path.iterdir()} == there
+
 
 def test_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     error = fails(capsys, "learn", tmp_path / "nowhere", "--map", tmp_path / "a.safetensors")

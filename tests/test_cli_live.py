@@ -193,27 +193,73 @@ def test_a_process_that_nobody_needs_any_more_ends(how: str, folder: Path, tmp_p
         assert re.fullmatch(r"dejavu: \d+ frames, \d+ dropped; .*\n", process.stderr.read())
 
 
+@pytest.mark.parametrize("options", [(), ("--search_every", "5"), ("--sequence", "1")], ids=" ".join)
 def test_the_page_shows_frame_reference_and_answer(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    options: tuple[str, ...],
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     states: list[dict[str, Any]] = []
     show = Page.show
 
     def shown(self: Page, moment: Any) -> None:
         show(self, moment)
-        if moment.shot.number in (30, 63):
+        if moment.shot.number in (2, 30, 39):
             with urlopen(f"{self.url}state") as answer:
                 states.append(json.load(answer))
 
+    def interrupted(seconds: float) -> None:
+        if seconds > 60:
+            raise KeyboardInterrupt
+
     monkeypatch.setattr(Page, "show", shown)
-    reference = ("--reference", "sim:aerial?frames=64")
-    run("live", folder / "map.safetensors", folder / "second.mkv", "--page", "0", *reference)
+    monkeypatch.setattr("dejavu_torch.cli.live.time.sleep", interrupted)
+    source, reference = f"{folder / 'second.mkv'}?stop=40", ("--reference", "sim:aerial?frames=64")
+    run("live", folder / "map.safetensors", source, "--page", "0", *reference, *options)
     out, err = capsys.readouterr()
-    assert re.match(r"dejavu: the page is at http://127\.0\.0\.1:\d+/\n", err)
-    assert [state["number"] for state in states] == [30, 63]
-    assert [state["place"] for state in states] == [lines_of(out)[i]["place"] for i in (30, 63)]
+    where, stays, summary = err.splitlines()
+    assert re.fullmatch(r"dejavu: the page is at http://127\.0\.0\.1:\d+/", where)
+    assert "Ctrl-C" in stays
+    assert summary.startswith("dejavu: 40 frames, 0 dropped")
+    assert [state["number"] for state in states] == [2, 30, 39]
+    assert [state["place"] for state in states] == [lines_of(out)[i]["place"] for i in (2, 30, 39)]
     assert all(state["reference"].startswith("data:image/jpeg") for state in states)
-    assert max(states[0]["curve"]) == pytest.approx(states[0]["posterior"], abs=1e-3)
+    for state in states:
+        if "--sequence" in options:
+            assert (max(state["curve"]), state["off"]) == (1, None)
+        else:
+            assert sum(state["curve"]) + state["off"] == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path, tmp_path: Path) -> None:
+    """A folder has no times: 10 frames a second. Nobody looks at the page, and none of its frames is lost."""
+    frames = next(open_source(folder / "second.mkv").batches(8))
+    np.save(tmp_path / "frames.npy", _pixels(frames))
+    words = ["live", str(folder / "map.safetensors"), str(tmp_path / "frames.npy"), "--page", "0"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dejavu_torch.cli", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    url = process.stderr.readline().split()[-1]
+    began, lines = time.monotonic(), [json.loads(process.stdout.readline()) for _ in range(8)]
+    assert time.monotonic() - began > 0.5
+    assert [line["frame"] for line in lines] == [*range(8)]
+    assert url in process.stderr.readline()
+    with urlopen(f"{url}state") as answer:
+        assert json.load(answer)["number"] == 7
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    assert process.wait(20) == 0
+    assert process.stderr.read().startswith("dejavu: 8 frames, 0 dropped")
 
 
 def test_a_port_in_use_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -119,7 +119,7 @@ def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> No
     assert model.views(reference, second, "290").places.tolist() == [*range(290, 300), *[-1] * 290]
     plain = ArrayTraverse(torch.rand(FRAMES, 1, 9, 9), "plain"), ArrayTraverse(torch.rand(9, 1, 9, 9), "few")
     assert model.views(plain[0], plain[0]).places.tolist() == list(range(FRAMES))
-    with refused("few has 9 frames", "plain 300", "second_truth"):
+    with refused("few has 9 frames", "plain 300", "a truth that says"):
         model.views(*plain)
     with refused("no whitening", "few"):
         DejaVu(whitening="none").views(*plain, "0")

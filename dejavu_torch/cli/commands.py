@@ -162,16 +162,19 @@ def run_learn(
         _print_steps(traverse)
         traverse, views = _with_second(model, traverse, second, second_truth)
         if average is not None:
-            visits = model.places_shown(traverse, open_source(average), average_truth)
+            with _truth_by("--average_truth"):
+                visits = model.places_shown(traverse, open_source(average), average_truth)
         _check_calibration(model, traverse, calibration, precision)
         traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
     else:
-        visits = growth.shown_on_map(model, open_source(str(average)), average_truth)
+        with _truth_by("--average_truth"):
+            visits = growth.shown_on_map(model, open_source(str(average)), average_truth)
         traverse, views = visits.traverse, None
         _check_calibration(model, traverse, calibration, precision)
         known = None
         if calibration not in UNREAD:
-            known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
+            with _truth_by("--calibration_truth"):
+                known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
     done, start, work = "", model.map.places, WorkFolder(work_folder_of(map))
     with _making(cluster) as make:
@@ -344,7 +347,7 @@ def run_live(
         threshold: accept a match whose score is below
         precision: accept instead what is at least as probably right, such as .99
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
-            for any that is free
+            for any that is free. A file is then played in real time, and the page stays until Ctrl-C
         reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
         realtime: take the frames of a video at their times, and drop those that come too fast
         timeout: seconds without a frame after which a camera, address or pipe, the only ones it is for, has
@@ -731,6 +734,8 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
         twice = next((one for one in maps[:i] if one.exists() and path.exists() and one.samefile(path)), None)
         if twice is not None:
             raise InputError(f"{path} and {twice} are one file; expected each map once")
+    if len(maps) < 2:
+        raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
     models = [_load_map(path, copy.deepcopy(features)) for path in maps]
     try:
         model = growth.merge(models, [path.stem for path in maps])
@@ -954,7 +959,8 @@ def _with_second(
     if query is not None and _same_as(traverse, [query]):
         raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
     reference = model.resample(reference, progress=True, shape=model.frame_shape)
-    return reference, model.views(reference, traverse, truth)
+    with _truth_by("--second_truth"):
+        return reference, model.views(reference, traverse, truth)
 
 
 def _with_calibration(
@@ -980,7 +986,17 @@ def _with_calibration(
     reference = model.resample(reference, model.step, True, model.frame_shape)
     traverse = model.fit(traverse, reference.frame_shape)
     check_sizes(model, reference, traverse)
-    return reference, model.places_shown(reference, traverse, truth)
+    with _truth_by("--calibration_truth"):
+        return reference, model.places_shown(reference, traverse, truth)
+
+
+@contextmanager
+def _truth_by(option: str) -> Iterator[None]:
+    """What is refused within names the option that a truth would be given by."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace("or a truth that", f"or {option}, which")) from error
 
 
 def _check_calibration(model: DejaVu, traverse: Traverse, calibration: str | None, told: str) -> None:

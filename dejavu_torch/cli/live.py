@@ -6,9 +6,11 @@ import json
 import logging
 import math
 import sys
+import time
 from collections import deque
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
+from typing import NoReturn
 
 import numpy as np
 
@@ -19,11 +21,11 @@ from dejavu_torch.live.feed import Feed, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
 from dejavu_torch.live.page import Moment, Page, ReferencePictures
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, SequenceModel
 
 RECENT = 10_000  # answers whose milliseconds are kept
+RATE = 10  # frames a second that a page shows of a source without times
 
 log = logging.getLogger("dejavu_torch")
 
@@ -40,11 +42,13 @@ def follow(
 ) -> None:
     """Localize the frames of a source until it ends or Ctrl-C; see `run_live`.
 
+    Convention: with a page a file is played in real time, and the page stays until Ctrl-C.
+
     Raises:
         InputError: what is wrong with the source, behind the lines and the summary of what came before.
     """
     localizer = LiveLocalizer(model, sequence)
-    shots, newest, name = shots_from(source, model, realtime)
+    shots, newest, name = shots_from(source, model, realtime, port is not None)
     taken = Timings()
     with ExitStack() as stack:
         page = None
@@ -70,9 +74,13 @@ def follow(
                     if reader_left():
                         break
                     if page is not None and localizer.scores is not None:
-                        posterior = isinstance(sequence, PlaceFilter)
+                        posterior = localizer.posterior
+                        drawn = localizer.scores if posterior is None else posterior
                         counts = (taken.frames, feed.dropped, *taken.percentiles())
-                        page.show(Moment(shot, match, localizer.scores, posterior, *counts))
+                        page.show(Moment(shot, match, drawn, posterior is not None, *counts))
+                else:
+                    if page is not None and not is_stream(source):
+                        _stay(page.url)
         finally:
             if taken.frames:
                 p50, p99 = taken.percentiles()
@@ -80,8 +88,14 @@ def follow(
                 _tell(f"{taken.frames} frames, {feed.dropped} dropped; {times}")
 
 
-def shots_from(source: str, model: DejaVu, realtime: bool) -> tuple[Iterable[Shot], bool, str]:
-    """What a source gives, whether only its newest frame counts, and its name."""
+def shots_from(
+    source: str, model: DejaVu, realtime: bool, shown: bool = False
+) -> tuple[Iterable[Shot], bool, str]:
+    """What a source gives, whether only its newest frame counts, and its name.
+
+    Args:
+        shown: on a page, which a file is played for at its own pace.
+    """
     shape = model.frame_shape
     size = (shape[1], shape[2]) if shape is not None and len(shape) == 3 else None
     if is_stream(source):
@@ -95,7 +109,9 @@ def shots_from(source: str, model: DejaVu, realtime: bool) -> tuple[Iterable[Sho
         if note:
             log.warning("%s", note)
     shots = shots_of(traverse)
-    return (in_real_time(shots, traverse.name) if realtime else shots), realtime, traverse.name
+    if realtime or shown:
+        shots = in_real_time(shots, traverse.name, None if realtime else RATE)
+    return shots, realtime, traverse.name
 
 
 def _noted(camera: Camera) -> Iterable[Shot]:
@@ -145,6 +161,13 @@ class Timings:
             return math.nan, math.nan
         p50, p99 = np.percentile(np.fromiter(self._recent, float), (50, 99))
         return float(p50), float(p99)
+
+
+def _stay(url: str) -> NoReturn:
+    """Wait for Ctrl-C."""
+    _tell(f"that was the last frame; the page stays at {url} until Ctrl-C")
+    while True:
+        time.sleep(3600)
 
 
 def _tell(text: str) -> None:

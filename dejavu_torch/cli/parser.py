@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import pydoc
+import re
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -39,6 +40,16 @@ HINT = (
 )
 MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 NETWORKS = ("features", "backbone", "network")  # options that name a class, or a function that makes one
+WORDS = {  # what values of Python's types are on a command line
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "a word",
+    "Path": "a path",
+    "Module": "a class or function by its import path, such as dejavu_torch.HOG",
+    **dict.fromkeys(("list", "tuple", "Sequence"), "a list, such as [1, 2]"),
+    **dict.fromkeys(("dict", "Mapping"), "settings, as KEY: VALUE"),
+}
 LONGEST = 300  # characters of a message that is told whole
 
 
@@ -57,8 +68,8 @@ def refusal(error: Exception) -> InputError:
     """What a part's constructor refused."""
     chain = list(causes(error))
     own = [one for one in chain if isinstance(one, InputError)]
-    if own:
-        return own[-1]
+    if own:  # what Python calls None is null here
+        return type(own[-1])(re.sub(r"\bNone\b", "null", str(own[-1])))
     return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST] or type(chain[-1]).__name__}")
 
 
@@ -153,7 +164,7 @@ class Parser(jsonargparse.ArgumentParser):
         parsed = super().parse_args(words, *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
             if any(abs(number) > LARGEST for number in whole_numbers(value)):
-                self.error(f'Parser key "{key}": {value}; expected whole numbers of at most {LARGEST}')
+                self.error(f"--{key} is {value}; expected whole numbers of at most {LARGEST}")
         return parsed
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
@@ -165,12 +176,58 @@ class Parser(jsonargparse.ArgumentParser):
                 for name in names.split(", ")
             ]
             message = f"{head}{required}{', '.join(needed)}"
-        told = one_line(message)
-        if ex is not None and len(told) > LONGEST // 2:  # a complaint for every type that could be meant
-            *_, first = causes(ex)
-            part = next((cause for cause in causes(ex) if isinstance(cause, UsageError)), first)
-            told = one_line(f"{message.splitlines()[0]} {part}")
+        told = one_line(_by_options(message, ex))
         raise UsageError(told if len(told) < LONGEST else f"{told[:LONGEST]} ...") from ex
+
+
+def _by_options(message: str, error: Exception | None) -> str:
+    """What jsonargparse says, by the names of options and without those of Python's types."""
+    found = re.match(r'Parser key "([^"]+)"[^:]*:\s*(.*)', message, re.DOTALL)
+    key, text = found.groups() if found else ("", message)
+    option = "--" + key.replace(".init_args", "")
+    part = next((one for one in causes(error) if isinstance(one, UsageError)), None) if key else None
+    if part is not None and part is not error and str(part) not in text.splitlines()[:1]:
+        inner = re.sub(r"(?<![\w-])--(?=\w)", f"{option}.", str(part))  # of the part's own parser
+        return inner if inner.startswith(option) else f"{option}: {inner}"
+    unknown = re.match(r"Option '([\w.]+)' is not accepted", text)
+    if unknown:
+        name = unknown[1].replace(".init_args", "")
+        return f"{option}{'.' * bool(key)}{name}: '{name}' is not accepted"
+    subcommands = re.match(r'expected "subcommand" to be one of {(.*)}', text)
+    if subcommands:
+        return f"no stage given; expected one of {subcommands[1].replace(',', ', ')}"
+    value = re.search(r"import path string: ([^\n]*)|(?:Given|Got) value: ([^\n]*)\Z", text)
+    if not key or value is None:
+        return f"{option}: {text}" if key else text
+    if "is abstract" in text:
+        return f"{option} has no class; expected {option} CLASS with it"
+    if "Problem with given class_path" in text:
+        *_, first = causes(error)
+        return f"{option} cannot be had: {first}"
+    setting = re.search(r"NestedArg\(key='([\w.]+)'", text)
+    if setting and value[1]:
+        return f"{option}.{setting[1]}: {option} {value[1]} has no settings; expected one or the other"
+    types = re.search(r"Subtypes: \[(.*)\]\n|Expected an? (.*?)\. Got", text)
+    wanted = "" if types is None else _wanted(types[1] or types[2])
+    return f"{option} is {value[1] or value[2]}; expected {wanted or 'a class by its import path'}"
+
+
+def _wanted(types: str) -> str:
+    """Python's types in words.
+
+    Example:
+        >>> _wanted("<class 'int'>, typing.Literal['route', 'x'], <class 'NoneType'>")
+        'a whole number, route or x'
+    """
+    words = []
+    for name, choices, many in re.findall(r"<class '([\w.]+)'>|Literal\[(.*?)\]|\b(\w+)\[", types):
+        last = name.rpartition(".")[2]
+        if choices:
+            words += re.findall(r"\w+", choices)
+        elif last != "NoneType":
+            words.append(WORDS.get(last or many, f"a {last} by its import path"))
+    words = list(dict.fromkeys(words)) or ["null"]
+    return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
 
 
 def command_parser(name: str, function: Callable[..., None]) -> Parser:

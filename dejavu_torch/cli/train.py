@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import re
 import shlex
 import warnings
 from collections.abc import Iterator, Sequence
@@ -228,7 +229,8 @@ class TrainCLI(LightningCLI):
         try:
             trainer = super().instantiate_trainer(callbacks=own, **kwargs)
         except (ImportError, ValueError) as error:
-            raise InputError(str(error)) from error
+            told = re.sub(r"`(\w+)='(\w+)'`", r"--trainer.\1 \2", str(error))
+            raise InputError(told) from error
         trainer.words = self.words  # type: ignore[attr-defined]  # a MapTrainer
         return trainer
 

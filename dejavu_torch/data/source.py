@@ -20,6 +20,7 @@ from dejavu_torch.data.video import SUFFIXES as VIDEO_SUFFIXES
 from dejavu_torch.data.video import Video
 from dejavu_torch.types import InputError, Traverse
 
+KINDS = {int: "integer", float: "floating-point number"}  # what the values of options are
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `FrameRange`
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, "
@@ -154,7 +155,9 @@ def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[s
         try:
             given[name] = kind(value)
         except ValueError as error:
-            raise InputError(f"{text}: {name} is {value!r}; expected {kind.__name__}") from error
+            raise InputError(
+                f"{text}: {name} is {value!r}; expected {KINDS.get(kind, kind.__name__)}"
+            ) from error
     missing = [name for name, default in defaults.items() if default is empty and name not in given]
     if missing:
         raise InputError(f"{text}: {', '.join(missing)} is missing; expected {missing[0]}=...")

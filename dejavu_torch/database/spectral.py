@@ -647,10 +647,10 @@ class SpectralMapper(Mapper):
 
     Args:
         route_bytes_per_place: what the map may take for each place, without what does not grow with the
-            route; the step is chosen so that its coded lines fit. Names and positions of frames count, but
-            come on top, and a line says so, where they would leave the lines less than half. None, with no
-            step either, is 5 for frames. Ready features need not be smooth along the route: None holds .85 of
-            their variance, whatever that takes, as it does where 5 bytes are too few to code anything.
+            route; the step is chosen so that its coded lines fit. Positions of frames count, but come on top,
+            and a line says so, where they would leave the lines less than half. None, with no step either, is
+            5, and more where that holds less than .85 of the variance of ready features, which need not be
+            smooth along the route, or where mean and chunks alone take it, as on a short route.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -703,8 +703,8 @@ class SpectralMapper(Mapper):
 
     @property
     def budget(self) -> float | None:
-        """Bytes per place; None where a step, or the variance that is held, decides."""
-        own = self.route_bytes_per_place is not None or self.step is not None or self.ready
+        """Bytes per place; None where a step decides."""
+        own = self.route_bytes_per_place is not None or self.step is not None
         return self.route_bytes_per_place if own else ROUTE_BYTES
 
     @torch.no_grad()
@@ -757,10 +757,10 @@ class SpectralMapper(Mapper):
         """What is taken beside the map, where it counts: over half of the lines' room comes on top of it."""
         if self.budget is None or not self.taken:
             return 0
-        if self.taken <= (self.budget * places - overhead) / 2:
+        if self.taken <= max(0, self.budget * places - overhead) / 2:
             return self.taken
         log.warning(
-            "names and positions of frames take %.3g bytes per place, over half of what "
+            "positions of frames take %.3g bytes per place, over half of what "
             "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
             self.taken / places,
             self.budget,
@@ -769,22 +769,30 @@ class SpectralMapper(Mapper):
 
     def _step(self, lines: RouteLines, overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
-        if self.step is not None:
+        wanted = self.budget
+        if wanted is None:
+            assert self.step is not None
             return self.step
-        if self.budget is None:
-            return lines.step_that_holds(HELD)
         places, numbers = lines.lines.shape
-        room = self.budget * places - overhead
-        least = lines.coded_bytes(lines.steps[1])  # none of them
-        if room <= least or self.budget > 4 * numbers:
-            if self.route_bytes_per_place is None:  # nobody asked for them
-                return lines.step_that_holds(HELD)
+        nothing = lines.coded_bytes(lines.steps[1])  # of no lines
+        least = (overhead + nothing) / places
+        most = math.floor(least) + 4 * numbers  # all numbers as floats
+        if self.route_bytes_per_place is None and (self.ready or wanted <= least):
+            if wanted <= least:
+                log.warning(
+                    "mean and chunks of %d places take %.3g bytes for each, more than the default "
+                    "route_bytes_per_place of %g: they come on top of it",
+                    *(places, least, wanted),
+                )
+            fits = lines.step_of(max(wanted * places - (overhead if wanted > least else 0), nothing))
+            return min(fits, lines.step_that_holds(HELD))
+        if self.route_bytes_per_place is not None and not least < wanted <= most:
+            works = math.ceil(least + min(5, 2 * numbers))
             raise InputError(
-                f"route_bytes_per_place is {self.budget:g}; expected more than "
-                f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
-                f"and at most {4 * numbers}, {numbers} numbers as floats"
+                f"route_bytes_per_place is {wanted:g}; expected more than {least:.3g}, which the mean, "
+                f"chunks and positions take, such as {works}, and at most {most}, with all numbers as floats"
             )
-        return lines.step_of(room)
+        return lines.step_of(wanted * places - overhead)
 
 
 def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:

@@ -42,8 +42,9 @@ class MapSummary:
         kind: of the map. places: N. covered: places that at least one layer covers.
         templates: sum of phases. template_numbers: sum of phases x features.
         chunks: what repeats in each.
-        fixed: bytes that do not grow with the route, by part, such as the backbone.
-        route: bytes that do, by part, such as the templates.
+        fixed: bytes beside the map, by part, such as the backbone: but for the names of frames they do not
+            grow with the route.
+        route: bytes of the map itself, by part, such as the templates.
         lines: of a spectral map, those that are not 0.
     """
 
@@ -128,7 +129,8 @@ def describe(summary: MapSummary) -> str:
     stored = f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: "
     stored += f"{summary.route_bytes} of the route, {growing:.2f} per place ({_parts(summary.route)})"
     if summary.fixed:
-        stored += f", and {summary.fixed_bytes} fixed ({_parts(summary.fixed)})"
+        names = ", with the names of its frames" * ("names" in summary.fixed)
+        stored += f", and {summary.fixed_bytes} fixed{names} ({_parts(summary.fixed)})"
     lines.append(stored)
     return "\n".join(lines)
 

@@ -201,7 +201,7 @@ def _compact_stores(model: DejaVu, reference: Tensor, tolerance: int) -> dict[st
     """The descriptors that a spectral map codes: all in float, every k-th and interpolated ones in int8."""
     frames, dimension = reference.shape
     summary = model.summary()
-    fixed = summary.fixed_bytes - summary.fixed.get("header", 0)  # whitening and backbone: all need them
+    fixed = sum(summary.fixed.get(part, 0) for part in ("backbone", "whitening"))  # all need them
     one = "place" if len(model.map.positions) else "frame"
     apart, short = max(1, 2 * tolerance), as_int8(reference)
     between, spaced, keys = interpolated(short, model.map.summary().route_bytes)

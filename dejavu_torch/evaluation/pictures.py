@@ -86,6 +86,9 @@ class Localization(NamedTuple):
     tolerance: int
     matching: Matching = SINGLE
 
+    def __repr__(self) -> str:
+        return f"{self.query.name} on {self.reference.name}"
+
     @property
     def sequence(self) -> SequenceModel | None:
         """What scores consecutive queries together."""

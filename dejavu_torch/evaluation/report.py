@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -66,6 +67,14 @@ class Report(NamedTuple):
     def shown(self) -> dict[str, Contender]:
         """The rows of a table by key: ours as `map`, and the others that store something else each."""
         return {"map": self.ours, **distinct(self.contenders)}
+
+    def __repr__(self) -> str:
+        """What was scored, the main scores, and what else there is, in three lines."""
+        rows = score_table(self._replace(contenders={}))
+        scores = ", ".join(f"{name} {value}" for name, value in zip(*rows, strict=True) if name)
+        beside = f"; beside it {', '.join(self.contenders)}" if self.contenders else ""
+        first = summary(self).partition(". ")[0].rstrip(".")
+        return f"{first}\n{scores or self.ours.name}{beside}\nall of report.json: as_json()"
 
 
 def score_table(report: Report, every: bool = False) -> list[list[str]]:
@@ -223,6 +232,18 @@ def summary(report: Report) -> str:
         took = learning if facts["seconds_learn"] else "Localizing took"
         lines.append(f"{took} {facts['seconds_localize']:.1f} s")
     return ". ".join(lines) + "."
+
+
+def as_html(report: Report, pictures: Mapping[str, Picture]) -> str:
+    """The table of scores and two pictures, for a notebook; nothing in it lies in another file."""
+    shown = [name for name in ("pr", "coverage", "pairs") if name in pictures][:2]
+    rows = [[html.escape(printable(cell)) for cell in row] for row in score_table(report)]
+    table = [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows]
+    images = [
+        f'<img src="{_embedded(as_png(pictures[name]))}" style="width:25rem" alt="{name}"/>' for name in shown
+    ]
+    text = html.escape(printable(summary(report)))
+    return f"<table>{''.join(table)}</table><p>{text}</p>{''.join(images)}"
 
 
 def report_folder(path: Path) -> AbstractContextManager[Path]:

@@ -32,7 +32,7 @@ from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
-from dejavu_torch.evaluation.report import Report
+from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
 from dejavu_torch.experiments.storage import noise_over_map, storage_curve
@@ -59,13 +59,19 @@ class Comparison(NamedTuple):
 
     The run's traverses are as they were learned and localized, resampled where the model asks for it; its
     match and truth count places. candidates: of each query the best places, no two within the tolerance, as
-    many as were wanted or as a score takes.
+    many as were wanted or as a score takes. A notebook shows the table of scores and two pictures.
     """
 
     report: Report
     pictures: Mapping[str, Picture]
     run: Localization
     candidates: Candidates
+
+    def __repr__(self) -> str:
+        return f"{self.run!r}\n{self.report!r}\npictures: {', '.join(self.pictures)}"
+
+    def _repr_html_(self) -> str:
+        return as_html(self.report, self.pictures)
 
 
 def compare(
@@ -230,7 +236,10 @@ def _check_arguments(
         if value is not None and value < 0:
             raise InputError(f"{name} is {value}; expected at least 0")
     if leave_out is not None and not isinstance(model.mapper, TemplateMapper):
-        raise InputError(f"leave_out is {leave_out}, but it is of template maps: expected a TemplateMapper")
+        raise InputError(
+            f"leave_out is {leave_out}, but it is of template maps: expected a TemplateMapper, "
+            "as of --config local_maxima"
+        )
     if leave_out is not None and model.map.places and model.trained is not None:
         raise InputError(
             f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"

@@ -8,8 +8,9 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
+from dejavu_torch.features.progress import shown
+from dejavu_torch.features.views import AugmentedTraverse
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -34,7 +35,8 @@ def feature_batches(
         traverse: frames (B,C,H,W), or ready features (B,D), which are passed on.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time; fewer where they are large.
-        progress: text of a progress bar on stderr, shown on a terminal only; None is no bar.
+        progress: what to call this work on stderr, see `shown`; None shows nothing. Frames that are looked at
+            several times, as those of an AugmentedTraverse, count once.
         look: is given the first batch and its features.
 
     Shape: yields (B,D) float.
@@ -42,10 +44,9 @@ def feature_batches(
     Raises:
         InputError: features that are not (B,D) or not finite, or no frames at all.
     """
-    done = 0
-    hidden = None if progress else True
-    bar = tqdm(total=traverse.length, desc=progress, unit="frame", disable=hidden, leave=False)
-    with bar, in_mode(module, False):
+    done, looks = 0, traverse.copies if isinstance(traverse, AugmentedTraverse) else 1
+    total = traverse.length and traverse.length // looks
+    with shown(progress, total) as update, in_mode(module, False):
         for batch in traverse.batches(traverse.batch_size(batch_size)):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
@@ -60,8 +61,8 @@ def feature_batches(
                 )
             if look is not None and done == 0:
                 look(batch, features)
+            update((done + len(features)) // looks - done // looks)
             done += len(features)
-            bar.update(len(features))
             yield features
     if done == 0:
         raise InputError(f"{traverse.name} holds no frames; expected at least one")

@@ -79,6 +79,12 @@ class AugmentedTraverse(Traverse):
         return self.traverse.frame_shape
 
     @property
+    def looks(self) -> str:
+        """How often it looks at which frames, in words."""
+        each = "each frame" if self.shown.step == 1 else f"{len(self.shown)} of the frames"
+        return f"{self.copies} look{'s' * (self.copies > 1)} at {each}"
+
+    @property
     def views(self) -> Views:
         """The copies with the frames that they show."""
         blocks = torch.tensor(self.shown).split(self.block)

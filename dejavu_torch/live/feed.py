@@ -104,16 +104,20 @@ class Feed:
                 self._changed.notify_all()
 
 
-def in_real_time(shots: Iterable[Shot], name: str) -> Iterator[Shot]:
+def in_real_time(shots: Iterable[Shot], name: str, rate: float | None = None) -> Iterator[Shot]:
     """Each frame no earlier than its timestamp says, counted from the first.
 
+    Args:
+        rate: frames a second of a source without times.
+
     Raises:
-        InputError: frames without times.
+        InputError: frames without times, and no rate.
     """
     began: float | None = None
     for shot in shots:
-        if math.isnan(shot.seconds):
+        seconds = shot.number / rate if rate and math.isnan(shot.seconds) else shot.seconds
+        if math.isnan(seconds):
             raise InputError(f"{name} has no times; expected a video for --realtime")
-        began = time.monotonic() - shot.seconds if began is None else began
-        time.sleep(max(0.0, began + shot.seconds - time.monotonic()))
+        began = time.monotonic() - seconds if began is None else began
+        time.sleep(max(0.0, began + seconds - time.monotonic()))
         yield shot

@@ -133,6 +133,14 @@ class LiveLocalizer:
             routes[int(found.route_of(match.index))].name if routes and place >= 0 else "",
         )
 
+    @property
+    def posterior(self) -> Tensor | None:
+        """(N+1,) probabilities of each place, and of being off the map, behind the latest frame; None without
+        a filter, or ahead of the first frame."""
+        if not isinstance(self.sequence, PlaceFilter) or self.scores is None:
+            return None
+        return self.sequence.latest()
+
     def _describe(self, batch: Tensor) -> Tensor:
         """The descriptor of a frame that fits the map, (1,K)."""
         batch = self.model.fit_frames(batch)

@@ -37,7 +37,8 @@ PAGE = Path(__file__).with_name("page.html")
 class Moment(NamedTuple):
     """What the page shows of one frame.
 
-    scores: (N,) of all places. posterior: whether they are -log of probabilities. p50, p99: milliseconds.
+    scores: (N,) of all places; or, where `posterior`, (N+1,) probabilities of each and of being off the map.
+    p50, p99: milliseconds.
     """
 
     shot: Shot
@@ -144,7 +145,8 @@ class Page:
         return state | {
             "frames": moment.frames,
             "dropped": moment.dropped,
-            "places": len(moment.scores),
+            "places": len(moment.scores) - moment.posterior,
+            "off": round(float(moment.scores[-1]), 6) if moment.posterior else None,
             "kind": "Posterior over the route"
             if moment.posterior
             else "Match over the route, the best place 1",
@@ -160,26 +162,30 @@ def _number(value: Any) -> Any:
 
 
 def curve(scores: Tensor, posterior: bool) -> list[float]:
-    """Scores (N,) as at most `COLUMNS` heights in [0, 1], each the highest of its places.
+    """What the page draws of all places, as at most `COLUMNS` heights in [0, 1].
 
     Args:
-        posterior: the scores are -log of probabilities, which are the heights; else the best score has height
-            1, and the worst 0.
+        scores: (N,), of which a column has the best of its places: the best of all has height 1, the worst 0.
+        posterior: they are probabilities (N+1,), the last of being off the map: a column has the sum of its
+            places, so that all columns and the last number add up to 1.
 
     Example:
         >>> curve(torch.tensor([3.0, 1.0, 2.0, torch.inf]), posterior=False)
         [0.0, 1.0, 0.5, 0.0]
+        >>> curve(torch.tensor([0.25, 0.5, 0.0, 0.25]), posterior=True)
+        [0.25, 0.5, 0.0]
     """
     scores = scores.detach().float().cpu()
-    known = scores.isfinite()
     if posterior:
-        height = (-scores).exp()
-    elif known.any():
+        places = len(scores) - 1
+        columns = min(COLUMNS, places)
+        sums = torch.zeros(columns).index_add_(0, torch.arange(places) * columns // places, scores[:-1])
+        return [round(value, 6) for value in sums.tolist()]
+    known = scores.isfinite()
+    height = torch.zeros_like(scores)
+    if known.any():
         worst, best = scores[known].max(), scores[known].min()
-        height = (worst - scores) / (worst - best).clamp(min=1e-12)
-    else:
-        height = torch.zeros_like(scores)
-    height = torch.where(known, height, 0).clamp(0, 1)
+        height = torch.where(known, (worst - scores) / (worst - best).clamp(min=1e-12), 0).clamp(0, 1)
     columns = min(COLUMNS, len(height))
     best = torch.nn.functional.adaptive_max_pool1d(height[None], columns)[0]
     return [round(value, 4) for value in best.tolist()]

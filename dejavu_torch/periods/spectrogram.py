@@ -158,7 +158,7 @@ class SpectrogramAnalysis(PeriodFinder):
         if window < self.window and self.short == "refuse":
             raise InputError(
                 f"the route has {places} places; expected at least {self.window}, the window, "
-                "or a shorter window, or short='shrink'"
+                "or a shorter window, or one that shrinks (--mapper.periods.short shrink)"
             )
         hop = min(self.hop or window, window)
         chunks = [(start, start + window) for start in range(0, places - window + 1, hop)]

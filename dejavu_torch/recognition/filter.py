@@ -123,6 +123,7 @@ class PlaceFilter(SequenceModel):
         self.off_map = nn.Parameter(torch.tensor(float(off_map)))
         self.within, self.threshold, self.search_every = within, threshold, search_every
         self.moved = 1  # how often the camera has moved since the query before
+        self._latest: tuple[Tensor, int, int] | None = None  # arguments of `_spread`
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         return self.unlikely(self.posterior(scores, before)[:, :-1], scores)
@@ -222,8 +223,14 @@ class PlaceFilter(SequenceModel):
         before = None
         for scores in batches:
             posterior = self.posterior(scores, before)
-            before = posterior[-1].detach() if len(posterior) else before
+            if len(posterior):
+                before = posterior[-1].detach()
+                self._latest = _with_rest(before), 0, scores.shape[1]
             yield self.unlikely(posterior[:, :-1], scores)
+
+    def latest(self) -> Tensor | None:
+        """The posterior (N+1,) behind the latest query of `stream` or `follow`; None ahead of the first."""
+        return None if self._latest is None else _without_rest(_spread(*self._latest))
 
     def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
         """See `SequenceModel`; between two searches only the places of a likely stretch are scored.
@@ -267,6 +274,7 @@ class PlaceFilter(SequenceModel):
                     moments, covered = search
                 since += 1
                 belief = self._updated(expected, self.evidence(scores, moments)[0])
+                self._latest = belief, start, places
                 found.append(self._told(belief, start, scores, covered))
             if found:
                 yield found

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import base64
+import io
 import re
 from collections.abc import Iterator
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 import torch
 from footage import QUERY, REFERENCE, STEP, camera, everything
 from footage import footage as ground
 from helpers import Fixed, all_of, refused, template_model
+from PIL import Image
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu, InputError, SequenceMatcher, SpectrogramAnalysis
@@ -47,6 +51,35 @@ def test_scores_of_a_route_that_repeats(model: DejaVu) -> None:
     pictures = {"coverage", "scores", "pr", "auc", "chunks", "spectrogram", "templates", "activations"}
     assert set(result.pictures) == pictures
     assert 0 <= report["activations"]["fused"]["inside"] <= 1
+
+
+def test_a_comparison_is_shown_in_a_few_lines_and_in_a_notebook_as_table_and_pictures(model: DejaVu) -> None:
+    reference, query = ArrayTraverse(route(0), "<b>&one"), ArrayTraverse(route(1), "two")
+    result = compare(reference, query, "0", model)
+    scores = result.report.ours.scores
+    assert scores is not None
+    for told in (repr(result), repr(result.report)):
+        assert len(told) < 1000
+        assert told.count("\n") < 6
+        assert f"AUC {scores.auc:.3f}" in told
+        assert "240 queries" in told
+        assert "null" in told
+    assert "two on <b>&one" in repr(result)
+    html = result._repr_html_()
+    root = ElementTree.fromstring(f"<body>{html}</body>")
+    assert len(root.findall(".//tr")) == 1 + len(result.report.shown())
+    assert [cell.text for cell in root.findall(".//tr")[1]][1] == f"{scores.auc:.3f}"
+    images = [image.get("src", "") for image in root.findall(".//img")]
+    assert len(images) == 2
+    for image in images:
+        png = base64.b64decode(image.removeprefix("data:image/png;base64,"))
+        assert Image.open(io.BytesIO(png)).width > 300
+
+
+def test_what_is_not_scored_is_shown_too(model: DejaVu) -> None:
+    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1, 200)), model=model)
+    assert "nothing is scored" in repr(result)
+    assert result._repr_html_().count("<img") == 1  # of ready features
 
 
 def test_leave_out_is_printed_beside_never_instead(model: DejaVu) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import re
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -11,7 +14,9 @@ from torch import Tensor, nn
 
 from dejavu_torch import HOG, InputError, Traverse, types
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.features import progress
 from dejavu_torch.features.extract import feature_batches, features_of
+from dejavu_torch.features.views import AugmentedTraverse
 
 
 class Pooled(nn.Module):
@@ -152,3 +157,44 @@ def test_batches_of_large_frames_are_smaller(monkeypatch: pytest.MonkeyPatch) ->
     batches = list(feature_batches(ArrayTraverse(frames), HOG(), 64))
     assert [len(batch) for batch in batches] == [3, 3, 1]
     torch.testing.assert_close(torch.cat(batches), HOG()(frames))
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_bar_counts_frames_however_often_they_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = ArrayTraverse(torch.rand(70, 1, 16, 16))
+    copies = AugmentedTraverse(frames, 70, 3, 10_000, {"noise": 0.01})
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr("tqdm.std.time", iter(range(10**6)).__next__)  # each update is shown
+    batches = list(feature_batches(copies, nn.Flatten(), 64, progress=f"learning: {copies.looks}"))
+    assert sum(map(len, batches)) == 210
+    counts = [tuple(map(int, pair)) for pair in re.findall(r"(\d+)/(\d+)", terminal.getvalue())]
+    assert {total for _, total in counts} == {70}
+    assert counts == sorted(counts)
+    assert counts[-1] == (70, 70)
+    assert "3 looks at each frame" in terminal.getvalue()
+    some = AugmentedTraverse(frames, 70, 3, 100, {"noise": 0.01})
+    assert some.looks == "3 looks at 24 of the frames"
+    assert "1 look at each" in AugmentedTraverse(frames, 70, 1, 100, {"noise": 0.01}).looks
+
+
+def test_without_a_terminal_there_is_a_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = ArrayTraverse(torch.rand(100, 1, 4, 4))
+    list(feature_batches(frames, nn.Flatten(), 1, progress="learning"))
+    assert capsys.readouterr().err == ""  # over at once
+    clock = iter(range(10**6))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))  # a second a frame
+    list(feature_batches(frames, nn.Flatten(), 1, progress="learning"))
+    lines = capsys.readouterr().err.splitlines()
+    assert [re.findall(r"\d+", line) for line in lines] == [["30", "100", "70"], ["90", "100", "10"]]
+    assert all("learning" in line for line in lines)
+    list(feature_batches(Listed(*frames.batches(1)), nn.Flatten(), 1, progress="learning"))
+    assert [re.findall(r"\d+", line) for line in capsys.readouterr().err.splitlines()] == [["30"], ["90"]]
+    list(feature_batches(frames, nn.Flatten(), 1))
+    assert capsys.readouterr().err == ""

@@ -97,3 +97,6 @@ def test_real_time() -> None:
     assert time.monotonic() - began >= 0.1
     with refused("no times"):
         list(in_real_time([Shot(0, math.nan, PIXELS)], "folder"))
+    began = time.monotonic()
+    assert len(list(in_real_time((Shot(i, math.nan, PIXELS) for i in range(6)), "folder", rate=50))) == 6
+    assert time.monotonic() - began >= 0.1

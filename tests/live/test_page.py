@@ -29,8 +29,9 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 def moment(number: int = 7, name: str = "left<b>.png", accepted: bool = True, time: float = 0.28) -> Moment:
     pixels = np.zeros((24, 32, 3), np.uint8)
     pixels[:, :16] = (200, 40, 40)
-    scores = torch.full((3000,), 9.0)
-    scores[1200:1210] = torch.tensor([3, 2, 1, 0.2, 0.1, 0.1, 0.2, 1, 2, 3])
+    scores = torch.full((3001,), 1e-5)
+    scores[1200:1204] = torch.tensor([0.1, 0.3, 0.3, 0.2])
+    scores[-1] = 1 - scores[:-1].sum()
     match = LiveMatch(1204, 1204, name, 0.1, math.exp(-0.1), 0.99, accepted, 12.5)
     return Moment(Shot(number, time, pixels), match, scores, True, 8, 2, 11.0, 19.0)
 
@@ -55,7 +56,8 @@ def test_the_state_is_that_of_the_latest_frame(page: Page) -> None:
     assert known.items() <= state.items()
     assert str(state["query"]).startswith("data:image/jpeg;base64,")
     assert state["reference"] is None
-    assert max(state["curve"]) == pytest.approx(math.exp(-0.1), abs=1e-3)  # type: ignore[type-var]
+    assert sum(state["curve"]) + state["off"] == pytest.approx(1, abs=1e-3)  # type: ignore[call-overload]
+    assert 0.5 < max(state["curve"]) < 0.91  # type: ignore[type-var]
     assert "curve" not in state_of(page, seen="7")
     page.show(moment(8, time=math.nan))
     assert (state_of(page, seen="7")["number"], state_of(page)["time"]) == (8, None)
@@ -96,9 +98,20 @@ def test_a_port_that_cannot_be_had_is_one_line(page: Page) -> None:
 def test_curve_keeps_the_highest_of_many_places() -> None:
     scores = torch.full((100_000,), 12.0)
     scores[70_001] = 0.0
-    heights = curve(scores, posterior=True)
+    heights = curve(scores, posterior=False)
     assert (len(heights), max(heights), heights.index(max(heights))) == (512, 1.0, 512 * 70_001 // 100_000)
     assert curve(torch.full((4,), math.inf), posterior=False) == [0.0] * 4
+
+
+@pytest.mark.parametrize("places", [1, 7, 512, 700, 100_000])
+def test_columns_of_a_posterior_and_being_off_the_map_add_up_to_1(places: int) -> None:
+    posterior = torch.rand(places + 1, generator=torch.Generator().manual_seed(0))
+    posterior /= posterior.sum()
+    heights = curve(posterior, posterior=True)
+    assert len(heights) == min(512, places)
+    assert sum(heights) == pytest.approx(1 - float(posterior[-1]), abs=1e-3)
+    middle = torch.arange(places) * len(heights) // places == len(heights) // 2
+    assert heights[len(heights) // 2] == pytest.approx(float(posterior[:-1][middle].sum()), abs=1e-5)
 
 
 def test_reference_pictures_of_any_source(tmp_path: Path) -> None:

@@ -144,16 +144,22 @@ def test_the_budget_is_met_as_far_as_the_sample_tells(caplog: pytest.LogCaptureF
     assert [text for text in caplog.messages if f"{size(model):.3g}" in text and "400 of its 1030" in text]
 
 
-def test_names_count_in_the_budget(tmp_path: Path) -> None:
+def test_names_are_beside_the_budget() -> None:
     class Named(ArrayTraverse):
         def frame_name(self, i: int) -> str:
             return f"{i * i % 10007}"
 
-    model = learned(Named(route()), 12.0)
-    names = model.summary().route["names"] / PLACES
-    assert 1 < names < 6
-    assert abs(model.summary().route_bytes / PLACES / 12 - 1) < 0.05
+    model, plain = learned(Named(route()), 4.0), learned(route(), 4.0)
+    assert model.summary().fixed["names"] > PLACES
+    assert model.summary().route == plain.summary().route
     assert model.frame_names[3] == "9"
+
+
+def test_where_the_default_budget_gives_way_one_line_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    mapper = SpectralMapper(chunk=3)  # whose chunks alone take over 9 bytes per place
+    model = DejaVu(whitening="none", mapper=mapper).learn(route())
+    assert model.summary().route_bytes > 9 * PLACES
+    assert len(caplog.messages) == 1
 
 
 def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
@@ -258,18 +264,18 @@ def test_other_code_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_a_run_of_which_nothing_is_finished_blocks_no_other(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "route", frames(520, size=16))
-    good = (folder / "0.png").read_bytes()  # in the sample
+    good = (folder / "1.png").read_bytes()  # in the sample
 
     def learn() -> None:
         mapper = SpectralMapper(8.0, chunk=CHUNK)
         model = DejaVu(HOG(cell=8), "none", mapper)
         model.learn(open_source(folder), work=WorkFolder(tmp_path / "work"))
 
-    (folder / "0.png").write_bytes(b"no image")
-    with refused("0.png"):
+    (folder / "1.png").write_bytes(b"no image")
+    with refused("1.png"):
         learn()
     (tmp_path / "work" / f"{PREFIX}of-a-kill").mkdir()
-    (folder / "0.png").write_bytes(good)
+    (folder / "1.png").write_bytes(good)
     WorkFolder(tmp_path / "work").check_unused()
     learn()
     assert len(list((tmp_path / "work").glob("chunks-*"))) == 6
