@@ -649,8 +649,8 @@ class SpectralMapper(Mapper):
         route_bytes_per_place: what the map may take for each place, without what does not grow with the
             route; the step is chosen so that its coded lines fit. Names and positions of frames count, but
             come on top, and a line says so, where they would leave the lines less than half. None, with no
-            step either, is 5 for frames. Ready features need not be smooth along the route: None holds .85 of
-            their variance, whatever that takes, as it does where 5 bytes are too few to code anything.
+            step either, is 5. Ready features need not be smooth along the route: None is then at least 5, and
+            as many as hold .85 of their variance; so it is where 5 are too few to code anything.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -703,7 +703,7 @@ class SpectralMapper(Mapper):
 
     @property
     def budget(self) -> float | None:
-        """Bytes per place; None where a step, or the variance that is held, decides."""
+        """Bytes per place; None where a step, or the variance that a map holds, decides."""
         own = self.route_bytes_per_place is not None or self.step is not None or self.ready
         return self.route_bytes_per_place if own else ROUTE_BYTES
 
@@ -771,20 +771,22 @@ class SpectralMapper(Mapper):
         """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
         if self.step is not None:
             return self.step
-        if self.budget is None:
-            return lines.step_that_holds(HELD)
         places, numbers = lines.lines.shape
-        room = self.budget * places - overhead
+        given = self.route_bytes_per_place
+        budget = ROUTE_BYTES if given is None else given
+        room = budget * places - overhead
         least = lines.coded_bytes(lines.steps[1])  # none of them
-        if room <= least or self.budget > 4 * numbers:
-            if self.route_bytes_per_place is None:  # nobody asked for them
-                return lines.step_that_holds(HELD)
+        fits = least < room and budget <= 4 * numbers
+        if given is not None and not fits:
             raise InputError(
-                f"route_bytes_per_place is {self.budget:g}; expected more than "
+                f"route_bytes_per_place is {given:g}; expected more than "
                 f"{(overhead + least) / places:.3g}, which the mean, chunks, names and positions take, "
                 f"and at most {4 * numbers}, {numbers} numbers as floats"
             )
-        return lines.step_of(room)
+        step = lines.step_of(room) if fits else math.inf
+        if given is None and (self.ready or not fits):
+            return min(step, lines.step_that_holds(HELD))
+        return step
 
 
 def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:
