@@ -242,7 +242,6 @@ class DejaVu(nn.Module):
             InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
-        self._reduce(traverse)
         text = "learning" if progress else None
         before = None if self.whitening is None else self.whitening.state_dict()
         try:
@@ -291,6 +290,7 @@ class DejaVu(nn.Module):
             states = [traverse.state(run.start, run.stop) for run in sampled]
             key = self.run_key(traverse, frames, states, visits)
             work.open(key | digests(second=_state_of(second)))
+        self._reduce(traverse)
         visits = visits and self.read_once(visits, progress)
         with in_one_thread():
             fit = self._fit(traverse, frames, second, taken, progress, work, visits)
@@ -301,7 +301,7 @@ class DejaVu(nn.Module):
         route.needed = fit.needed
         if counts is not None:
             route.count_visits(counts)
-        self._say_reached(route, taken, _is_ready(traverse))
+        self._say_reached(route, taken, mapper.beside(taken, _is_ready(traverse)))
         return self._take(route, traverse, names, positions)
 
     def _fit(
@@ -406,12 +406,11 @@ class DejaVu(nn.Module):
         sources = digests(source=[traverse.identity(), frames, states], visits=_state_of(visits))
         return sources | {"settings": sums.pop(HEADER), **sums}
 
-    def _say_reached(self, route: SpectralMap, taken: int, ready: bool) -> None:
+    def _say_reached(self, route: SpectralMap, taken: int, mapper: Mapper) -> None:
         """What a long route takes, where the sample told wrongly."""
-        wanted, places = getattr(self.mapper, "budget", None), route.places
+        wanted, places = getattr(mapper, "budget", None), route.places
         summary = route.summary()
-        gave_way = ready and getattr(self.mapper, "route_bytes_per_place", None) is None
-        if wanted is None or gave_way or summary.route_bytes - summary.route["lines"] >= wanted * places:
+        if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
             return
         reached = (summary.route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
         if abs(reached / wanted - 1) > OFF:

@@ -703,8 +703,8 @@ class SpectralMapper(Mapper):
 
     @property
     def budget(self) -> float | None:
-        """Bytes per place; None where a step decides."""
-        own = self.route_bytes_per_place is not None or self.step is not None
+        """Bytes per place; None where a step, or the variance that a map holds, decides."""
+        own = self.route_bytes_per_place is not None or self.step is not None or self.ready
         return self.route_bytes_per_place if own else ROUTE_BYTES
 
     @torch.no_grad()
@@ -769,30 +769,29 @@ class SpectralMapper(Mapper):
 
     def _step(self, lines: RouteLines, overhead: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
-        wanted = self.budget
-        if wanted is None:
-            assert self.step is not None
+        if self.step is not None:
             return self.step
         places, numbers = lines.lines.shape
+        given = self.route_bytes_per_place
         nothing = lines.coded_bytes(lines.steps[1])  # of no lines
         least = (overhead + nothing) / places
         most = math.floor(least) + 4 * numbers  # all numbers as floats
-        if self.route_bytes_per_place is None and (self.ready or wanted <= least):
-            if wanted <= least:
-                log.warning(
-                    "mean and chunks of %d places take %.3g bytes for each, more than the default "
-                    "route_bytes_per_place of %g: they come on top of it",
-                    *(places, least, wanted),
-                )
-            fits = lines.step_of(max(wanted * places - (overhead if wanted > least else 0), nothing))
-            return min(fits, lines.step_that_holds(HELD))
-        if self.route_bytes_per_place is not None and not least < wanted <= most:
+        if given is not None and not least < given <= most:
             works = math.ceil(least + min(5, 2 * numbers))
             raise InputError(
-                f"route_bytes_per_place is {wanted:g}; expected more than {least:.3g}, which the mean, "
+                f"route_bytes_per_place is {given:g}; expected more than {least:.3g}, which the mean, "
                 f"chunks and positions take, such as {works}, and at most {most}, with all numbers as floats"
             )
-        return lines.step_of(wanted * places - overhead)
+        budget = ROUTE_BYTES if given is None else given
+        short = budget <= least
+        if short:
+            log.warning(
+                "mean and chunks of %d places take %.3g bytes for each, more than the default "
+                "route_bytes_per_place of %g: they come on top of it",
+                *(places, least, budget),
+            )
+        step = lines.step_of(max(nothing, budget * places - overhead * (not short)))
+        return min(step, lines.step_that_holds(HELD)) if given is None and (self.ready or short) else step
 
 
 def check_settings(metric: str, transform: str, chunk: int | str, resolution: float) -> None:

@@ -467,3 +467,24 @@ def test_visits_to_appended_places_are_averaged_in_chunk_by_chunk(tmp_path: Path
     assert whole.map.visits.tolist() == [[500, 1], [PLACES - 500, 2]]
     assert file_of(grown(work=WorkFolder(tmp_path / "work")), tmp_path) == file_of(whole, tmp_path)
     assert made == []
+
+
+def test_a_long_route_of_ready_features_holds_their_variance(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Wide ones that change from place to place: reduced, though nothing whitens, and resumed alike."""
+    random = torch.Generator().manual_seed(0)
+    basis = torch.randn(60, 300, generator=random)
+    places = torch.randn(PLACES, 60, generator=random) @ basis
+    wide = ArrayTraverse(places)
+
+    def learn() -> DejaVu:
+        model = DejaVu(whitening="none", mapper=SpectralMapper(chunk=CHUNK))
+        return model.learn(wide, work=WorkFolder(tmp_path / "work"))
+
+    first, again = learn(), learn()
+    assert first.map.dimension == 61
+    assert first.summary().route_bytes > 8 * PLACES
+    assert "route_bytes_per_place" not in caplog.text
+    assert torch.equal(again(places[:9]), first(places[:9]))
+    assert torch.equal(first.localize(places[::50]).index, torch.arange(0, PLACES, 50))
