@@ -41,7 +41,7 @@ HINT = (
 MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 NETWORKS = ("features", "backbone", "network")  # options that name a class, or a function that makes one
 WORDS = {  # what values of Python's types are on a command line
-    "int": "a whole number",
+    "int": "an integer",
     "float": "a number",
     "bool": "true or false",
     "str": "a word",
@@ -217,7 +217,7 @@ def _wanted(types: str) -> str:
 
     Example:
         >>> _wanted("<class 'int'>, typing.Literal['route', 'x'], <class 'NoneType'>")
-        'a whole number, route or x'
+        'an integer, route or x'
     """
     words = []
     for name, choices, many in re.findall(r"<class '([\w.]+)'>|Literal\[(.*?)\]|\b(\w+)\[", types):
@@ -323,6 +323,8 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         if arguments.get("descriptor"):
             _check_own(arguments["descriptor"], told, "descriptor")
         model = arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
+        if "mapper.route_bytes_per_place" in told and isinstance(model.mapper, SpectralMapper):
+            model.mapper.gives_way = False  # what is asked for is met, or refused
         if whitening:
             written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"
             check_not_read(written, whitening)

@@ -50,6 +50,7 @@ BLOCK = 2**19  # numbers made at a time: they stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk made at a time, which is gone through for each
 ROWS = 2**14  # of descriptors, looked at together
 COPIES = 4  # numbers held for a place of a long chunk and a query: line, transform, score, is it best
+BUDGET = 5.0  # route bytes per place, where nobody asks for others
 LITTLE = 0.1  # of the variance: a map that holds less says what it needs
 # measured, in multiplications of a matrix product:
 LINE_COST = 150  # of a coded line in a query's sum
@@ -640,10 +641,6 @@ class SpectralMap(PlaceMap):
         )
 
 
-class Default(float):
-    """A budget that nobody gave: on a route too short for it the mean and the chunks come on top of it."""
-
-
 class SpectralMapper(Mapper):
     """Codes descriptors along the route: the transform of each number over a chunk, in steps of one size.
 
@@ -651,7 +648,7 @@ class SpectralMapper(Mapper):
         route_bytes_per_place: what the map may take for each place, without what does not grow with the
             route; the step is chosen so that its coded lines fit. Positions of frames count, but come on top,
             and a line says so, where they would leave the lines less than half; so do mean and chunks where
-            they alone, as on a short route, take the 5 of the default.
+            they alone, as on a short route, take the 5 of the default, unless `gives_way` is set to False.
         step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
         chunk: places of a chunk: "route" is one chunk, or a number of places; shorter chunks cost more bytes,
             and the map can be extended.
@@ -681,7 +678,7 @@ class SpectralMapper(Mapper):
 
     def __init__(
         self,
-        route_bytes_per_place: float | None = Default(5.0),
+        route_bytes_per_place: float | None = BUDGET,
         step: float | None = None,
         chunk: int | Literal["route"] = "route",
         transform: Transform = "dft",
@@ -700,6 +697,7 @@ class SpectralMapper(Mapper):
         check_settings(metric, transform, chunk, resolution)
         self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
         self.transform, self.metric, self.resolution = transform, metric, resolution
+        self.gives_way = route_bytes_per_place == BUDGET
         self.taken = 0  # bytes of the budget, see `beside`
 
     @torch.no_grad()
@@ -770,7 +768,7 @@ class SpectralMapper(Mapper):
         nothing = lines.coded_bytes(lines.steps[1])
         least = (overhead + nothing) / places
         most = math.floor(least) + 4 * numbers  # all numbers as floats
-        if isinstance(wanted, Default):
+        if self.gives_way:
             if wanted <= least:
                 log.warning(
                     "mean and chunks of %d places take %.3g bytes for each, which the default "

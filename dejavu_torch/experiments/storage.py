@@ -98,6 +98,7 @@ def _coded(
 ) -> Iterator[tuple[Found, int]]:
     """What is found on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
     mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric, resolution)
+    mapper.gives_way = False
     model = with_mapper(run.model, mapper)
     try:
         model.learn_features(features)
