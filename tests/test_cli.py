@@ -412,14 +412,14 @@ def test_a_map_that_cannot_be_judged(trained_map: Path, capsys: pytest.CaptureFi
 # what is refused
 
 WRONG = {  # a line of words behind `dejavu`, and what its one line holds
-    "demo --seed x": ("--seed is x", "whole number"),
-    "learn a.npy --map m.safetensors --batch_size 2.5": ("--batch_size is 2.5", "whole number"),
+    "demo --seed x": ("--seed is x", "integer"),
+    "learn a.npy --map m.safetensors --batch_size 2.5": ("--batch_size is 2.5", "integer"),
     "learn a.npy --map m.safetensors --threshold high": ("--threshold is high", "a number"),
     "learn a.npy --map m.safetensors --weight_bits 4": ("--weight_bits is 4", "8 or 32"),
     "learn a.npy --map m.safetensors --seed 99999999999999999999": ("--seed is 99999999999999999999", "most"),
     "learn a.npy --map m.safetensors --features short": ("--features is short", "import path"),
     "learn a.npy --map m.safetensors --features no.such.Net": ("--features", "'no'"),
-    "learn a.npy --map m.safetensors --features.cell big": ("--features.cell is big", "whole number"),
+    "learn a.npy --map m.safetensors --features.cell big": ("--features.cell is big", "integer"),
     "learn a.npy --map m.safetensors --features.cel 3": ("--features.cel", "not accepted"),
     "learn a.npy --map m.safetensors --features.bins soft": ("--features.bins is soft", "hard or linear"),
     "learn a.npy --map m.safetensors --features torch.nn.Linear": ("--features.in_features", "required"),
@@ -430,7 +430,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     ),
     "learn a.npy --map m.safetensors --whitening.bits 5": ("shrinkage=null", "bits=5"),
     "learn a.npy --map m.safetensors --mapper HOG": ("--mapper is HOG", "Mapper"),
-    "learn a.npy --map m.safetensors --mapper.chunk some": ("--mapper.chunk is some", "number or route"),
+    "learn a.npy --map m.safetensors --mapper.chunk some": ("--mapper.chunk is some", "integer or route"),
     "learn a.npy --map m.safetensors --mapper.step 1": ("route_bytes_per_place is 5.0", "step is 1", "null"),
     "learn a.npy --map m.safetensors --config local_maxima --mapper.periods Foo": (
         "--mapper.periods is Foo",
@@ -443,20 +443,35 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m.safetensors --calibration c.npy": ("6 frames", "--calibration_truth"),
     "learn one.npy --map m.safetensors": ("one.npy has 1 frame", "at least 2"),
     "learn sim:aerial?frames=many --map m.safetensors": ("frames is 'many'", "integer"),
-    "localize m a.npy --out m.csv --top some": ("--top is some", "whole number"),
+    "localize m a.npy --out m.csv --top some": ("--top is some", "integer"),
     "localize m a.npy --out m.csv --speeds [fast]": ("--speeds is", "fast", "a list"),
     "localize m a.npy --out m.csv --search fast": ("--search is fast", "auto, scan, bound or ivf"),
     "compare a.npy b.npy --out r --config paper": ("18 places", "1024", "--mapper.periods.short shrink"),
     "compare a.npy b.npy --out r --leave_out 3": ("leave_out is 3", "--config local_maxima"),
-    "evaluate a.csv --truth 0 --out r --tolerance some": ("--tolerance is some", "whole number"),
-    "live m a.npy --page many": ("--page is many", "whole number"),
+    "evaluate a.csv --truth 0 --out r --tolerance some": ("--tolerance is some", "integer"),
+    "live m a.npy --page many": ("--page is many", "integer"),
     "merge m.safetensors --map n.safetensors": ("m.safetensors", "at least two maps"),
-    "bench scale --out r --places few": ("--places is few", "whole number"),
+    "bench scale --out r --places few": ("--places is few", "integer"),
     "train": ("fit, validate, test",),
     "train fit --data.source a.npy --model.lr fast": ("--model.lr is fast", "a number"),
     "train fit --data.source a.npy --trainer.accelerator abacus": ("--trainer.accelerator abacus", "cpu"),
     "train fit --data.source a.npy --model.mapper Nothing": ("--model.mapper is Nothing", "Mapper"),
 }
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8, 12])
+def test_short_routes_fit_or_are_refused_with_a_number_that_works(
+    count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    np.save(tmp_path / "a.npy", frames(count))
+    learn = "learn", tmp_path / "a.npy", "--map", tmp_path / "m.safetensors", "--calibration", "none"
+    run(*learn)
+    summary = DejaVu.load(tmp_path / "m.safetensors").summary()
+    assert (summary.route_bytes > 5 * count) == (len(caplog.messages) == 1) == (count < 6)
+    run(*learn, "--mapper.route_bytes_per_place", "null", "--mapper.step", "0.1")
+    capsys.readouterr()
+    error = fails(capsys, *learn, "--mapper.route_bytes_per_place", "5" if count < 6 else "0.2")
+    run(*learn, "--mapper.route_bytes_per_place", re.findall(r"such as (\d+)", error)[0])
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ HINT = (
 MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 NETWORKS = ("features", "backbone", "network")  # options that name a class, or a function that makes one
 WORDS = {  # what values of Python's types are on a command line
-    "int": "a whole number",
+    "int": "an integer",
     "float": "a number",
     "bool": "true or false",
     "str": "a word",
@@ -217,7 +217,7 @@ def _wanted(types: str) -> str:
 
     Example:
         >>> _wanted("<class 'int'>, typing.Literal['route', 'x'], <class 'NoneType'>")
-        'a whole number, route or x'
+        'an integer, route or x'
     """
     words = []
     for name, choices, many in re.findall(r"<class '([\w.]+)'>|Literal\[(.*?)\]|\b(\w+)\[", types):

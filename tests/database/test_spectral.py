@@ -192,8 +192,8 @@ def test_on_a_short_route_the_default_budget_gives_way(
 def test_the_default_budget_of_few_numbers_is_what_they_take() -> None:
     """5 bytes are more than one number takes as a float: as a default they only bound it."""
     assert 1 < SpectralMapper()(route(200, 1)).summary().route_bytes / 200 < 4
-    with refused("route_bytes_per_place is 5", "at most 4"):
-        SpectralMapper(5.0)(route(200, 1))
+    with refused("route_bytes_per_place is 6", "at most 4"):
+        SpectralMapper(6.0)(route(200, 1))
 
 
 def test_more_bytes_hold_more_of_the_route() -> None:
