@@ -45,12 +45,15 @@ class Traverse(ABC):
         length: number of frames N, or None where only reading to the end can tell.
         place: (N,) float64, the true position of each frame in units of reference frames,
             or None where it is unknown.
+        cut: how the frames were cut out of one long image, and which of all such cuts they are: two traverses
+            that were cut alike show the same places. None where they were not cut out of one.
         seeks: whether `between` reads nothing ahead of the first frame that is asked for.
     """
 
     name: str = "traverse"
     length: int | None = None
     place: Tensor | None = None
+    cut: tuple[tuple[int, ...], range] | None = None
     seeks: bool = False
 
     @abstractmethod
@@ -276,6 +279,8 @@ class SequenceModel(nn.Module, ABC):
     queries.
     """
 
+    likely: float | None = None  # a score below it is more likely right than not, where scores tell that
+
     @property
     def shifts(self) -> tuple[tuple[int, ...], ...]:
         """The trajectories, of a model whose score is the best mean along some: a map may add them up itself.
@@ -315,7 +320,8 @@ class SequenceModel(nn.Module, ABC):
         """
 
     def threshold_of(self, threshold: float | None) -> float | None:
-        """What a score has to be below to be accepted, where it is `threshold` for single queries."""
+        """What a score has to be below to be accepted, where it is `threshold` for single queries; None where
+        nobody said."""
         return threshold
 
 

@@ -64,7 +64,7 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-5)
 
 
-def test_convention_4_threshold_option_then_map_then_all(
+def test_convention_4_threshold_option_then_map_then_probability_then_all(
     small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     route, out = tmp_path / "a.safetensors", tmp_path / "m.csv"
@@ -73,7 +73,13 @@ def test_convention_4_threshold_option_then_map_then_all(
         return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
 
     run("localize", small_map, QUERY, "--out", out)
-    assert "no threshold" in capsys.readouterr().out
+    assert "no threshold given or stored in the map: accepted where the prob" in capsys.readouterr().out
+    assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) < 96
+    run("localize", small_map, QUERY, "--sequence", 5, "--out", out)  # which has no probabilities
+    assert "every query with a finite score" in capsys.readouterr().out
+    assert accepted() == 96
+    run("localize", small_map, QUERY, "--threshold", ".inf", "--out", out)
+    assert "no threshold" not in capsys.readouterr().out
     assert accepted() == 96
     score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[40]
     run("learn", SMALL, "--map", route, "--threshold", str(score))
@@ -188,7 +194,8 @@ def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixt
     run("learn", tmp_path / "a.npy", "--map", tmp_path / "a.safetensors", *TEMPLATES)
     assert "this route does not repeat" in capsys.readouterr().out.splitlines()
     assert DejaVu.load(tmp_path / "a.safetensors").map.plan == ()
-    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", *TEMPLATES, "--out", tmp_path / "report")
+    pair = tmp_path / "a.npy", tmp_path / "b.npy"
+    run("compare", *pair, "--truth", "0", *TEMPLATES, "--out", tmp_path / "report")
     report = report_of(tmp_path / "report")
     assert report["recall_at_1"] == report["auc"] == 0
     assert report["accepted"] == 0
@@ -378,7 +385,7 @@ def test_compare_builds_features_of_this_package_by_itself(tmp_path: Path) -> No
     model = DejaVu(features, mapper=TemplateMapper(SpectrogramAnalysis(window=64, strongest=1)))
     model.learn(open_source(str(tmp_path / "a.npy"))).save(tmp_path / "a.safetensors")
     pair = tmp_path / "a.npy", tmp_path / "b.npy"
-    run("compare", *pair, "--map", tmp_path / "a.safetensors", "--out", tmp_path / "r")
+    run("compare", *pair, "--truth", "0", "--map", tmp_path / "a.safetensors", "--out", tmp_path / "r")
     report = report_of(tmp_path / "r")
     assert report["trained"] is None
     assert report["map_bytes"] == (tmp_path / "a.safetensors").stat().st_size

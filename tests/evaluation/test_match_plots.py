@@ -99,7 +99,7 @@ def test_where_a_threshold_rejects_some_the_best_of_them_is_shown() -> None:
     match = found([0, 1, 2, 3], [0.1, 0.4, 0.3, 0.2], below=0.25)
     last = example_matches(match, None, 0)[-1]
     assert (last.query, last.right) == (2, -1)
-    assert "first above the threshold" in last.why
+    assert "surest not accepted" in last.why
 
 
 def test_an_example_is_shown_once_and_only_if_there_is_one() -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from dejavu_torch.recognition.candidates import Candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.matching import Found, Matching, lengths_beside
-from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.select import Acceptance, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
 
@@ -82,7 +82,7 @@ def test_scores_pass_by_once_and_are_not_held(
 
 def test_single_queries_alone_where_there_is_no_sequence() -> None:
     found = Matching().found(SCORES.split(7))
-    assert same(found.match(0.01), best_match(SCORES, 0.01))
+    assert same(found.match(Acceptance(0.01)), best_match(SCORES, 0.01))
     assert found.sequences == {}
     ranked = Matching(ranks=3, apart=4).found([SCORES])
     assert ranked.candidates.index.shape == (30, 3)
