@@ -124,6 +124,37 @@ def test_threshold_and_count_of_accepted(
     assert f"96 queries, {first} accepted" in capsys.readouterr().out
 
 
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibrated map, whose queries are another flight."""
+    path = tmp_path_factory.mktemp("flights") / "map.safetensors"
+    run("learn", "sim:aerial?frames=96", "--map", path)
+    return path
+
+
+AGAIN = "sim:aerial?frames=96&traverse=1"
+
+
+@pytest.mark.parametrize("words", [("--precision", ".3"), (), ("--filter", "--precision", ".01")])
+def test_the_first_of_several_places_has_the_probability(
+    flights: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    best, top = tmp_path / "best.csv", tmp_path / "top.csv"
+    run("localize", flights, AGAIN, *words, "--out", best)
+    run("localize", flights, AGAIN, *words, "--top", "4", "--out", top)
+    alone, rows = rows_of(best), rows_of(top)
+    assert [{**row, "rank": "1"} for row in alone] == rows[::4]
+    others = [row for row in rows if row["rank"] != "1"]
+    assert len(others) == 3 * 96
+    assert {(row["probability"], row["accepted"]) for row in others} == {("", "0")}
+    reports = []
+    for path in (best, top):
+        run("evaluate", path, "--truth", "0", "--out", tmp_path / "scores")
+        reports.append(report_of(tmp_path / "scores"))
+    assert reports[0]["rejection"] == reports[1]["rejection"]
+    assert reports[0]["accepted"] == reports[1]["accepted"] == sum(row["accepted"] == "1" for row in alone)
+
+
 def test_compare_and_evaluate_agree(route: Path, pair: tuple[Path, Path], tmp_path: Path) -> None:
     run(
         "compare",

@@ -267,7 +267,9 @@ def run_localize(
         check_candidates(top, APART)
     if matcher is not None and search in ("bound", "ivf"):
         together = "--filter" if filter else f"--sequence {sequence}"
-        raise InputError(f"--search {search} and {together}, which takes all scores; expected one of them")
+        raise InputError(
+            f"--search {search} and {together}, which needs the scores of all places; expected one of them"
+        )
     if cluster is not None:
         _check_cluster(cluster, device)
         if filter or sequence != 1 or search not in ("auto", "scan"):
@@ -313,7 +315,8 @@ def run_localize(
         print(told)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
-        _say(f"{told_probable(counts, total)}: {next_steps(matcher is not None, rule.given)}")
+        steps = next_steps(matcher is not None, rule.given)
+        _say(told_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
     _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
@@ -1033,7 +1036,7 @@ def _check_accepting(
 ) -> None:
     """Refuse at once what does not go with a precision, or with anything else that needs probabilities."""
     if threshold is not None and precision is not None:
-        raise InputError(f"--threshold {threshold} and --precision {precision}; expected one of them")
+        raise InputError(f"--threshold {threshold:g} and --precision {precision:g}; expected one of them")
     check_precision(precision)
     if isinstance(sequence, PlaceFilter):
         together = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""

@@ -75,12 +75,11 @@ def follow(
                         page.show(Moment(shot, match, localizer.scores, posterior, *counts))
         finally:
             if taken.frames:
-                rule = model.acceptance(sequence)
-                if not rule.given:
-                    _tell(str(rule))
                 p50, p99 = taken.percentiles()
                 times = f"milliseconds a frame: p50 {p50:.1f}, p99 {p99:.1f}"
-                _tell(f"{taken.frames} frames, {feed.dropped} dropped; {times}")
+                rule = model.acceptance(sequence)
+                told = "" if rule.given else f"; {rule}"
+                _tell(f"{taken.frames} frames, {feed.dropped} dropped; {times}{told}")
 
 
 def shots_from(source: str, model: DejaVu, realtime: bool) -> tuple[Iterable[Shot], bool, str]:

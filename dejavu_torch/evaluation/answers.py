@@ -14,7 +14,7 @@ PROBABLE = (0.9, 0.5)  # the answers that are at least so probably right are cou
 SURE = 0.5  # probability from which an answer is confident
 THIRD = 3  # without probabilities, one of so many is, by its score
 FEWEST = 10  # answers that show a line,
-SHARE = 0.1  # and of all queries: few that are sure by mistake are so one behind the other
+SHARE = 0.2  # and of all queries: few that are sure by mistake are so one behind the other
 NEAR = 5  # frames from a line, at least
 TIMES = 2  # as many answers near a line as the same places and queries in any order
 
@@ -53,8 +53,8 @@ def told_probable(counts: Mapping[str, int], answers: int) -> str:
     return f"{many} of {answers} answers are probably right (at least {high[1:]}), {more} at {low[1:]}"
 
 
-def next_steps(together: bool, strict: bool) -> str:
-    """What to try on answers that have a probability but are not scored, in words.
+def next_steps(together: bool, strict: bool) -> list[str]:
+    """What to try on answers that have a probability, in words.
 
     Args:
         together: whether queries are matched together already. strict: whether a threshold or precision is
@@ -63,9 +63,8 @@ def next_steps(together: bool, strict: bool) -> str:
     steps = {
         "--filter counts the queries before each as well, if they are consecutive": not together,
         "--precision .9 accepts only what is so probably right": not strict,
-        "--truth scores the answers": True,
     }
-    return "; ".join(step for step, fits in steps.items() if fits)
+    return [step for step, fits in steps.items() if fits]
 
 
 def confident(match: Match) -> Tensor:

@@ -181,7 +181,7 @@ def steps_after(facts: Mapping[str, Any]) -> str:
         return ""
     together = bool(facts.get("filter")) or facts.get("sequence", 1) > 1
     strict = facts.get("threshold") is not None or (facts.get("least_probability") or 0) > SURE
-    return next_steps(together, strict)
+    return "; ".join([*next_steps(together, strict), "--truth scores the answers"])
 
 
 def sentence(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -26,10 +27,12 @@ class Acceptance(NamedTuple):
     def __str__(self) -> str:
         if self.precision is not None:
             told = f"accepted where the probability is at least {self.precision:.9g}"
-        elif self.threshold is not None:
+        elif self.threshold is None:
+            told = "every query with a finite score is accepted"
+        elif self.given:
             told = f"accepted where the score is below {self.threshold:.9g}"
         else:
-            told = "every query with a finite score is accepted"
+            told = f"accepted where the filter itself gives more than {math.exp(-self.threshold):.9g}"
         return told if self.given else f"no threshold given or stored in the map: {told}"
 
 

@@ -43,6 +43,19 @@ def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
     render(figure)
 
 
+def test_without_a_truth_coverage_shows_the_probabilities() -> None:
+    sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
+    match = matched(4, 9, -1, 2).with_probability(sure)
+    figure, axis = plot_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")
+    (points,) = axis.collections
+    shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))
+    assert shown == {0.2: (1, 9), 0.6: (3, 2), 0.9: (0, 4)}
+    assert points.get_clim() == (0, 1)
+    assert dots(axis) == {"1 not reported": [(2, 0)]}
+    assert "probability of being right" in texts(figure)
+    render(figure)
+
+
 def test_coverage_leaves_grey_what_is_not_scored() -> None:
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
     truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
