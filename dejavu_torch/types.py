@@ -207,7 +207,7 @@ class Match(_Reported):
 
     index: (Q,) int64, the reported place, -1 where no place has a finite score.
     score: (Q,) float, the lowest S; lower is better, +inf where nothing covers.
-    accepted: (Q,) bool, score below the threshold, or probability at least the precision asked for.
+    accepted: (Q,) bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
     probability: (Q,) float64, of being right, where the map is calibrated; else None. It goes along with the
         three, but is none of the tuple's.
     """

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.types import Match
 
-PROBABLE = (0.9, 0.5)  # the answers that are at least so probably right are counted
-SURE = 0.5  # probability from which an answer is confident
+COUNTED = (0.9, PROBABLE)  # the answers that are at least so probably right
 THIRD = 3  # without probabilities, one of so many is, by its score
 FEWEST = 10  # answers that show a line,
 SHARE = 0.2  # and of all queries: few that are sure by mistake are so one behind the other
@@ -39,7 +39,7 @@ def probable_counts(match: Match) -> dict[str, int]:
     """How many answers are at least so probably right, by that probability; empty without probabilities."""
     if match.probability is None:
         return {}
-    return {f"{least:g}": int((match.probability >= least).sum()) for least in PROBABLE}
+    return {f"{least:g}": int((match.probability >= least).sum()) for least in COUNTED}
 
 
 def told_probable(counts: Mapping[str, int], answers: int) -> str:
@@ -70,7 +70,7 @@ def next_steps(together: bool, strict: bool) -> list[str]:
 def confident(match: Match) -> Tensor:
     """Which answers (Q,) are believed most: by their probability, else the third that scores best; bool."""
     if match.probability is not None:
-        return match.probability >= SURE
+        return match.probability >= PROBABLE
     found = match.score.isfinite()
     if not found.any():
         return found

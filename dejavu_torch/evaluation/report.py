@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import jinja2
 
 from dejavu_torch.data.output import whole_folder
-from dejavu_torch.evaluation.answers import SURE, next_steps, told_line, told_probable
+from dejavu_torch.evaluation.answers import next_steps, told_line, told_probable
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import rejection_table
+from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.text import printable
 
 PICTURES = (
@@ -180,7 +181,7 @@ def steps_after(facts: Mapping[str, Any]) -> str:
     if "probably_right" not in facts:
         return ""
     together = bool(facts.get("filter")) or facts.get("sequence", 1) > 1
-    strict = facts.get("threshold") is not None or (facts.get("least_probability") or 0) > SURE
+    strict = facts.get("threshold") is not None or (facts.get("least_probability") or 0) > PROBABLE
     return "; ".join([*next_steps(together, strict), "--truth scores the answers"])
 
 
