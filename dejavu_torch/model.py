@@ -112,10 +112,10 @@ class DejaVu(nn.Module):
         whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; "none"
             keeps the features; None is Whitening ahead of a SpectralMapper, "none" ahead of templates.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
-        threshold: accept a match when its score is below; None leaves it to `acceptance`, math.inf accepts
-            every finite score.
+        threshold: accept a match when its score is below; infinity accepts every finite score.
         precision: accept a match instead where it is at least as probably right, above 0 and below 1; of a
-            map that is calibrated, see `calibrate`.
+            map that is calibrated, see `calibrate`. Without either, a calibrated map accepts from .5 on, and
+            any other every finite score, see `acceptance`.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
         velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
