@@ -55,6 +55,7 @@ from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Search, Searcher, check_scanned, check_search
+from dejavu_torch.recognition.select import PROBABLE, Acceptance
 from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
 from dejavu_torch.streaming import sample as streaming
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread, with_visits
@@ -79,6 +80,7 @@ CALIBRATION_SCORES = 2**30  # of all frames that a map is calibrated by, at all 
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors on the device at a time
 FEW_DESCRIPTORS = IN_MEMORY // 4  # bytes
+HIGHEST = torch.finfo(torch.float64).max  # of the numbers that a file can hold: every score is below
 OFF = 0.02  # of the bytes per place asked for: worth a word
 MANY_FEATURES = 50_000  # per frame: worth a word
 
@@ -120,9 +122,10 @@ class DejaVu(nn.Module):
             components, as of `Whitening(views=0)`; None is Whitening ahead of a SpectralMapper, "none" ahead
             of templates.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
-        threshold: accept a match when its score is below; None accepts every finite score.
+        threshold: accept a match when its score is below; infinity accepts every finite score.
         precision: accept a match instead where it is at least as probably right, above 0 and below 1; of a
-            map that is calibrated, see `calibrate`.
+            map that is calibrated, see `calibrate`. Without either, a calibrated map accepts from .5 on, and
+            any other every finite score, see `acceptance`.
         batch_size: frames in memory at a time.
         preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
         velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
@@ -171,7 +174,7 @@ class DejaVu(nn.Module):
         if weight_bits not in BITS:
             raise InputError(f"weight_bits is {weight_bits!r}; expected one of {', '.join(map(str, BITS))}")
         check_precision(precision)
-        if precision is not None and threshold not in (None, math.inf):
+        if precision is not None and threshold is not None:
             raise InputError(f"a threshold, {threshold}, and a precision, {precision}; expected one of them")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.features = HOG() if features is None else features
@@ -189,7 +192,7 @@ class DejaVu(nn.Module):
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self.threshold = None if threshold == math.inf else threshold
+        self.threshold = None if threshold is None else min(threshold, HIGHEST)
         self.precision = precision
         self.batch_size = batch_size
         self.velocity = velocity
@@ -503,8 +506,9 @@ class DejaVu(nn.Module):
 
         Args:
             reference: as `resample` gives it.
-            truth: which frames of the reference it shows, see `find_ground_truth`. Of several for one frame
-                the first counts; frames that show none are left out.
+            truth: which frames of the reference it shows, see `find_ground_truth`; None, of one that is as
+                long: frame i is place i. Of several for one frame the first counts; frames that show none are
+                left out.
 
         Raises:
             InputError: no whitening that could learn from it, or as of `places_shown`.
@@ -520,7 +524,7 @@ class DejaVu(nn.Module):
         """
         second = self.resample(second, getattr(reference, "step", None), shape=reference.frame_shape)
         frames, shown = reference.count(), second.count()
-        found = ground_truth_of(truth, reference, second, frames, shown)
+        found = ground_truth_of(truth, reference, second, frames, shown, aligned=True)
         if found is None:
             steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
             raise InputError(
@@ -793,7 +797,7 @@ class DejaVu(nn.Module):
             order: (N,) which frame each place of a shuffled map is; the match then counts frames.
         """
         found = self.found(descriptors, self.matching(sequence, search), order)
-        return found.match(self.threshold_of(sequence), self.precision)
+        return found.match(self.acceptance(sequence))
 
     def found(self, descriptors: Tensor, matching: Matching, order: Tensor | None = None) -> Found:
         """All that a matching finds, of descriptors and in an order as of `localize_descriptors`."""
@@ -828,9 +832,9 @@ class DejaVu(nn.Module):
         """
         self._require_map()
         self.check_precision(sequence)
-        threshold, matching = self.threshold_of(sequence), self.matching(sequence, search)
+        rule, matching = self.acceptance(sequence), self.matching(sequence, search)
         for part in self._found(descriptors, matching._replace(look=look)):
-            yield part.match(threshold, self.precision)
+            yield part.match(rule)
 
     def candidates(
         self,
@@ -857,8 +861,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        parts = list(self.candidate_batches(queries, k, apart, sequence=sequence, search=search))
-        return Candidates(*map(torch.cat, zip(*parts, strict=True)))
+        return joined(self.candidate_batches(queries, k, apart, sequence=sequence, search=search)).candidates
 
     def candidate_batches(
         self,
@@ -868,16 +871,18 @@ class DejaVu(nn.Module):
         progress: str | None = None,
         sequence: SequenceModel | None = None,
         search: Search = "auto",
-    ) -> Iterator[Candidates]:
-        """As `candidates`, one batch of queries at a time: memory does not grow with the queries."""
+    ) -> Iterator[Found]:
+        """As `candidates`, one batch of queries at a time: memory does not grow with the queries.
+
+        On a calibrated map with the probability of the first candidate of each.
+        """
         self._require_map()
         check_candidates(k, apart, self.map.places)
         if sequence is not None:
             check_scanned(search)
         check_search(search, self.map)
-        matching = Matching(sequence, ranks=k, apart=apart, search=search)
-        for part in self._found(self._checked(queries, progress, sequence), matching):
-            yield part.candidates
+        matching = self.matching(sequence, search)._replace(ranks=k, apart=apart)
+        yield from self._found(self._checked(queries, progress, sequence), matching)
 
     def _checked(
         self, queries: Traverse | Tensor, progress: str | None, sequence: SequenceModel | None
@@ -918,8 +923,24 @@ class DejaVu(nn.Module):
         raise InputError(f"the precision is {self.precision}, but {seen}; expected a threshold in its place")
 
     def threshold_of(self, sequence: SequenceModel | None) -> float | None:
-        """What the score of a query, or of a sequence, has to be below to be accepted."""
+        """What the score of a query, or of a sequence, has to be below; None where nobody said."""
         return self.threshold if sequence is None else sequence.threshold_of(self.threshold)
+
+    def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
+        """Which answers are accepted, of single queries or of a sequence (convention 4).
+
+        By the threshold or precision that was given, or that the map's file has. Else, on a map that is
+        calibrated for this way of matching, where the probability is at least .5. Else what a filter by
+        itself takes for more likely than not, and of other ways every finite score.
+        """
+        threshold = self.threshold_of(sequence)
+        if threshold is not None:
+            return Acceptance(threshold)
+        if self.precision is not None:
+            return Acceptance(precision=self.precision)
+        if self.matching(sequence).platt is not None:
+            return Acceptance(precision=PROBABLE, given=False)
+        return Acceptance(None if sequence is None else sequence.likely, given=False)
 
     def _found(
         self, batches: Iterable[Tensor], matching: Matching, order: Tensor | None = None

@@ -45,6 +45,8 @@ class Traverse(ABC):
         length: number of frames N, or None where only reading to the end can tell.
         place: (N,) float64, the true position of each frame in units of reference frames,
             or None where it is unknown.
+        cut: how the frames were cut out of one long image, and which of all such cuts they are: two traverses
+            that were cut alike show the same places. None where they were not cut out of one.
         seeks: whether `between` reads nothing ahead of the first frame that is asked for.
         sized: whether the size of the frames was asked for, as by `width=` of a video.
     """
@@ -52,6 +54,7 @@ class Traverse(ABC):
     name: str = "traverse"
     length: int | None = None
     place: Tensor | None = None
+    cut: tuple[tuple[int, ...], range] | None = None
     seeks: bool = False
     sized: bool = False
 
@@ -206,7 +209,7 @@ class Match(_Reported):
 
     index: (Q,) int64, the reported place, -1 where no place has a finite score.
     score: (Q,) float, the lowest S; lower is better, +inf where nothing covers.
-    accepted: (Q,) bool, score below the threshold, or probability at least the precision asked for.
+    accepted: (Q,) bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
     probability: (Q,) float64, of being right, where the map is calibrated; else None. It goes along with the
         three, but is none of the tuple's.
     """
@@ -278,6 +281,8 @@ class SequenceModel(nn.Module, ABC):
     queries.
     """
 
+    likely: float | None = None  # a score below it is more likely right than not, where scores tell that
+
     @property
     def shifts(self) -> tuple[tuple[int, ...], ...]:
         """The trajectories, of a model whose score is the best mean along some: a map may add them up itself.
@@ -317,7 +322,8 @@ class SequenceModel(nn.Module, ABC):
         """
 
     def threshold_of(self, threshold: float | None) -> float | None:
-        """What a score has to be below to be accepted, where it is `threshold` for single queries."""
+        """What a score has to be below to be accepted, where it is `threshold` for single queries; None where
+        nobody said."""
         return threshold
 
 

@@ -64,7 +64,7 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-5)
 
 
-def test_convention_4_threshold_option_then_map_then_all(
+def test_convention_4_threshold_option_then_map_then_probability_then_all(
     small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     route, out = tmp_path / "a.safetensors", tmp_path / "m.csv"
@@ -73,7 +73,15 @@ def test_convention_4_threshold_option_then_map_then_all(
         return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
 
     run("localize", small_map, QUERY, "--out", out)
-    assert "no threshold" in capsys.readouterr().out
+    assert "no threshold given or stored in the map: accepted where the prob" in capsys.readouterr().out
+    assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
+    run("localize", small_map, "sim:aerial?frames=96&seed=9", "--out", out)  # another road
+    assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) < 96
+    run("localize", small_map, QUERY, "--sequence", 5, "--out", out)  # which has no probabilities
+    assert "every query with a finite score" in capsys.readouterr().out
+    assert accepted() == 96
+    run("localize", small_map, QUERY, "--threshold", ".inf", "--out", out)
+    assert "no threshold" not in capsys.readouterr().out
     assert accepted() == 96
     score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[40]
     run("learn", SMALL, "--map", route, "--threshold", str(score))
@@ -188,7 +196,8 @@ def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixt
     run("learn", tmp_path / "a.npy", "--map", tmp_path / "a.safetensors", *TEMPLATES)
     assert "this route does not repeat" in capsys.readouterr().out.splitlines()
     assert DejaVu.load(tmp_path / "a.safetensors").map.plan == ()
-    run("compare", tmp_path / "a.npy", tmp_path / "b.npy", *TEMPLATES, "--out", tmp_path / "report")
+    pair = tmp_path / "a.npy", tmp_path / "b.npy"
+    run("compare", *pair, "--truth", "0", *TEMPLATES, "--out", tmp_path / "report")
     report = report_of(tmp_path / "report")
     assert report["recall_at_1"] == report["auc"] == 0
     assert report["accepted"] == 0
@@ -216,6 +225,42 @@ def test_compare_without_truth_gives_matches_and_no_scores(
     run("compare", *pair, *known, "--truth", "16", "--out", tmp_path / "report")
     report = report_of(tmp_path / "report")
     assert report["auc"] is not None
+
+
+def test_as_many_frames_are_no_truth_but_their_answers_ask_for_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, start in (("a", 0), ("b", 16)):
+        part = f"sim:aerial?frames=112&traverse={int(start > 0)}&start={start}&stop={start + 96}"
+        pixels = 255 * torch.cat(list(open_source(part).batches(64))).permute(0, 2, 3, 1)
+        np.save(tmp_path / f"{name}.npy", pixels.byte().numpy())
+    pair, out = (tmp_path / "a.npy", tmp_path / "b.npy"), tmp_path / "report"
+    run("compare", *pair, "--out", out)
+    told, report, page = capsys.readouterr().out, report_of(out), (out / "index.html").read_text()
+    assert report["auc"] is None
+    assert report["least_probability"] == 0.5
+    rows = list(csv.DictReader((out / "matches.csv").open()))
+    sure = [sum(float(row["probability"]) >= least for row in rows) for least in (0.9, 0.5)]
+    assert report["probably_right"] == {"0.9": sure[0], "0.5": sure[1]}
+    assert report["accepted"] == sure[1] > 48
+    assert report["line"]["offset"] == 16
+    for text in (told, page.partition("</p>")[0]):
+        assert f"{sure[0]} of 96 answers are probably right (at least .9), {sure[1]} at .5" in text
+        assert "is it --truth 16?" in text
+        assert "--filter" in text
+    run("compare", *pair, "--map", out / "map.safetensors", "--truth", "0", "--out", tmp_path / "zero")
+    first = capsys.readouterr().out.splitlines()[0]
+    lead = (tmp_path / "zero" / "index.html").read_text().partition("<p>")[2]
+    for text in (first, lead):
+        assert text.lower().startswith("the answers contradict the truth (place = query)")
+    for truth, contradicts in (("0", True), ("16", False)):
+        run("evaluate", out / "matches.csv", "--truth", truth, "--out", tmp_path / "scores")
+        assert capsys.readouterr().out.startswith("the answers contradict") == contradicts
+        assert ("line" in report_of(tmp_path / "scores")) == contradicts
+    run("localize", out / "map.safetensors", pair[1], "--filter", "--out", tmp_path / "m.csv")
+    told = capsys.readouterr().out
+    assert "of 96 answers are probably right" in told
+    assert "--filter" not in told
 
 
 def test_negative_offset_is_a_truth(tmp_path: Path) -> None:
@@ -378,7 +423,7 @@ def test_compare_builds_features_of_this_package_by_itself(tmp_path: Path) -> No
     model = DejaVu(features, mapper=TemplateMapper(SpectrogramAnalysis(window=64, strongest=1)))
     model.learn(open_source(str(tmp_path / "a.npy"))).save(tmp_path / "a.safetensors")
     pair = tmp_path / "a.npy", tmp_path / "b.npy"
-    run("compare", *pair, "--map", tmp_path / "a.safetensors", "--out", tmp_path / "r")
+    run("compare", *pair, "--truth", "0", "--map", tmp_path / "a.safetensors", "--out", tmp_path / "r")
     report = report_of(tmp_path / "r")
     assert report["trained"] is None
     assert report["map_bytes"] == (tmp_path / "a.safetensors").stat().st_size

@@ -152,8 +152,12 @@ def test_channel_and_contrast_are_options_and_stay_with_the_map(
 def test_what_is_taken_for_the_truth_is_told(
     pair: tuple[Path, Path], matches: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run("compare", pair[0], pair[0], "--out", tmp_path / "same")
-    told = "right within 5 frames of the truth (place = query, since both have as many frames)"
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i, image in enumerate(frames(32)):
+        Image.fromarray(image).save(folder / f"{i}.png")
+    run("compare", folder, folder, "--out", tmp_path / "same")
+    told = "right within 5 frames of the truth (place = query, as the sources say themselves)"
     assert told in capsys.readouterr().out
     assert told in (tmp_path / "same" / "index.html").read_text()
     run("evaluate", matches, "--truth", "4", "--reference", pair[0], "--out", tmp_path / "offset")
@@ -195,7 +199,18 @@ def test_a_curve_that_starts_late_is_marked(
     pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Stored frames find themselves at distance 0, all of them: one threshold, and no area."""
-    run("compare", pair[0], pair[0], *TEMPLATES, "--tolerance", "0", "--out", tmp_path / "itself")
+    run(
+        "compare",
+        pair[0],
+        pair[0],
+        "--truth",
+        "0",
+        *TEMPLATES,
+        "--tolerance",
+        "0",
+        "--out",
+        tmp_path / "itself",
+    )
     out = capsys.readouterr().out
     report = report_of(tmp_path / "itself")
     assert report["uncompressed"]["recall_at_1"] == report["uncompressed"]["curve_starts_at_recall"] == 1

@@ -111,8 +111,6 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
         (("--precision", "0"), ("precision is 0", "above 0")),
         (("--precision", "1"), ("precision is 1", "below 1")),
         (("--precision", ".9", "--threshold", "1"), ("--threshold", "--precision", "one of them")),
-        (("--precision", ".9", "--top", "3"), ("precision 0.9", "--top 3")),
-        (("--precision", ".9", "--sequence", "5"), ("precision is 0.9", "calibrated for single queries")),
     ],
 )
 def test_precisions_that_cannot_be_asked_for(
@@ -128,6 +126,38 @@ def test_precisions_that_cannot_be_asked_for(
 
 
 @pytest.mark.parametrize(
+    ("words", "told", "commands"),
+    [
+        ("--sequence 5 --precision .9", ("--sequence 5", "--precision 0.9"), "localize live compare"),
+        ("--sequence 5 --filter", ("--sequence 5", "--filter"), "localize live compare"),
+        ("--threshold 1 --precision .9", ("--threshold 1", "--precision 0.9"), "localize live compare"),
+        ("--sequence 5 --distractors sim:outdoor", ("--sequence 5", "--distractors sim:outdoor"), "compare"),
+        (
+            "--filter --search_every 9 --precision .9",
+            ("--search_every 9", "--precision 0.9"),
+            "localize live",
+        ),
+        ("--search_every 9", ("--search_every 9", "--filter"), "localize"),
+        ("--filter --search bound", ("--filter", "--search bound"), "localize"),
+        ("--sequence 5 --search ivf", ("--sequence 5", "--search ivf"), "localize"),
+    ],
+)
+def test_options_that_exclude_each_other_are_told_before_anything_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, told: tuple[str, ...], commands: str
+) -> None:
+    out = ("--out", tmp_path / "out")
+    read = {
+        "localize": ("nowhere.safetensors", "nowhere", *out),
+        "live": ("nowhere.safetensors", "nowhere"),
+        "compare": ("nowhere", "nowhere", *out),
+    }
+    for command in commands.split():
+        error = fails(capsys, command, *read[command], *words.split())
+        assert [one for one in told if one not in error] == [], error
+        assert "nowhere" not in error
+
+
+@pytest.mark.parametrize(
     ("words", "told"),
     [
         (("--calibration", AGAIN), ("itself", "another traverse")),
@@ -138,7 +168,6 @@ def test_precisions_that_cannot_be_asked_for(
         (("--distractors", AGAIN), ("one of the traverses", "another route")),
         (("--distractors", SEA, "--sequence", "5"), ("--distractors", "a filter")),
         (("--precision", ".9", "--calibration", "none"), ("--precision 0.9", "calibrated map")),
-        (("--precision", ".9", "--top", "2"), ("--top 2", "precision 0.9")),
         (("--distractors", "nowhere"), ("nowhere is not there",)),
     ],
 )

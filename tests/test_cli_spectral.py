@@ -187,7 +187,7 @@ def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> Non
 
 
 def test_the_seed_of_compare_shuffles_the_null(folder: Path) -> None:
-    pair = folder / "a.npy", folder / "b.npy", *TEMPLATES
+    pair = folder / "a.npy", folder / "b.npy", "--truth", "0", *TEMPLATES
     for seed in (0, 1):
         run("compare", *pair, "--seed", str(seed), "--out", folder / f"null{seed}")
     first, second = (report_of(folder / f"null{seed}") for seed in (0, 1))
@@ -393,7 +393,8 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(
     one, two = noisy
     reports = {}
     for length in (1, 9):
-        run("compare", one, two, "--tolerance", 1, "--sequence", length, "--out", tmp_path / f"{length}")
+        words = "--truth", 0, "--tolerance", 1, "--sequence", length
+        run("compare", one, two, *words, "--out", tmp_path / f"{length}")
         reports[length] = report_of(tmp_path / f"{length}")
         assert reports[length]["sequence"] == length
         table = re.search(r"^AUC +T = 1 +T = 5 +T = 9 +T = 11 +T = 21\n(.*)$", capsys.readouterr().out, re.M)
@@ -418,7 +419,7 @@ def test_a_filter_is_of_the_map_and_of_all_beside_it(
 ) -> None:
     one, two = noisy
     out = tmp_path / "out"
-    run("compare", one, two, "--filter", "--out", out)
+    run("compare", one, two, "--truth", 0, "--filter", "--out", out)
     report = report_of(out)
     assert (report["filter"], report["sequence"]) == (True, 1)
     assert report["auc"] > report["sequences"]["1"]["auc"]
@@ -433,8 +434,9 @@ def test_a_filter_is_of_the_map_and_of_all_beside_it(
     rows = list(csv.DictReader(matches.open(newline="")))
     assert {row["accepted"] for row in rows} == {"0", "1"}
     assert all((float(row["score"]) < math.log(2)) == (row["accepted"] == "1") for row in rows)
-    assert report["threshold"] == pytest.approx(math.log(2))
-    run("compare", one, two, "--filter", "--threshold", 0.1, "--out", out)
+    assert report["threshold"] == pytest.approx(math.log(2))  # ready features are not calibrated
+    assert report["least_probability"] is None
+    run("compare", one, two, "--truth", 0, "--filter", "--threshold", 0.1, "--out", out)
     assert report_of(out)["threshold"] == 0.1
     assert DejaVu.load(route).threshold is None  # it is none of single queries
     run("localize", route, two, "--filter", "--threshold", 100, "--top", 2, "--out", matches)

@@ -99,7 +99,9 @@ def test_localize_writes_a_row_for_each_candidate(
     run("localize", route, pair[1], "--out", tmp_path / "best.csv")
     run("localize", route, pair[1], "--out", tmp_path / "top.csv", "--top", "10")
     best, rows = rows_of(tmp_path / "best.csv"), rows_of(tmp_path / "top.csv")
-    assert list(rows[0]) == ["query", "place", "score", "accepted", "rank", "query_name", "place_name"]
+    columns = ["query", "place", "score", "accepted", "probability", "rank", "query_name", "place_name"]
+    assert list(rows[0]) == columns
+    assert {row["probability"] for row in rows if row["rank"] != "1"} == {""}
     assert [int(row["rank"]) for row in rows] == [*range(1, 11)] * 96
     assert [row | {"rank": "1"} for row in rows[::10]] == rows[::10]
     both = rows[0].keys() & best[0].keys()
@@ -122,8 +124,52 @@ def test_threshold_and_count_of_accepted(
     assert f"96 queries, {first} accepted" in capsys.readouterr().out
 
 
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibrated map, whose queries are another flight."""
+    path = tmp_path_factory.mktemp("flights") / "map.safetensors"
+    run("learn", "sim:aerial?frames=96", "--map", path)
+    return path
+
+
+AGAIN = "sim:aerial?frames=96&traverse=1"
+
+
+@pytest.mark.parametrize("words", [("--precision", ".3"), (), ("--filter", "--precision", ".01")])
+def test_the_first_of_several_places_has_the_probability(
+    flights: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    best, top = tmp_path / "best.csv", tmp_path / "top.csv"
+    run("localize", flights, AGAIN, *words, "--out", best)
+    run("localize", flights, AGAIN, *words, "--top", "4", "--out", top)
+    alone, rows = rows_of(best), rows_of(top)
+    assert [{**row, "rank": "1"} for row in alone] == rows[::4]
+    others = [row for row in rows if row["rank"] != "1"]
+    assert len(others) == 3 * 96
+    assert {(row["probability"], row["accepted"]) for row in others} == {("", "0")}
+    reports = []
+    for path in (best, top):
+        run("evaluate", path, "--truth", "0", "--out", tmp_path / "scores")
+        reports.append(report_of(tmp_path / "scores"))
+    assert reports[0]["rejection"] == reports[1]["rejection"]
+    assert reports[0]["accepted"] == reports[1]["accepted"] == sum(row["accepted"] == "1" for row in alone)
+
+
 def test_compare_and_evaluate_agree(route: Path, pair: tuple[Path, Path], tmp_path: Path) -> None:
-    run("compare", *pair, "--map", route, "--tolerance", "1", "--top", "12", "--out", tmp_path / "c")
+    run(
+        "compare",
+        *pair,
+        "--map",
+        route,
+        "--truth",
+        "0",
+        "--tolerance",
+        "1",
+        "--top",
+        "12",
+        "--out",
+        tmp_path / "c",
+    )
     rows = rows_of(tmp_path / "c" / "matches.csv")
     assert len(rows) == 96 * 12
     places = torch.tensor([int(row["place"]) for row in rows]).view(96, 12)
@@ -142,7 +188,7 @@ def test_compare_and_evaluate_agree(route: Path, pair: tuple[Path, Path], tmp_pa
 def test_without_top_compare_counts_and_writes_matches_only(
     route: Path, pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run("compare", *pair, "--map", route, "--tolerance", "1", "--out", tmp_path / "c")
+    run("compare", *pair, "--map", route, "--truth", "0", "--tolerance", "1", "--out", tmp_path / "c")
     assert "among their first 5 candidates" in capsys.readouterr().out
     assert report_of(tmp_path / "c")["recall_at_10"] > 0
     assert len(rows_of(tmp_path / "c" / "matches.csv")) == 96
@@ -162,7 +208,7 @@ def test_as_many_ranks_as_the_file_has(tmp_path: Path) -> None:
 def test_a_route_of_fewer_places_than_candidates() -> None:
     waves = torch.rand(8, 3, generator=torch.Generator().manual_seed(3))
     model = template_model(periods=Fixed(FrequencyLayer(8, 8, 0, 8, (0, 1, 2))))
-    result = compare(ArrayTraverse(waves), ArrayTraverse(waves + 0.01), model=model, tolerance=0)
+    result = compare(ArrayTraverse(waves), ArrayTraverse(waves + 0.01), "0", model=model, tolerance=0)
     report = result.report.as_json()
     assert (report["recall_at_5"], report["recall_at_10"]) == (1.0, None)
 

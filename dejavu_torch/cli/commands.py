@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import shlex
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
@@ -26,15 +27,17 @@ from dejavu_torch.database.merged import MergedMap
 from dejavu_torch.database.place_map import PlaceMap
 from dejavu_torch.database.recipe import recipe_of, with_parts
 from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision, check_sizes
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.recognition.calibration import NEVER
-from dejavu_torch.recognition.candidates import Candidates, check_candidates
+from dejavu_torch.recognition.candidates import check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.search import Search, check_scanned, check_search
+from dejavu_torch.recognition.matching import Found
+from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.streaming.coder import Made, code_here
 from dejavu_torch.streaming.sample import SAMPLE as SHORT
@@ -236,15 +239,17 @@ def run_localize(
         map: map file
         source: as of `dejavu learn`
         out: csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name
-        threshold: accept a match whose score is below
-        precision: accept instead what is at least as probably right, such as .99
-        top: write so many places of each query, no two within 5 of each other, a row each with its rank
+        threshold: accept a match whose score is below; .inf accepts all
+        precision: accept instead what is at least as probably right, such as .99. Without either, and none in
+            the map, .5 on a calibrated map, else all
+        top: write so many places of each query, no two within 5 of each other, a row each with its rank; a
+            probability is that of the first
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         as_is: take the frames as they are, though the map's are resampled
         sequence: queries that are matched together, one place after another
         speeds: of a sequence, such as '[.8,1,1.25]' places a query, of which the best counts; 1 if not given
         filter: the most probable place given all queries so far, at varying speed, or off the map; scores and
-            --threshold are -log probability, and what is more likely than not is accepted
+            --threshold are -log of the filter's own probability
         moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
             if not given
         search_every: of the filter, queries from one search of all places to the next; in between only those
@@ -260,6 +265,15 @@ def run_localize(
     where = device_of(device)
     check_output_file(out)
     check_not_read(out, map, source)
+    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold, search_every)
+    _check_accepting(threshold, precision, matcher)
+    if top is not None:
+        check_candidates(top, APART)
+    if matcher is not None and search in ("bound", "ivf"):
+        together = "--filter" if filter else f"--sequence {sequence}"
+        raise InputError(
+            f"--search {search} and {together}, which needs the scores of all places; expected one of them"
+        )
     if cluster is not None:
         _check_cluster(cluster, device)
         if filter or sequence != 1 or search not in ("auto", "scan"):
@@ -277,35 +291,36 @@ def run_localize(
         model.velocity = None
     _accept_by(model, threshold, precision)
     if top is not None:
-        _check_top(top, model)
         check_candidates(top, APART, model.map.places)
     query = open_source(source)
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
-    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold, search_every)
     if matcher is not None:
         matcher.check(None, model.map.places)
-        check_scanned(search)
     else:
         check_search(search, model.map)
         model.searcher(search).sample = SAMPLE
     model.check_precision(matcher)
-    threshold = model.threshold_of(matcher)
+    rule = model.acceptance(matcher)
     matches = model.matches(query, "localizing", matcher, search)
     if top is not None:
-        candidates = model.candidate_batches(query, top, APART, "localizing", matcher, search)
-        matches = (batch.as_match(threshold) for batch in candidates)
+        found = model.candidate_batches(query, top, APART, "localizing", matcher, search)
+        matches = (part.ranked(rule) for part in found)
+    counts: Counter[str] = Counter()
     with _searching(cluster, model):
-        total, accepted = _write_matches(out, matches, query, model, top)
+        total, accepted = _write_matches(out, _counted(matches, counts), query, model, top)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
-    elif threshold is None and model.precision is None:
-        print("no threshold given or stored in the map: every query with a finite score is accepted")
+    elif not rule.given:
+        print(rule)
     told = model.searcher(search).told
     if matcher is None and told.method in ("bound", "ivf"):
         print(told)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
+    if counts:
+        steps = next_steps(matcher is not None, rule.given)
+        _say(told_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
     _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
@@ -344,8 +359,8 @@ def run_live(
         speeds: as of `dejavu localize`
         moves: as of `dejavu localize`
         search_every: as of `dejavu localize`
-        threshold: accept a match whose score is below
-        precision: accept instead what is at least as probably right, such as .99
+        threshold: as of `dejavu localize`
+        precision: as of `dejavu localize`
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
             for any that is free. A file is then played in real time, and the page stays until Ctrl-C
         reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
@@ -364,14 +379,15 @@ def run_live(
         raise InputError(f"--reference {reference} without --page; expected both")
     if not 0 < timeout <= threading.TIMEOUT_MAX:
         raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
-    model = _load_map(map, features).to(where)
-    if as_is:
-        model.velocity = None
-    _accept_by(model, threshold, precision)
     if sequence is None:
         filter = True
     length = 1 if sequence is None else sequence
     matcher = _sequence_of(length, speeds, filter, moves, APART, threshold, search_every)
+    _check_accepting(threshold, precision, matcher)
+    model = _load_map(map, features).to(where)
+    if as_is:
+        model.velocity = None
+    _accept_by(model, threshold, precision)
     model.check_precision(matcher)
     follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
 
@@ -421,7 +437,8 @@ def run_compare(
         speeds: as of `dejavu localize`
         filter: as of `dejavu localize`
         moves: as of `dejavu localize`
-        top: write so many places of each query, no two within the tolerance, a row each with its rank
+        top: write so many places of each query, no two within the tolerance, a row each with its rank; a
+            probability is that of the first
         descriptor: as of `dejavu learn`
         calibration: as of `dejavu learn`; a third traverse
         calibration_truth: which places it shows, as --truth
@@ -432,6 +449,9 @@ def run_compare(
 
     where = device_of(device, learns=map is None)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
+    _check_accepting(model.threshold, model.precision, matcher, distractors)
+    if top is not None:
+        check_candidates(top, max(0, tolerance))
     asked = model.threshold
     if filter:
         model.threshold = None  # of distances: that of the filter is none for the map to keep
@@ -453,8 +473,6 @@ def run_compare(
     for other in strange:
         if _same_as(other, traverses):
             raise InputError(f"--distractors {other.name} is one of the traverses; expected another route")
-    if top is not None:
-        _check_top(top, model)
     known_frames = calibration is None and len(first.frame_shape) == 3
     certain = calibration not in UNREAD or (known_frames if map is None else model.calibration is not None)
     if not certain or (matcher is not None and not filter):
@@ -520,6 +538,7 @@ def run_evaluate(
     with report_folder(out) as folder:
         title = f"{matches} evaluated by {truth}"
         write_report(folder, result.report, result.pictures, title, command)
+    _print_contradiction(result.report)
     _print_scores(result.report, out)
 
 
@@ -703,9 +722,9 @@ def run_export(
         raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")
     check_output_file(onnx)
     check_not_read(onnx, map)
+    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
     model = _load_map(map, features)
     _accept_by(model, threshold, None)
-    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
     if matcher is not None and model.precision is not None:
         seen = f"the map's precision, {model.precision}, is of single frames in an ONNX file"
         raise InputError(f"{seen}; expected --threshold with a sequence or a filter")
@@ -1027,18 +1046,28 @@ def _same_as(traverse: Traverse, others: Iterable[Traverse]) -> Traverse | None:
     return next((other for other in others if Path(other.name).resolve() == name), None)
 
 
-def _check_top(top: int, model: DejaVu) -> None:
-    """Refuse to accept several places of a query by the probability of one."""
-    if model.precision is not None:
-        seen = f"--top {top} writes several places, and the precision {model.precision} is of one"
-        raise InputError(f"{seen}; expected --threshold in its place, or no --top")
+def _check_accepting(
+    threshold: float | None,
+    precision: float | None,
+    sequence: SequenceModel | None,
+    distractors: object = None,
+) -> None:
+    """Refuse at once what does not go with a precision, or with anything else that needs probabilities."""
+    if threshold is not None and precision is not None:
+        raise InputError(f"--threshold {threshold:g} and --precision {precision:g}; expected one of them")
+    check_precision(precision)
+    if isinstance(sequence, PlaceFilter):
+        together = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""
+    else:
+        together = f"--sequence {sequence.length}" if isinstance(sequence, SequenceMatcher) else ""
+    for name, value in (("--precision", precision), ("--distractors", distractors)):
+        if together and value:
+            why = "probabilities are of single queries and of a filter that searches all places each time"
+            raise InputError(f"{together} and {name} {value}: {why}; expected one of the two options")
 
 
 def _accept_by(model: DejaVu, threshold: float | None, precision: float | None) -> None:
     """What a model accepts from now on, where one of the two is given."""
-    if threshold is not None and precision is not None:
-        raise InputError(f"--threshold {threshold} and --precision {precision}; expected one of them")
-    check_precision(precision)
     if threshold is not None or precision is not None:
         model.threshold, model.precision = threshold, precision
 
@@ -1110,13 +1139,17 @@ def _publish(
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     run, kept = result.run, out / "map.safetensors"
+    rule = run.model.acceptance(run.sequence)
+    _print_contradiction(result.report)
     print_map(run.model)
     if run.truth is None:
         print("nothing tells which places are right, see --truth: matches and pictures, no scores")
+    if not rule.given:
+        print(rule)
     match = run.match
     if top is not None:
-        first = Candidates(*(column[:, :top] for column in result.candidates))
-        match = first.as_match(run.model.threshold_of(run.sequence))
+        found = Found(result.candidates, probability=match.probability)
+        match = found.first(top).ranked(rule)
     with report_folder(out) as folder:
         if given is None or given.resolve() != kept.resolve():
             run.model.save(folder / kept.name)
@@ -1138,13 +1171,30 @@ def _write_matches(
     return write_matches(path, matches, frames, model.map.frame_of, *names, ranks, model.map.routes)
 
 
+def _counted(matches: Iterable[Match], counts: Counter[str]) -> Iterator[Match]:
+    """The matches as they are, those counted that are probably right."""
+    for match in matches:
+        counts.update(probable_counts(match))
+        yield match
+
+
+def _print_contradiction(report: Report) -> None:
+    """Say ahead of all else that the answers lie elsewhere than a ground truth says."""
+    if report.ours.scores is not None and "line" in report.facts:
+        _say(told_line(report.facts, True))
+
+
 def _print_scores(report: Report, out: Path) -> None:
     from dejavu_torch.evaluation.rejection import rejection_table
-    from dejavu_torch.evaluation.report import score_table, sequence_table, summary, text_table
+    from dejavu_torch.evaluation.report import score_table, sequence_table, steps_after, summary, text_table
 
     rejection = rejection_table(report.facts.get("rejection", {}))
     for rows in (score_table(report), sequence_table(report), rejection):
         if rows:
             print(text_table(rows))
     _say(summary(report))
+    if report.ours.scores is None:
+        for before, text in (("", told_line(report.facts, False)), ("next: ", steps_after(report.facts))):
+            if text:
+                _say(f"{before}{text}")
     _say(f"next: open {out / 'index.html'}")

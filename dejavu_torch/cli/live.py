@@ -85,7 +85,9 @@ def follow(
             if taken.frames:
                 p50, p99 = taken.percentiles()
                 times = f"milliseconds a frame: p50 {p50:.1f}, p99 {p99:.1f}"
-                _tell(f"{taken.frames} frames, {feed.dropped} dropped; {times}")
+                rule = model.acceptance(sequence)
+                told = "" if rule.given else f"; {rule}"
+                _tell(f"{taken.frames} frames, {feed.dropped} dropped; {times}{told}")
 
 
 def shots_from(

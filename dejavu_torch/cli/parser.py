@@ -322,6 +322,9 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
             _check_own(whitening, told, "whitening")
         if arguments.get("descriptor"):
             _check_own(arguments["descriptor"], told, "descriptor")
+        both = [arguments[one] for one in ("threshold", "precision")]
+        if None not in both:
+            raise UsageError("--threshold {:g} and --precision {:g}; expected one of them".format(*both))
         model = arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
         if whitening:
             written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"

@@ -26,7 +26,8 @@ class Fitted(Traverse):
         if len(traverse.frame_shape) != 3 or len(shape) != 3:
             raise InputError(f"{traverse.name} has no frames of the map's kind; expected frames")
         self.traverse, self.shape = traverse, shape
-        self.name, self.length, self.place = traverse.name, traverse.length, traverse.place
+        self.name, self.length = traverse.name, traverse.length
+        self.place, self.cut = traverse.place, traverse.cut
         self.seeks, self.sized = traverse.seeks, True
 
     def batches(self, size: int) -> Iterator[Tensor]:

@@ -43,7 +43,7 @@ class FrameRange(Traverse):
         start: the first frame, from 0. stop: the end, which is left out; 0 is that of the traverse.
         step: how many frames to go on from one to the next.
 
-    Convention: frames count from 0 again; `place` keeps its values.
+    Convention: frames count from 0 again; `place` and `cut` keep their values.
 
     Raises:
         InputError: start, stop or step out of range; while reading, a traverse of unknown length that has
@@ -78,6 +78,8 @@ class FrameRange(Traverse):
         self.seeks, self.sized = traverse.seeks, traverse.sized
         if traverse.place is not None:
             self.place = traverse.place[start : stop or None : self.frames.step].contiguous()
+        if traverse.cut is not None:
+            self.cut = traverse.cut[0], traverse.cut[1][start : stop or None : self.frames.step]
         self._least = len(self.frames) if stop else 1
 
     def batches(self, size: int) -> Iterator[Tensor]:

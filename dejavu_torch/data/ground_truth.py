@@ -160,6 +160,7 @@ class Request(NamedTuple):
     queries: int | Tensor
     interpolate: bool
     resampled: bool
+    aligned: bool
 
     @property
     def numbers(self) -> Tensor:
@@ -208,6 +209,7 @@ def find_ground_truth(
     queries: int | Tensor,
     interpolate: bool = False,
     resampled: bool = False,
+    aligned: bool = False,
 ) -> GroundTruth | None:
     """The ground truth that a text means, or what is known without one, in frames of the reference.
 
@@ -223,14 +225,16 @@ def find_ground_truth(
               right (in GTsoft, if that is the only one); what is in GTsoft only counts neither way;
             - `utm:25`: every reference frame within 25 metres (inclusive; `utm` alone means 25) by the UTM
               coordinates in the names of both traverses' images, `@easting@northing@...@.jpg`;
-            - None: the positions that both traverses carry, else frame i is place i where both are equally
-              long and nothing is resampled, else there is no ground truth.
+            - None: the positions that both traverses carry; else frame i is place i where they say so, see
+              `say_aligned`, are equally long and nothing is resampled; else there is no ground truth.
         reference, query: the sources, not resampled; None where there is none at hand.
         frames: how many frames the reference has, None where unknown.
         queries: how many, or (Q,) int64 the frame of each query in its source.
         interpolate: a query between two that the .csv lists gets the place between theirs, rounded.
         resampled: queries and places are resampled by distance: a query frame that is listed but shown by no
             query then speaks for the nearest one that is shown and not listed.
+        aligned: of two traverses that are equally long, frame i is place i whatever they say, as where a user
+            names one as another traverse of the same places.
 
     Convention 11: a ground truth counts frames of the sources, whether or not they are resampled; see
         `ground_truth_in_places`. The tolerance of the scores applies on top, inclusive.
@@ -243,7 +247,7 @@ def find_ground_truth(
         >>> find_ground_truth("-1", None, None, frames=3, queries=3).positives.tolist()
         [[-1], [0], [1]]
     """
-    request = Request(reference, query, frames, queries, interpolate, resampled)
+    request = Request(reference, query, frames, queries, interpolate, resampled, aligned)
     if truth is None:
         return _default(request)
     format = check_ground_truth(truth, interpolate)
@@ -263,7 +267,32 @@ def _default(request: Request) -> GroundTruth | None:
     count = queries if isinstance(queries, int) else query.length
     if request.resampled or count is None or count != request.frames:
         return None
+    if not (request.aligned or say_aligned(reference, query, count)):
+        return None
     return as_ground_truth(offset_truth(queries, request.frames))
+
+
+def say_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
+    """Whether two traverses of so many frames say themselves that frame i of both shows the same place.
+
+    They do where both were cut alike, each out of a long image, or where the frames of both have the same
+    names, all different. Times, as of the frames of a video, are no such names: any two recordings share
+    them.
+
+    Example:
+        >>> from dejavu_torch.data.source import open_source
+        >>> one, two = (open_source(f"sim:aerial?frames=8&traverse={i}") for i in (0, 1))
+        >>> say_aligned(one, two, 8)  # they have positions, but no names
+        False
+    """
+    if reference.cut is not None:
+        return reference.cut == query.cut
+    if not math.isnan(reference.frame_time(0)):
+        return False
+    names = [reference.frame_name(i) for i in range(frames)]
+    if not all(names) or len({*names}) < frames:
+        return False
+    return all(query.frame_name(i) == name for i, name in enumerate(names))
 
 
 def describe_ground_truth(truth: str | None, interpolate: bool = False, positions: bool = False) -> str:
@@ -274,13 +303,20 @@ def describe_ground_truth(truth: str | None, interpolate: bool = False, position
 
     Example:
         >>> describe_ground_truth("12"), describe_ground_truth(None)
-        ('place = query + 12', 'place = query, since both have as many frames')
+        ('place = query + 12', 'place = query, as the sources say themselves')
     """
     if truth is None:
         carried = "the positions that both traverses carry"
-        return carried if positions else "place = query, since both have as many frames"
+        return carried if positions else "place = query, as the sources say themselves"
     words = check_ground_truth(truth).describe(truth)
     return f"{words}, interpolated" if interpolate else words
+
+
+def offset_of(truth: str | None, positions: bool = False) -> int | None:
+    """The offset of a ground truth place = query + offset, as of `describe_ground_truth`; None for others."""
+    if truth is None:
+        return None if positions else 0
+    return _offset(truth)
 
 
 # offsets and coordinates --------------------------------------------------------------------------------

@@ -44,6 +44,7 @@ class SlidingWindow(IndexedTraverse):
         self.name, self.strip, self.step = name, strip, step
         self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
         self.length = len(self.windows)
+        self.cut = (strip.shape[2], width, step), range(self.length)
 
     def read(self, frames: range) -> Tensor:
         return self.windows[frames.start : frames.stop : frames.step].contiguous()

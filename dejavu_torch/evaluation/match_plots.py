@@ -132,9 +132,9 @@ def plot_rows(rows: Sequence[Row]) -> Plot:
 
 
 def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> list[Example]:
-    """The queries that a report shows: the surest right, the surest wrong, and one at the threshold.
+    """The queries that a report shows: the surest right, the surest wrong, and one at the border.
 
-    The last is the surest that the threshold rejects, or, where it rejects none, the least sure of all.
+    The last is the surest that is not accepted, or, where all are, the least sure of all.
     Without ground truth the surest of all stands for the first two. A query that is several of these is one
     example.
 
@@ -143,7 +143,7 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
         >>> for example in example_matches(match, as_ground_truth(torch.tensor([[0], [1]])), tolerance=0):
         ...     print(example)
         Example(why='surest right answer, score 0.1', query=0, place=0, right=0)
-        Example(why='surest wrong answer, first above the threshold, score 0.2', query=1, place=9, right=1)
+        Example(why='surest wrong answer, surest not accepted, score 0.2', query=1, place=9, right=1)
     """
     reported = match.index >= 0
     rejected = reported & ~match.accepted
@@ -154,7 +154,7 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
         right = is_right(match.index, truth.positives, tolerance)
         groups = {"surest right answer": scored & right, "surest wrong answer": scored & ~right}
     if rejected.any():
-        groups["first above the threshold"] = rejected
+        groups["surest not accepted"] = rejected
     else:
         groups["least sure answer"] = reported
     reasons: dict[int, list[str]] = {}
@@ -395,7 +395,8 @@ def plot_coverage(
     """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9).
 
     Args:
-        truth: (Q,R) right places, or a GroundTruth, or None where nothing is known.
+        truth: (Q,R) right places, or a GroundTruth, or None where nothing is known: the colours are then the
+            probabilities, if there are any.
         borders: (N+1,) see `PlaceMap.borders`; (1,) the number of frames where places are frames.
         queries: (Q,) the frame of each query. unit: of the tolerance.
     """
@@ -409,7 +410,17 @@ def plot_coverage(
             axis.plot(queries[which], shown, ".", color=colour, markersize=size, label=label)
 
     missing = ~reported
-    if truth is None:
+    if truth is None and match.probability is not None and reported.any():
+        order = match.probability.argsort()  # the surest above the others
+        order = order[reported[order]]
+        place = match.index[order]
+        places = borders[place] if len(borders) > 1 else place
+        style: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0, "vmax": 1, "linewidths": 0}
+        dotted = queries[order].numpy(), places.numpy()
+        shown = axis.scatter(*dotted, s=9, c=match.probability[order].numpy(), **style)
+        bar = figure.colorbar(shown, ax=axis, pad=0.01, aspect=30)
+        bar.set_label("probability of being right")
+    elif truth is None:
         dots(reported, COLOURS["map"], f"{reported.sum()} reported")
     else:
         truth = as_ground_truth(truth)
@@ -427,5 +438,6 @@ def plot_coverage(
     first, last = int(queries.min()), int(queries.max())
     axis.set(xlabel=QUERY, ylabel=f"reported {PLACE}")
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
-    figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
+    if axis.get_legend_handles_labels()[0]:
+        figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
     return figure, axis

@@ -54,7 +54,8 @@ def write_matches(
     """Write matches that come in parts as a csv; returns how many (queries, accepted at their first rank).
 
     Args:
-        matches: one a query, in order; with `ranks`, that many a query, as `Candidates.as_match` gives.
+        matches: one a query, in order; with `ranks`, that many a query, as `Found.ranked` gives. Where a
+            probability is NaN its cell is empty.
         query_frames: (Q,) int64, the frame of its source that each query shows; None where query i is
             frame i.
         frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None where place i is
@@ -91,7 +92,8 @@ def write_matches(
             for query, place, score, good, p, at in rows:
                 names = _name(query_name, query), _name(place_name, place)
                 route = bisect_right(starts, place) - 1 if routes and place >= 0 else -1
-                cells = (f"{p:.6g}", at, printable(routes[route].name) if route >= 0 else "")
+                sure = "" if math.isnan(p) else f"{p:.6g}"
+                cells = (sure, at, printable(routes[route].name) if route >= 0 else "")
                 also = [cell for cell, (_, is_told) in zip(cells, told, strict=True) if is_told]
                 own = place - starts[route] if route >= 0 else place
                 writer.writerow([query, own, f"{score:.{digits}g}", int(good), *also, *names])
@@ -113,8 +115,8 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
             0; where the column is missing, every match with a finite score is accepted. probability: of being
             right, from 0 to 1; where the column is missing, none is known. rank: where there is
             such a column, the lines of a query are its candidates, ranks 1 to K in this order with one K for
-            all queries, and the first is its match. route: where there is such a column, the name of the
-            route whose frame the place is. Other columns are ignored.
+            all queries, and the first is its match, whose probability alone counts. route: where there is
+            such a column, the name of the route whose frame the place is. Other columns are ignored.
         route: whose places count, of a file with that column.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
@@ -149,7 +151,8 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
         if "route" in cells and not nothing:
             routes[cells["route"]] = None
             place = place if cells["route"] == route else ELSEWHERE
-        probability = 0.0 if nothing else as_number(cells.get("probability", "0"))
+        unknown = nothing or rank > 1
+        probability = 0.0 if unknown else as_number(cells.get("probability", "0"))
         if probability is None or not 0 <= probability <= 1:
             seen_ = f"probability is {cells['probability']!r}"
             raise InputError(f"{where}: {seen_}; expected a number from 0 to 1")

@@ -179,9 +179,9 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
         rows.append(Row(one.why, titles, frames))
     known = "" if run.truth is None else ", and at the right what it should have been"
     last = (
-        "First above the threshold: the best match that the threshold rejects."
-        if any("threshold" in one.why for one in examples)
-        else "No threshold rejects any; the least sure answer has the worst score."
+        "Surest not accepted: the best match of those that are rejected."
+        if any("not accepted" in one.why for one in examples)
+        else "All are accepted; the least sure answer has the worst score."
     )
     return {
         "pairs": Picture(
@@ -202,11 +202,14 @@ def draw_coverage(
     match: Match, truth: GroundTruth | None, tolerance: int, borders: Tensor, queries: Tensor, unit: str
 ) -> dict[str, Picture]:
     """The places reported; see `plot_coverage`."""
+    colours = "A query in its right place is green, in a wrong one red."
+    if truth is None:
+        known = match.probability is not None
+        colours = "The darker, the more probably it is the right place." if known else ""
     picture = Picture(
         plot_coverage(match, truth, tolerance, borders, queries, unit),
         "places reported",
-        "Where along the route each query was found."
-        + (" A query in its right place is green, in a wrong one red." if truth is not None else ""),
+        f"Where along the route each query was found. {colours}".strip(),
     )
     return {"coverage": picture}
 

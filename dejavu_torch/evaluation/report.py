@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 import jinja2
 
 from dejavu_torch.data.output import whole_folder
+from dejavu_torch.evaluation.answers import next_steps, told_line, told_probable
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import rejection_table
+from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.text import printable
 
 PICTURES = (
@@ -149,11 +151,10 @@ def headline(report: Report) -> str:
     facts, scores = report.facts, report.ours.scores
     text = f"{facts['queries']} queries were looked up"
     text += f" on a map of {facts['frames']} places" if "frames" in facts else ""
+    line = told_line(facts, scores is not None)
     if scores is None:
-        return (
-            f"{text}. There is no ground truth, so nothing is scored: see the matches and the pictures, or "
-            "give one, such as --truth 12 (place = query + 12) or --truth truth.csv (rows of query,place)."
-        )
+        return f"{text}. {unscored(facts)} {sentence(line)}".strip()
+    text = f"{sentence(line)} {text}".strip()
     answerable = facts.get("with_answer", facts["queries"])
     some = f" Of the {answerable} that have a right place," if answerable < facts["queries"] else ""
     text += f"{'.' if some else ':'}{some} {percent(scores.recall_at_1)} were found in their right place "
@@ -173,6 +174,31 @@ def headline(report: Report) -> str:
     return text
 
 
+def unscored(facts: Mapping[str, Any]) -> str:
+    """What can be said of answers where nothing tells which are right, and what to do next, in sentences."""
+    steps = steps_after(facts)
+    if not steps:
+        return (
+            "There is no ground truth, so nothing is scored: see the matches and the pictures, or give one, "
+            "such as --truth 12 (place = query + 12) or --truth truth.csv (rows of query,place)."
+        )
+    return f"{sentence(told_probable(facts['probably_right'], facts['queries']))} Next: {steps}."
+
+
+def steps_after(facts: Mapping[str, Any]) -> str:
+    """What to try next where nothing is scored, but probabilities are known; else ""."""
+    if "probably_right" not in facts:
+        return ""
+    together = bool(facts.get("filter")) or facts.get("sequence", 1) > 1
+    strict = facts.get("threshold") is not None or (facts.get("least_probability") or 0) > PROBABLE
+    return "; ".join([*next_steps(together, strict), "--truth scores the answers"])
+
+
+def sentence(text: str) -> str:
+    """Words as a sentence of their own; "" stays as it is."""
+    return text[:1].upper() + text[1:] + "." * (text[-1:] not in ("", "?"))
+
+
 def percent(share: float) -> str:
     """A share in words that stay on one line.
 
@@ -189,7 +215,10 @@ def summary(report: Report) -> str:
     places = f" on {facts['frames']} places" if "frames" in facts else ""
     right = f"right within {facts['tolerance']} {facts.get('unit', 'frames')}"
     right += f" of the truth ({facts['truth']})" if facts.get("truth") else ""
-    lines = [f"{facts['queries']} queries{places}; {right if report.ours.scores else 'nothing is scored'}"]
+    if report.ours.scores is None:
+        counts = facts.get("probably_right")
+        right = told_probable(counts, facts["queries"]) if counts else "nothing is scored"
+    lines = [f"{facts['queries']} queries{places}; {right}"]
     if "resampling" in facts:
         step, reference, query = (
             facts["resampling"][key] for key in ("step", "reference_frames", "query_frames")

@@ -20,6 +20,7 @@ from dejavu_torch.data.ground_truth import (
     check_ground_truth,
     describe_ground_truth,
     ground_truth_in_places,
+    offset_of,
 )
 from dejavu_torch.database.l1 import l1_backend
 from dejavu_torch.database.place_map import PlaceMap
@@ -27,6 +28,7 @@ from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.database.summary import MapSummary
 from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqslam_baseline
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
@@ -96,8 +98,8 @@ def compare(
 
     Args:
         reference: the traverse to learn. query: a second traverse of the route.
-        truth: see `find_ground_truth`; without one there are matches and pictures, but neither scores nor
-            baselines.
+        truth: see `find_ground_truth`; where neither it nor the sources themselves tell the right places,
+            there are matches and pictures, but neither scores nor baselines.
         model: settings; None is DejaVu with its defaults. A model that has a map keeps it and is
             evaluated as it is: the map has to be of this very reference. It learns and localizes on the
             device that it is on, and is on the CPU afterwards, where all the rest is computed.
@@ -159,7 +161,7 @@ def compare(
         matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
         wanted = matching._replace(ranks=ranks, apart=tolerance, platt=model.matching(sequence).platt)
         found = model.found(queries, wanted)
-    match, candidates = found.match(model.threshold_of(sequence), model.precision), found.candidates
+    match, candidates = found.match(model.acceptance(sequence)), found.candidates
     off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
     if distractors and not off_map:
         log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
@@ -189,6 +191,13 @@ def compare(
             tolerance,
             model.map.positions,
             describe_ground_truth(truth, interpolate, carried),
+        ),
+        **own_facts(
+            match._replace(index=model.map.frame_of(match.index)),
+            run.query_frames,
+            tolerance,
+            known is not None,
+            offset_of(truth, carried),
         ),
         **candidate_facts(model.map.scored(candidates.index), known, tolerance),
         **rejection_facts(run.scored, known, tolerance, off_map),
@@ -364,12 +373,14 @@ def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
 def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
     """What report.json holds of the run beside its scores; nothing is learned where the map is given."""
     model, reference, query = run.model, run.reference, run.query
+    rule = model.acceptance(run.sequence)
     facts = {
         "seconds_learn": seconds["learn"],
         "seconds_localize": seconds["localize"],
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
-        "threshold": model.threshold_of(run.sequence),
+        "threshold": rule.threshold,
+        "least_probability": rule.precision,
         "sequence": run.sequence.length if isinstance(run.sequence, SequenceMatcher) else 1,
         "speeds": list(run.sequence.speeds) if isinstance(run.sequence, SequenceMatcher) else None,
         "filter": isinstance(run.sequence, PlaceFilter),

@@ -15,9 +15,11 @@ from dejavu_torch.data.ground_truth import (
     describe_ground_truth,
     find_ground_truth,
     ground_truth_in_places,
+    offset_of,
 )
 from dejavu_torch.data.positions import unit_of
 from dejavu_torch.database.merged import MergedMap
+from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import (
     RECALL_DEFINITION,
@@ -99,6 +101,8 @@ def evaluate_file(
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
         raise InputError("there is no ground truth; expected one, or traverses that carry their positions")
+    carried = all(one is not None and one.place is not None for one in (reference, query))
+    own = own_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         match = match._replace(index=place_map.place_of(match.index))
@@ -108,9 +112,8 @@ def evaluate_file(
         behind = max(places or 0, 1 + highest) + tolerance
         match = match._replace(index=match.index.masked_fill(elsewhere[0], behind))
         candidates = candidates.masked_fill(elsewhere[1], behind)
-    facts = evaluation_facts(
-        match, known, tolerance, positions, describe_ground_truth(truth, interpolate, positions=True)
-    )
+    described = describe_ground_truth(truth, interpolate, carried)
+    facts = evaluation_facts(match, known, tolerance, positions, described) | own
     accepted = facts["accepted"]
     facts |= candidate_facts(candidates, known, tolerance)
     facts |= rejection_facts(match, known, tolerance, {})

@@ -208,7 +208,7 @@ def _check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
 
 def _truth(reference: Traverse, query: Traverse, frames: int, queries: int) -> GroundTruth:
     """What the sources say, or frame i is place i."""
-    truth = ground_truth_of(None, reference, query, frames, queries)
+    truth = ground_truth_of(None, reference, query, frames, queries, aligned=True)
     if truth is None:
         raise InputError(
             f"{reference.name} has {frames} frames and {query.name} {queries}; expected as many, frame i "

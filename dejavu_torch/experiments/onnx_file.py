@@ -259,6 +259,8 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
         facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
         facts |= {} if model.precision is None else {"precision": model.precision}
     threshold = model.threshold_of(sequence)
+    if threshold is None and sequence is not None:
+        threshold = sequence.likely  # of sequences the file has no calibration
     facts |= {} if threshold is None else {"threshold": threshold}
     return facts | ({} if model.step is None else {"step": model.step})
 

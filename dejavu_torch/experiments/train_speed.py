@@ -122,7 +122,7 @@ def bench_train(
     if steps < 1 or not seeds or not all(0 <= seed < 2**32 for seed in seeds):
         seen = f"bench train got {steps} steps and seeds {list(seeds)}"
         raise InputError(f"{seen}; expected at least one each, and seeds from 0 to 2^32 - 1")
-    truth = ground_truth_of(None, reference, query)
+    truth = ground_truth_of(None, reference, query, aligned=True)
     if truth is None:
         raise InputError(
             f"nothing tells the places of {query.name}: it has {query.length} frames, {reference.name} "

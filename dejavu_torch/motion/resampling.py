@@ -160,6 +160,7 @@ def ground_truth_of(
     places: int | None = None,
     queries: int | None = None,
     interpolate: bool = False,
+    aligned: bool = False,
 ) -> GroundTruth | None:
     """`find_ground_truth` of traverses that may be resampled, in frames of the reference's source.
 
@@ -173,4 +174,5 @@ def ground_truth_of(
     if numbers is None:
         raise InputError(f"{query.name} does not know how many frames it has; expected their number")
     sources = source_of(reference), source_of(query)
-    return find_ground_truth(truth, *sources, frames, numbers, interpolate, reference is not sources[0])
+    moved = reference is not sources[0]
+    return find_ground_truth(truth, *sources, frames, numbers, interpolate, moved, aligned)

@@ -54,8 +54,8 @@ class PlaceFilter(SequenceModel):
         off_map: standard deviations; a place that stands out less than this speaks for being off the map.
         within: places; the score of a place counts its neighbours up to here, the less the further away,
             since what is nearly right counts as right.
-        threshold: accept a match whose score is below; the default accepts what is more likely than not,
-            None every match.
+        threshold: accept a match whose score is below, math.inf every match; None leaves it to
+            `DejaVu.acceptance`, which without a calibrated map accepts what is more likely than not.
         search_every: queries from one search of all places to the next. In between `follow`, and so
             `DejaVu.localize`, scores only the stretch of places that is likely, as far as the map can score a
             stretch alone: a spectral map by its chunks, a template map by its layers. Where no stretch holds
@@ -87,6 +87,8 @@ class PlaceFilter(SequenceModel):
         tensor([0, 1, 2])
     """
 
+    likely = math.log(2)
+
     def __init__(
         self,
         moves: Sequence[float] = (0.2, 0.6, 0.2),
@@ -96,7 +98,7 @@ class PlaceFilter(SequenceModel):
         sharpness: float = 1.0,
         off_map: float = 1.25,
         within: int = 5,
-        threshold: float | None = math.log(2),
+        threshold: float | None = None,
         search_every: int = 1,
     ) -> None:
         super().__init__()

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, evidence, evidence_of
 from dejavu_torch.recognition.candidates import Candidates, best_candidates
 from dejavu_torch.recognition.search import LISTED, SCORES_AT_ONCE, Search, Searcher, enough
-from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.select import Acceptance, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
 
+EVERY = Acceptance()  # of finite scores
 LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
 AT_ONCE = 2**20  # scores summed at a time: they stay in the processor's cache
 
@@ -32,14 +35,27 @@ class Found(NamedTuple):
     sequences: Mapping[int, Match] = MappingProxyType({})
     probability: Tensor | None = None
 
-    def match(self, threshold: float | None = None, precision: float | None = None) -> Match:
-        """The first candidate of each query, accepted as by `best_match`, or where it is at least as probably
-        right as `precision`."""
-        match = Candidates(*(column[:, :1] for column in self.candidates)).as_match(threshold)
+    def match(self, rule: Acceptance = EVERY) -> Match:
+        """The first candidate of each query."""
+        return self.first(1).ranked(rule)
+
+    def ranked(self, rule: Acceptance = EVERY) -> Match:
+        """Every candidate as a match of its own: (Q * k,), the k of a query together, best first.
+
+        Convention: a probability is that of the first candidate; the others have NaN, and where it decides,
+        none of these is accepted.
+        """
+        match = self.candidates.as_match(rule.threshold)
         if self.probability is None:
             return match
-        accepted = match.accepted if precision is None else self.probability >= precision
-        return match._replace(accepted=accepted).with_probability(self.probability)
+        others = self.candidates.index.shape[1] - 1
+        probability = pad(self.probability[:, None], (0, others), value=math.nan).flatten()
+        accepted = match.accepted if rule.precision is None else probability >= rule.precision
+        return match._replace(accepted=accepted).with_probability(probability)
+
+    def first(self, ranks: int) -> Found:
+        """The same with at most so many candidates of each query."""
+        return self._replace(candidates=Candidates(*(column[:, :ranks] for column in self.candidates)))
 
     def moved(self, place: Callable[[Tensor], Tensor]) -> Found:
         """The same with other numbers of the places; -1, where none is found, must stay."""

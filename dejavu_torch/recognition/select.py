@@ -2,10 +2,38 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from dejavu_torch.types import InputError, Match
+
+PROBABLE = 0.5  # what a calibrated map accepts from, where nobody says otherwise
+
+
+class Acceptance(NamedTuple):
+    """Which answers are accepted; `DejaVu.acceptance` chooses it.
+
+    threshold: those whose score is below; None accepts every finite score. precision: instead, those that are
+    at least so probably right. given: whether one of the two was asked for, or is stored in the map.
+    """
+
+    threshold: float | None = None
+    precision: float | None = None
+    given: bool = True
+
+    def __str__(self) -> str:
+        if self.precision is not None:
+            told = f"accepted where the probability is at least {self.precision:.9g}"
+        elif self.threshold is None:
+            told = "every query with a finite score is accepted"
+        elif self.given:
+            told = f"accepted where the score is below {self.threshold:.9g}"
+        else:
+            told = f"accepted where the filter itself gives more than {math.exp(-self.threshold):.9g}"
+        return told if self.given else f"no threshold given or stored in the map: {told}"
 
 
 def best_match(scores: Tensor, threshold: float | None = None) -> Match:

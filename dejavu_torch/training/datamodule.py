@@ -151,7 +151,8 @@ class RouteData(LightningDataModule):
         validation: a traverse to validate on during training. None: the reference itself under augmentation,
             the same each time; its figures say what is learned, not how another traverse fares.
         validation_truth: see `find_ground_truth`.
-        query: the traverse that `test` localizes. truth: its places, see `find_ground_truth`.
+        query: the traverse that `test` localizes. truth: its places, see `find_ground_truth`; of `second` and
+            `validation`, where they are as long, frame i is place i without one.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
@@ -352,12 +353,14 @@ class RouteData(LightningDataModule):
         self._check_length(traverse.name, len(values))
         if values.shape[1:] != reference.shape[1:]:
             raise _other_frames(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
-        known = ground_truth_of(self.truths[name][i], route, traverse, len(reference), len(values))
+        named = name != "query"  # as another traverse of the same places
+        counts = len(reference), len(values)
+        known = ground_truth_of(self.truths[name][i], route, traverse, *counts, aligned=named)
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
             raise InputError(
                 f"there is no ground truth for {traverse.name}: it has {len(values)} frames, the reference "
-                f"{len(reference)} places; expected {option}"
+                f"{len(reference)} places; expected {option}, such as 0 where frame i is place i"
             )
         if isinstance(route, ResampledTraverse):
             known = ground_truth_in_places(known, partial(place_of, route.positions))

@@ -36,6 +36,7 @@ from dejavu_torch.data.ground_truth import (
     position_truth,
 )
 from dejavu_torch.data.positions import look_up
+from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
@@ -181,9 +182,7 @@ def written(folder: Path, text: str | bytes) -> str:
         ("0", route(3), route(3), [0, 1, 2]),
         ("-1", route(3), route(3), [-1, 0, 1]),
         ("+1", route(3), route(2), [1, 2]),
-        (None, route(3), route(3), [0, 1, 2]),
         (None, route(3, [0, 1, 2]), route(2, [2, 1]), [2, 1]),
-        (None, route(3, [0, 1, 2]), route(3), [0, 1, 2]),
         ("1", route(3, [0, 1, 2]), route(3, [2, 1, 0]), [1, 2, -1]),
     ],
 )
@@ -203,12 +202,72 @@ def test_without_a_truth_other_lengths_or_missing_traverses_give_none() -> None:
     assert find_ground_truth(None, route(3), None, None, torch.tensor([0])) is None
 
 
+class Named(ArrayTraverse):
+    """Frames with names, and with times where `timed`."""
+
+    def __init__(self, names: list[str], timed: bool = False) -> None:
+        super().__init__(torch.rand(len(names), 2))
+        self.names, self.timed = names, timed
+
+    def frame_name(self, i: int) -> str:
+        return self.names[i]
+
+    def frame_time(self, i: int) -> float:
+        return float(i) if self.timed else math.nan
+
+
+def strip(pixels: int, width: int = 8, **part: int) -> Traverse:
+    window: Traverse = SlidingWindow(torch.rand(1, 8, pixels), width)
+    return FrameRange(window, **part) if part else window
+
+
+ABC, TIMES = list("abc"), ["0:00.0", "0:00.5", "0:01.0"]
+
+
+@pytest.mark.parametrize(
+    ("reference", "query", "says"),
+    [
+        (Named(ABC), Named(ABC), True),
+        (FrameRange(Named([*"xabc"]), 1), Named(ABC), True),
+        (route(3), route(3), False),
+        (route(3, [0, 1, 2]), route(3), False),
+        (Named(ABC), Named(["a", "b", "d"]), False),
+        (Named(ABC), Named(["b", "a", "c"]), False),
+        (Named([""] * 3), Named([""] * 3), False),
+        (Named(["a", "b", ""]), Named(["a", "b", ""]), False),
+        (Named(["a"] * 3), Named(["a"] * 3), False),
+        (Named(TIMES, timed=True), Named(TIMES, timed=True), False),
+        (strip(20), strip(20), True),
+        (strip(20), strip(22, 10), False),  # as many frames, of other windows
+        (strip(20, start=3), strip(20, start=3), True),
+        (strip(20, start=3, stop=6), strip(20, start=4, stop=7), False),
+        (strip(20, step=2), strip(20, stop=7), False),
+        (strip(10), route(3), False),
+        (route(3), strip(10), False),
+    ],
+)
+def test_as_many_frames_are_the_same_places_where_they_say_so(
+    reference: Traverse, query: Traverse, says: bool
+) -> None:
+    frames, queries = reference.length, query.length
+    assert frames is not None
+    assert queries == frames
+    found = find_ground_truth(None, reference, query, frames, queries)
+    assert (found is not None) == says
+    expected = list(range(frames))
+    if found is not None:
+        assert found.positives[:, 0].tolist() == expected
+    named = find_ground_truth(None, reference, query, frames, queries, aligned=True)  # by a user
+    assert named is not None
+    assert named.positives[:, 0].tolist() == expected
+
+
 def test_numbered_queries_get_their_own_rows() -> None:
     numbers = torch.tensor([3, 0])
     by_offset = find_ground_truth("2", None, None, None, numbers)
     by_position = find_ground_truth(None, route(3, [0, 1, 2]), route(4, [2, 9, 9, 1]), 3, numbers)
-    by_length = find_ground_truth(None, route(4), route(4), 4, numbers)
-    for found, expected in ((by_offset, [5, 2]), (by_position, [1, 2]), (by_length, [3, 0])):
+    by_name = find_ground_truth(None, Named([*"abcd"]), Named([*"abcd"]), 4, numbers)
+    for found, expected in ((by_offset, [5, 2]), (by_position, [1, 2]), (by_name, [3, 0])):
         assert found is not None
         assert found.positives[:, 0].tolist() == expected
     with refused("query 3", "below 3"):
@@ -645,8 +704,8 @@ def test_positions_and_coordinates_are_of_frames(tmp_path: Path) -> None:
 
 def test_as_many_resampled_frames_are_no_ground_truth() -> None:
     pair = route(12), route(12)
-    assert find_ground_truth(None, *pair, 12, SHOWN, resampled=True) is None
-    assert find_ground_truth(None, *pair, 12, SHOWN) is not None
+    assert find_ground_truth(None, *pair, 12, SHOWN, resampled=True, aligned=True) is None
+    assert find_ground_truth(None, *pair, 12, SHOWN, aligned=True) is not None
 
 
 @pytest.mark.parametrize(
@@ -655,7 +714,7 @@ def test_as_many_resampled_frames_are_no_ground_truth() -> None:
         ("-3", {}, "place = query - 3"),
         ("utm", {}, "within 25 m by the coordinates in image names"),
         ("utm:7.5", {}, "within 7.5 m"),
-        (None, {}, "both have as many frames"),
+        (None, {}, "as the sources say themselves"),
         (None, {"positions": True}, "positions that both traverses carry"),
     ],
 )

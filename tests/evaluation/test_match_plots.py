@@ -43,6 +43,19 @@ def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
     render(figure)
 
 
+def test_without_a_truth_coverage_shows_the_probabilities() -> None:
+    sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
+    match = matched(4, 9, -1, 2).with_probability(sure)
+    figure, axis = plot_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")
+    (points,) = axis.collections
+    shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))
+    assert shown == {0.2: (1, 9), 0.6: (3, 2), 0.9: (0, 4)}
+    assert points.get_clim() == (0, 1)
+    assert dots(axis) == {"1 not reported": [(2, 0)]}
+    assert "probability of being right" in texts(figure)
+    render(figure)
+
+
 def test_coverage_leaves_grey_what_is_not_scored() -> None:
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
     truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
@@ -99,7 +112,7 @@ def test_where_a_threshold_rejects_some_the_best_of_them_is_shown() -> None:
     match = found([0, 1, 2, 3], [0.1, 0.4, 0.3, 0.2], below=0.25)
     last = example_matches(match, None, 0)[-1]
     assert (last.query, last.right) == (2, -1)
-    assert "first above the threshold" in last.why
+    assert "surest not accepted" in last.why
 
 
 def test_an_example_is_shown_once_and_only_if_there_is_one() -> None:

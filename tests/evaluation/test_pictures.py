@@ -190,9 +190,9 @@ def test_the_pairs_are_the_frames_that_were_matched() -> None:
         assert torch.allclose(torch.tensor(axis.images[0].get_array())[..., 0], source[number, 0])
     for asked, reported in zip(numbers[::3], numbers[1::3], strict=True):
         assert int(run.match.index[asked]) == reported
-    assert "No threshold rejects any" in pairs.caption
+    assert "All are accepted" in pairs.caption
     strict = run._replace(match=run.match._replace(accepted=run.match.accepted & False))
-    assert "best match that the threshold rejects" in draw_pictures(strict, {})["pairs"].caption
+    assert "best match of those that are rejected" in draw_pictures(strict, {})["pairs"].caption
 
 
 def test_the_score_matrix_is_the_map_s() -> None:

@@ -42,7 +42,7 @@ def model() -> DejaVu:
 
 
 def test_scores_of_a_route_that_repeats(model: DejaVu) -> None:
-    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model)
+    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model)
     report = result.report.as_json()
     assert report["queries"] == 240
     # lcm(12, 20) = 60: of four places that look alike the first is reported
@@ -84,8 +84,8 @@ def test_what_is_not_scored_is_shown_too(model: DejaVu) -> None:
 
 def test_leave_out_is_printed_beside_never_instead(model: DejaVu) -> None:
     reference, query = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    without = compare(reference, query, model=model).report.as_json()
-    having = compare(reference, query, model=model, leave_out=2).report.as_json()
+    without = compare(reference, query, "0", model=model).report.as_json()
+    having = compare(reference, query, "0", model=model, leave_out=2).report.as_json()
     assert "leave_out" not in without
     assert having["recall_at_1"] == without["recall_at_1"]
     assert 0 <= having["leave_out"]["recall_at_1"] <= 1
@@ -94,19 +94,19 @@ def test_leave_out_is_printed_beside_never_instead(model: DejaVu) -> None:
 def test_the_seed_shuffles_the_null_only() -> None:
     model = template_model(periods=SpectrogramAnalysis(window=240, false_alarm=None))
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    first, second = (compare(*pair, model=model, seed=seed).report.as_json() for seed in (0, 1))
+    first, second = (compare(*pair, "0", model=model, seed=seed).report.as_json() for seed in (0, 1))
     assert first["auc"] == second["auc"]
     assert first["null"] != second["null"]
 
 
 def test_refuses_a_negative_tolerance(model: DejaVu) -> None:
     with pytest.raises(InputError, match="tolerance is -1"):
-        compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model, tolerance=-1)
+        compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=-1)
 
 
 def test_a_callable_metric() -> None:
     model = template_model(periods=SpectrogramAnalysis(window=240), metric=torch.cdist)
-    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model)
+    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model)
     assert result.report.as_json()["recall_at_1"] > 0
 
 
@@ -144,7 +144,7 @@ def trained(model: DejaVu) -> DejaVu:
 def test_a_map_that_is_there_is_evaluated_as_it_is(trained: DejaVu) -> None:
     before, expected = trained.map, trained.localize(route(1))
     templates = before.templates.clone()
-    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=trained)
+    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=trained)
     assert result.run.model.map is before
     assert torch.equal(before.templates, templates)
     for one, other in zip(result.run.match, expected, strict=True):
@@ -155,7 +155,7 @@ def test_a_map_that_is_there_is_evaluated_as_it_is(trained: DejaVu) -> None:
     assert report["map_bytes"] == trained.summary().map_bytes
     # the area tells them apart: this map's is not that of one learned anew
     fresh = with_mapper(trained, trained.mapper)
-    anew = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=fresh).report.as_json()
+    anew = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=fresh).report.as_json()
     assert anew["trained"] is None
     assert anew["seconds_learn"] > 0
     assert anew["auc"] != report["auc"]
@@ -163,7 +163,7 @@ def test_a_map_that_is_there_is_evaluated_as_it_is(trained: DejaVu) -> None:
 
 def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained: DejaVu) -> None:
     reference, query = route(0), route(1)
-    result = compare(ArrayTraverse(reference), ArrayTraverse(query), model=trained, seed=5)
+    result = compare(ArrayTraverse(reference), ArrayTraverse(query), "0", model=trained, seed=5)
     null = result.report.contenders["null"]
     assert null.name == "null: templates of shuffled frames"
     assert "null_same_plan" not in result.report.contenders
@@ -173,8 +173,8 @@ def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained:
 
 def test_a_map_that_is_there_keeps_its_nulls(model: DejaVu) -> None:
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    learned = compare(*pair, model=model).report.as_json()
-    there = compare(*pair, model=model).report.as_json()
+    learned = compare(*pair, "0", model=model).report.as_json()
+    there = compare(*pair, "0", model=model).report.as_json()
     for key in ("auc", "recall_at_1", "null", "null_same_plan", "stride", "trained", "periods"):
         assert there[key] == learned[key], key
 
@@ -189,7 +189,7 @@ def test_another_reference_than_the_map_s_is_refused(trained: DejaVu, frames: in
 def test_features_of_another_dimension_than_the_map_s_are_refused(trained: DejaVu) -> None:
     pair = ArrayTraverse(route(0)[:, :59]), ArrayTraverse(route(1)[:, :59])
     with refused("59", "60"):
-        compare(*pair, model=trained)
+        compare(*pair, "0", model=trained)
 
 
 class Unreadable(ArrayTraverse):
@@ -201,19 +201,19 @@ class Unreadable(ArrayTraverse):
 
 def test_leaving_out_of_a_trained_map_is_refused_at_once(trained: DejaVu) -> None:
     with refused("leave_out is 2", "trained templates", "no means of frames"):
-        compare(Unreadable(route(0)), Unreadable(route(1)), model=trained, leave_out=2)
+        compare(Unreadable(route(0)), Unreadable(route(1)), "0", model=trained, leave_out=2)
     # learned anew they are means again
     fresh = with_mapper(trained, trained.mapper)
-    report = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=fresh, leave_out=2).report
+    report = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=fresh, leave_out=2).report
     assert "leave_out" in report.contenders
 
 
 def test_a_traverse_matched_with_itself_is_warned_of(model: DejaVu, caplog: pytest.LogCaptureFixture) -> None:
     same = route(0)
-    compare(same, same, model=model)
+    compare(same, same, "0", model=model)
     assert "matched with itself" in caplog.text
     caplog.clear()
-    compare(same, route(1), model=template_model())  # two tensors, neither of which has a name
+    compare(same, route(1), "0", model=template_model())  # two tensors, neither of which has a name
     assert "matched with itself" not in caplog.text
 
 
@@ -221,7 +221,7 @@ def test_a_map_of_another_route_is_warned_of(caplog: pytest.LogCaptureFixture) -
     def warnings(reference: Tensor, tolerance: int = 2) -> list[str]:
         caplog.clear()
         pair = ArrayTraverse(reference, "one"), ArrayTraverse(route(1), "two")
-        compare(*pair, model=model, tolerance=tolerance)
+        compare(*pair, "0", model=model, tolerance=tolerance)
         return [one.getMessage() for one in caplog.records]
 
     model = template_model(periods=Fixed(FrequencyLayer(240, 240, 0, 240, tuple(range(60))))).learn(route(0))
@@ -235,7 +235,7 @@ def test_the_template_that_is_drawn_is_called_what_it_is(trained: DejaVu) -> Non
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
     fresh = with_mapper(trained, trained.mapper)
     for model, thick in ((trained, "the trained template"), (fresh, "their mean")):
-        picture = compare(*pair, model=model).pictures["templates"]
+        picture = compare(*pair, "0", model=model).pictures["templates"]
         assert f"thick: {thick}" in picture.plot[1][0].get_title(loc="left")
         assert ("that training made of it" in picture.caption) == (model is trained)
 
@@ -309,7 +309,7 @@ def test_whatever_stores_features_needs_the_backbone_as_well() -> None:
 
 def test_hog_does_not_stand_beside_itself_nor_where_there_are_no_frames(model: DejaVu) -> None:
     assert not {"hog", "hog_stride_coarsest"} & contenders(None).keys()
-    features = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), model=model).report.contenders
+    features = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model).report.contenders
     assert not {"hog", "hog_stride_coarsest"} & features.keys()
 
 
@@ -336,7 +336,7 @@ def test_sequences_of_every_contender(kind: str) -> None:
     pair = ArrayTraverse(passing(1)), ArrayTraverse(passing(2))
 
     def report(sequence: Any) -> dict[str, Any]:
-        return compare(*pair, model=model, tolerance=1, sequence=sequence).report.as_json()
+        return compare(*pair, "0", model=model, tolerance=1, sequence=sequence).report.as_json()
 
     single, seven, filtered = report(None), report(SequenceMatcher(7)), report(PlaceFilter(within=1))
     keys = {key for key, entry in single.items() if isinstance(entry, dict) and "auc" in entry}
@@ -381,7 +381,7 @@ def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.Monk
     for sequence in (None, SequenceMatcher(21), PlaceFilter()):
         asked.clear()
         model = DejaVu(whitening="none")
-        compare(ArrayTraverse(passing(1)), ArrayTraverse(passing(2)), model=model, sequence=sequence)
+        compare(ArrayTraverse(passing(1)), ArrayTraverse(passing(2)), "0", model=model, sequence=sequence)
         totals.append(sum(asked))
     assert len(set(totals)) == 1
     assert totals[0] > 64 * 10
@@ -405,7 +405,7 @@ def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames() -> None:
 def test_seqslam_s_pixels_need_frames_and_a_sequence(model: DejaVu) -> None:
     assert "seqslam" not in contenders(nn.Flatten())
     features = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    report = compare(*features, model=model, sequence=SequenceMatcher(5)).report
+    report = compare(*features, "0", model=model, sequence=SequenceMatcher(5)).report
     assert "seqslam" not in report.contenders
     assert list(report.contenders["uncompressed"].sequences) == [1, 5, 11, 21]
     tiny = template_model(nn.Flatten())

@@ -273,4 +273,4 @@ def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(
     route, model = DejaVu.load("road.safetensors").eval(), PlaceFilter()
     queries = next(open_source("sim:aerial?frames=64&traverse=1").between(30, 42))
     facts = assert_streams(Path("drive.onnx"), route, model, [65], queries)
-    assert facts["threshold"] == model.threshold_of(None)
+    assert facts["threshold"] == model.likely

@@ -345,7 +345,7 @@ def test_a_map_with_known_boundaries_is_learned_and_scored_as_any_other() -> Non
     reference, query = two_periods("a route", random), two_periods("again", random)
     settings = {"false_alarm": None, "strongest": 1}
     model = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(128, **settings)))
-    result = compare(reference, query, model=model, tolerance=0)
+    result = compare(reference, query, "0", model=model, tolerance=0)
     chunks = [(chunk["start"], chunk["stop"]) for chunk in result.report.facts["chunks"]]
     assert chunks == [(0, 128), (128, 256)]
     maps = known_boundaries(result, [90], tolerance=0)

@@ -17,6 +17,7 @@ from torch import Tensor
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, open_source
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.features.views import Stretches, Views
+from dejavu_torch.model import HIGHEST
 from dejavu_torch.recognition.calibration import (
     NEVER,
     Calibration,
@@ -272,6 +273,33 @@ def test_batches_and_files_do_not_change_probabilities(model: DejaVu, tmp_path: 
     for sequence in (None, PlaceFilter()):
         whole, parts = (one.localize(queries, sequence=sequence).probability for one in (model, again))
         torch.testing.assert_close(whole, parts, atol=1e-5, rtol=0)
+
+
+def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_on(model: DejaVu) -> None:
+    queries = torch.cat(list(open_source(AGAIN).batches(64)))[::2]
+    queries[40:] = queries[40:].flip(-1)  # some that are hard to find
+    for sequence in (None, PlaceFilter()):
+        match = model.localize(queries, sequence=sequence)
+        assert match.probability is not None
+        assert torch.equal(match.accepted, match.probability >= 0.5)
+        assert 0 < int(match.accepted.sum()) < len(queries)
+    assert model.acceptance() == model.acceptance(PlaceFilter()) == (None, 0.5, False)
+    assert model.acceptance(PlaceFilter(threshold=3.0)) == (3.0, None, True)
+    assert model.acceptance(PlaceFilter(search_every=9)) == (math.log(2), None, False)  # not calibrated for
+    assert model.acceptance(SequenceMatcher(5)) == (None, None, False)
+    for settings, single, filtered, sequence in (
+        ({"threshold": 0.2}, (0.2, None, True), (None, 0.5, False), (0.2, None, True)),
+        ({"precision": 0.9}, (None, 0.9, True), (None, 0.9, True), None),
+        ({"threshold": math.inf}, (HIGHEST, None, True), (None, 0.5, False), (HIGHEST, None, True)),
+    ):
+        other = DejaVu(**(model.settings() | settings))
+        other.load_state_dict(model.state_dict())
+        assert (other.acceptance(), other.acceptance(PlaceFilter())) == (single, filtered)
+        if sequence is not None:
+            assert other.acceptance(SequenceMatcher(5)) == sequence
+    other.calibration = NEVER
+    assert other.localize(queries).accepted.all()  # the last one, whatever the score
+    assert other.acceptance(PlaceFilter()) == (math.log(2), None, False)
 
 
 def test_precision_accepts_what_is_probable_enough(model: DejaVu, tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
     assert torch.equal(found.index, torch.arange(10, 50))
     assert torch.equal(found.accepted, found.score < math.log(2))
     assert found.accepted[1:].all()
-    assert model.localize(route[10:50], sequence=PlaceFilter(threshold=None)).accepted.all()
+    assert model.localize(route[10:50], sequence=PlaceFilter(threshold=math.inf)).accepted.all()
     assert not found.score.requires_grad
     model.batch_size = 7
     again = model.localize(route[10:50], sequence=PlaceFilter())

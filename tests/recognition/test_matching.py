@@ -15,7 +15,7 @@ from torch import Tensor
 from dejavu_torch.recognition.candidates import Candidates
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.matching import Found, Matching, lengths_beside
-from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.select import Acceptance, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
 
@@ -82,13 +82,33 @@ def test_scores_pass_by_once_and_are_not_held(
 
 def test_single_queries_alone_where_there_is_no_sequence() -> None:
     found = Matching().found(SCORES.split(7))
-    assert same(found.match(0.01), best_match(SCORES, 0.01))
+    assert same(found.match(Acceptance(0.01)), best_match(SCORES, 0.01))
     assert found.sequences == {}
     ranked = Matching(ranks=3, apart=4).found([SCORES])
     assert ranked.candidates.index.shape == (30, 3)
     places = ranked.candidates.index.sort(1).values
     assert (places.diff(dim=1) > 4).all()
     assert same(ranked.match(), best_match(SCORES))
+
+
+def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_it() -> None:
+    candidates = Candidates(torch.tensor([[1, 7], [3, -1]]), torch.tensor([[0.1, 0.2], [0.3, math.inf]]))
+    found = Found(candidates, probability=torch.tensor([0.9, 0.4], dtype=torch.float64))
+    for rule, accepted in (
+        (Acceptance(precision=0.5), [True, False, False, False]),
+        (Acceptance(0.25), [True, True, False, False]),  # of scores, which all candidates have
+        (Acceptance(), [True, True, True, False]),
+    ):
+        match = found.ranked(rule)
+        assert match.index.tolist() == [1, 7, 3, -1]
+        assert match.accepted.tolist() == accepted
+        assert match.probability is not None
+        assert match.probability.isnan().tolist() == [False, True, False, True]
+        assert match.probability[::2].tolist() == [0.9, 0.4]
+        assert same(found.match(rule), match.map(lambda column: column[::2]))
+        assert same(found.first(1).ranked(rule), found.match(rule))
+    alone = found._replace(probability=None)
+    assert alone.ranked(Acceptance(precision=0.5)).probability is None
 
 
 def test_nothing_found_needs_a_gradient() -> None:

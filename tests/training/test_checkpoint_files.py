@@ -80,7 +80,7 @@ def test_settings_in_a_checkpoint_import_nothing(
     (tmp_path / "evil_of_a_checkpoint.py").write_text(EVIL)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    train(command, "--ckpt_path", bad, "--data.query", "two.npy")
+    train(command, "--ckpt_path", bad, "--data.query", "two.npy", "--data.truth", "0")
     assert not (tmp_path / "executed").exists()
 
 

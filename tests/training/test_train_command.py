@@ -60,7 +60,7 @@ def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder: Path) ->
 
 
 def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    train("test", "--data.query", "two.npy")
+    train("test", "--data.query", "two.npy", "--data.truth", "0")
     match = DejaVu.load("run/map.safetensors").localize(ArrayTraverse(footage(0.1)))
     scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
     assert printed(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
@@ -253,7 +253,7 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
     assert maps[1].trained is not None
     assert maps[1].trained.steps == 4
     options = [*chosen, "--trainer.default_root_dir", run, "--ckpt_path", last]
-    train("test", *options, "--data.query", "two.npy")
+    train("test", *options, "--data.query", "two.npy", "--data.truth", "0")
     match = maps[0].localize(ArrayTraverse(footage(0.1)))
     scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
     rows = dict(
@@ -337,18 +337,18 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
     assert [str(w.message) for w in recwarn if not issubclass(w.category, DeprecationWarning)] == []
 
 
-@pytest.mark.parametrize("option", ["--data.validation", "--data.query"])
+@pytest.mark.parametrize("option", [("--data.validation",), ("--data.truth", "0", "--data.query")])
 def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
     folder: Path,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
     capsys: pytest.CaptureFixture[str],
-    option: str,
+    option: tuple[str, ...],
 ) -> None:
     """Two steps of a tiny rate teach nothing, so that HOG is better, and is said to be."""
     np.save(tmp_path / "first.npy", footage(side=32).numpy())
     np.save(tmp_path / "second.npy", footage(0.1, side=32).numpy())
-    options = ["--data.source", tmp_path / "first.npy", option, tmp_path / "second.npy"]
+    options = ["--data.source", tmp_path / "first.npy", *option, tmp_path / "second.npy"]
     options += ["--model.lr", 1e-6, "--trainer.max_steps", 2, "--trainer.default_root_dir", tmp_path / "run"]
     train("fit", *options)
     rows = {
