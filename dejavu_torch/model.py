@@ -600,7 +600,8 @@ class DejaVu(nn.Module):
             reference: the traverse that the map was learned from. Every 10th stretch of 20 of its frames is
                 looked up in changed light and view: `Augmentation` of 1.5 times the strengths of the
                 whitening, which has seen the plain ones.
-            views: frames of another traverse of the same places instead, which tell of its own changes;
+            views: frames of another traverse of the same places instead, which tell of its own changes, or
+                other `Stretches` of the reference;
                 those that show no place are left out, and of very many all but evenly spaced stretches.
             places: (n,) int64, which place each frame of the reference shows, -1 for none, as where it was
                 appended to other places; None is frame i at place i.
@@ -620,14 +621,16 @@ class DejaVu(nn.Module):
             True
         """
         self._require_map()
-        another = views is not None
         if views is None:
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
             places = torch.arange(self.map.places) if places is None else places
             stretches = Stretches(as_traverse(reference), len(places), strengths, places=self.map.places)
-            views, length = Views(stretches, places[stretches.places]), stretches.stretch
+            views = Views(stretches, places[stretches.places])
+        another = not isinstance(views.traverse, Stretches)
+        if isinstance(views.traverse, Stretches):
+            length = views.traverse.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
         name = views.traverse.name

@@ -54,7 +54,7 @@ class Rung(NamedTuple):
 
 
 def network() -> SmallCNN:
-    """That of configs/train_road.yaml."""
+    """That of configs/train_road.yaml, without its local contrast."""
     return SmallCNN(squeeze=24, cell=0)
 
 
