@@ -259,3 +259,10 @@ def test_a_frozen_network_is_shown_every_frame_once_and_every_view_once(tmp_path
     assert task.views is not None
     frames = len(task.data.sets["reference"])
     assert network.shown - tried == frames + len(task.views.descriptors)
+
+
+def test_a_whitening_that_nothing_teaches_is_refused_ahead_of_the_training(tmp_path: Path) -> None:
+    running = trainer(tmp_path)
+    with refused("data.augmentation", "data.second"):
+        running.fit(staged(), data_of(augmentation=Augmentation(**STILL)))  # type: ignore[arg-type]
+    assert running.global_step == 0
