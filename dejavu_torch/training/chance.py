@@ -49,12 +49,11 @@ class LastLosses:
         """Those of a step, by name."""
         self.last.append(dict(parts))
 
-    def check(self, chance: Mapping[str, float], over: bool = False) -> None:
-        """Refuse losses none of which is below chance. Nothing is known before `LAST` steps.
+    def check(self, chance: Mapping[str, float]) -> None:
+        """Refuse losses none of which is below chance or still falling. Nothing is known before `LAST` steps.
 
         Args:
             chance: of each loss that tells places apart, by name.
-            over: whether the stage is over; ahead of that, losses that are still falling may go on.
 
         Raises:
             NothingLearned: naming both.
@@ -65,7 +64,7 @@ class LastLosses:
         halves = {name: one.view(2, -1).mean(1).tolist() for name, one in losses.items()}
         self.learned = any(sum(halves[name]) / 2 <= BELOW * guess for name, guess in chance.items())
         falling = any(late < BELOW * early for early, late in halves.values())
-        if self.learned or min(chance.values()) == 0 or (falling and not over):
+        if self.learned or falling or min(chance.values()) == 0:
             return
         means = {name: sum(one) / 2 for name, one in halves.items()}
         seen = ", ".join(f"{name} {mean:.3g}, a guess has {chance[name]:.3g}" for name, mean in means.items())

@@ -290,8 +290,8 @@ class RouteData(LightningDataModule):
     def held(self) -> list[int]:
         """The first places of the stretches that training never sees."""
         frames = self.sets["reference"].values
-        known = len(self.routes) > 1 or frames.ndim == 2 or self.sources["validation"] is not None
-        if known or not self.held_out or len(frames) < FEW:
+        one_map = len(self.routes) == 1 and frames.ndim == 4
+        if not one_map or not self.held_out or len(frames) < FEW or self.sources["validation"] is not None:
             return []
         count = max(FEWEST, round(self.held_out * len(frames) / STRETCH))
         return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]

@@ -281,7 +281,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.last = LastLosses()
 
     def _say_few(self) -> None:
-        source, alone = self.data.sources["source"], self.data.sources["validation"] is None
+        source = self.data.sources["source"]
+        alone = self.data.sources["validation"] is None and len(self.data.routes) == 1
         name = source if isinstance(source, (str, Path)) else self.data.route_name
         log.warning(
             "%s has %d frames, below %d: the untrained map that `dejavu learn` makes is likely better%s",
@@ -385,7 +386,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         return steps if self.in_last_stage else min(self.began + round(self.stage.share * steps), steps - 1)
 
     def _advance(self, step: int) -> None:
-        self.last.check(self.stage.chance(self), over=True)
+        self.last.check(self.stage.chance(self))
         self.last = LastLosses()
         self.stage.end(self)
         self.zero_grad()
@@ -466,7 +467,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_train_end(self) -> None:
         """The same at the end."""
-        self.last.check(self.stage.chance(self), over=True)
+        self.last.check(self.stage.chance(self))
 
     def on_after_backward(self) -> None:
         """The gradients of all processes, ahead of their scaling and clipping."""

@@ -57,28 +57,27 @@ def test_no_blind_guess_of_the_phase_is_better() -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "phase", "steps", "over", "refused_"),
+    ("place", "phase", "steps", "refused_"),
     [
-        ((3.0, 3.0), 9.0, LAST, False, True),
-        ((3.0, 3.0), 9.0, LAST - 1, True, False),  # too few to tell
-        ((2.93, 2.93), 9.0, LAST, True, False),  # below 2.94
-        ((3.0, 3.0), 1.9, LAST, True, False),  # one below chance is enough
-        ((3.3, 3.1), 9.0, LAST, False, False),  # still falling
-        ((3.3, 3.1), 9.0, LAST, True, True),
-        ((3.3, 3.27), 9.0, LAST, False, True),  # hardly
+        ((3.0, 3.0), 9.0, LAST, True),
+        ((3.0, 3.0), 9.0, LAST - 1, False),  # too few to tell
+        ((2.93, 2.93), 9.0, LAST, False),  # below 2.94
+        ((3.0, 3.0), 1.9, LAST, False),  # one below chance is enough
+        ((3.3, 3.1), 9.0, LAST, False),  # still falling
+        ((3.3, 3.27), 9.0, LAST, True),  # hardly
     ],
 )
 def test_chance_is_told_by_the_losses_of_the_last_steps(
-    place: tuple[float, float], phase: float, steps: int, over: bool, refused_: bool
+    place: tuple[float, float], phase: float, steps: int, refused_: bool
 ) -> None:
     last = LastLosses()
     for i in range(steps):
         last.add({"place": torch.tensor(place[2 * i // LAST]), "phase": torch.tensor(phase)})
     if refused_:
         with refused("nothing is learned", "a guess has 3", f"phase {phase:g}, a guess has 2"):
-            last.check({"place": 3.0, "phase": 2.0}, over)
+            last.check({"place": 3.0, "phase": 2.0})
     else:
-        last.check({"place": 3.0, "phase": 2.0}, over)
+        last.check({"place": 3.0, "phase": 2.0})
 
 
 @pytest.mark.parametrize("kind", ["templates", "spectral"])
