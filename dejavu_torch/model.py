@@ -603,9 +603,8 @@ class DejaVu(nn.Module):
             return traverse
         height, width = own[1:]
         if shape is None:
-            needed = getattr(self.features, "resize", None)
             longest = None if traverse.sized else self.preprocess.size
-            size, why = reduced_size((height, width), longest, needed), "see preprocess.size"
+            size, why = reduced_size((height, width), longest, self._resize), "see preprocess.size"
         else:
             size, why = _size_like((height, width), shape), "as the map's"
         if size == (height, width):
@@ -680,7 +679,8 @@ class DejaVu(nn.Module):
             reference: the traverse that the map was learned from. Every 10th stretch of 20 of its frames is
                 looked up in changed light and view: `Augmentation` of 1.5 times the strengths of the
                 whitening, which has seen the plain ones.
-            views: frames of another traverse of the same places instead, which tell of its own changes;
+            views: frames of another traverse of the same places instead, which tell of its own changes, or
+                other `Stretches` of the reference;
                 those that show no place are left out, and of very many all but evenly spaced stretches.
             places: (n,) int64, which place each frame of the reference shows, -1 for none, as where it was
                 appended to other places; None is frame i at place i.
@@ -700,7 +700,6 @@ class DejaVu(nn.Module):
             True
         """
         self._require_map()
-        another = views is not None
         if views is None:
             if reference is None:
                 raise InputError("neither a reference nor views to calibrate by; expected one of them")
@@ -708,7 +707,10 @@ class DejaVu(nn.Module):
             strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
             places = torch.arange(self.map.places) if places is None else places
             stretches = Stretches(reference, len(places), strengths, places=self.map.places)
-            views, length = Views(stretches, places[stretches.places]), stretches.stretch
+            views = Views(stretches, places[stretches.places])
+        another = not isinstance(views.traverse, Stretches)
+        if isinstance(views.traverse, Stretches):
+            length = views.traverse.stretch
         else:
             length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
         name = views.traverse.name
@@ -1008,10 +1010,14 @@ class DejaVu(nn.Module):
         return feature_batches(traverse, self.pipeline, self._at_once, device, progress, look)
 
     @property
+    def _resize(self) -> tuple[int, int] | None:
+        """The size (height, width) that the features resize frames to, where one of this package's does."""
+        return getattr(self.features, "resize", None) if type(self.features) in CLASSES else None
+
+    @property
     def _at_once(self) -> int:
         """Frames of a batch: fewer than asked for where they are brought to a large size."""
-        resize = getattr(self.features, "resize", None) if type(self.features) in CLASSES else None
-        pixels = math.prod(resize or (1,))
+        pixels = math.prod(self._resize or (1,))
         return max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:

@@ -19,7 +19,7 @@ from lightning_fabric.plugins import CheckpointIO
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from lightning_fabric.utilities.rank_zero import _get_rank
 from pytorch_lightning import LightningModule, Trainer
-from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint
+from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from dejavu_torch.cli.commands import features_words, print_map
@@ -29,10 +29,12 @@ from dejavu_torch.data.output import check_output_folder, make_output_folder, re
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
+from dejavu_torch.training.chance import NothingLearned
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport
 from dejavu_torch.training.precision import has_bf16
+from dejavu_torch.training.steps import StepBar
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.training.worth import better
 from dejavu_torch.types import InputError
@@ -111,7 +113,7 @@ class MapTrainer(Trainer):
             model.relearn()
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
-        export.write(model, folder, datamodule.reference if model.made else None)
+        export.write(model, folder, datamodule if model.made else None)
         print_written(export, datamodule, self.words)
 
 
@@ -203,6 +205,7 @@ class TrainCLI(LightningCLI):
             super().instantiate_classes()
         except Exception as error:
             raise refusal(error) from error
+        self.model.gives_way = not any("route_bytes_per_place" in word for word in self.words)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A trainer with our callbacks; what Lightning refuses, in one line."""
@@ -216,6 +219,8 @@ class TrainCLI(LightningCLI):
             own.append(MapExport())
             chosen = asked["enable_checkpointing"] is False or any(isinstance(c, Checkpoint) for c in own)
             own += [] if chosen else [LastCheckpoint(EVERY)]
+        if self.subcommand == "fit" and asked["enable_progress_bar"] in (None, True):
+            own += [] if any(isinstance(c, ProgressBar) for c in own) else [StepBar()]
         for plugin in _listed(asked["plugins"]):
             if isinstance(plugin, CheckpointIO) and getattr(plugin, "checkpoint_io", plugin) is None:
                 plugin.checkpoint_io = CheckpointFiles()  # type: ignore[attr-defined]  # what it wraps
@@ -252,6 +257,28 @@ class TrainCLI(LightningCLI):
             log.warning("%s holds an earlier run, which this one replaces", root)
 
     def fit(self, **arguments: Any) -> None:
+        """Train; where nothing is learned, once more from the start at a third of the learning rate."""
+        try:
+            self._fit(**arguments)
+        except NothingLearned as error:
+            if self.trainer.world_size > 1:  # its processes cannot begin again
+                raise
+            model = self.config[self.subcommand]["model"]
+            first, model["lr"] = model["lr"], model["lr"] / 3
+            log.warning("%s; it begins again with model.lr %.3g in place of %.3g", error, model["lr"], first)
+            self._set_seed()
+            self.instantiate_classes()
+            again = {"model": self.model, "datamodule": self.datamodule, "ckpt_path": None}
+            try:
+                self._fit(**arguments | again)
+            except NothingLearned as last:
+                source = shlex.quote(str(self.datamodule.sources["source"]))
+                raise InputError(
+                    f"{last}, with model.lr {first:.3g} and {model['lr']:.3g}: no map is written; "
+                    f"`dejavu learn {source} --map FILE` makes one untrained"
+                ) from last
+
+    def _fit(self, **arguments: Any) -> None:
         """Train, and print what was written, also where the user interrupts."""
         root = Path(self.trainer.default_root_dir)
         refused = False
@@ -384,7 +411,8 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
     path, model = export.written
     print_map(model)
     if export.scores:
-        print(f"written to {path}; on {unseen_of(data)}, within {data.tolerance}:")
+        on = unseen_of(data) or "changed frames of stretches that training never saw"
+        print(f"written to {path}; on {on}, within {data.tolerance}:")
         for name, one in export.scores.items():
             print(f"  {name:20} AUC {one.auc:.3f}, recall@1 {one.recall_at_1:.3f}")
         if beaten := better(export.scores):

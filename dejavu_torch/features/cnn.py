@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -57,7 +58,8 @@ class SmallCNN(nn.Module):
 
     Args:
         dimension: D, number of features.
-        channels: of the frames, 3 or 1.
+        channels: of the frames, 3 or 1; None is 3, until a training has frames of other channels, or weights
+            are loaded.
         resize: (height, width) in pixels that frames are brought to, antialiased.
         widths: channels after each convolution; each halves height and width.
         squeeze: channels ahead of the linear layer.
@@ -78,7 +80,7 @@ class SmallCNN(nn.Module):
     def __init__(
         self,
         dimension: int = 96,
-        channels: int = 3,
+        channels: int | None = None,
         resize: tuple[int, int] = (96, 96),
         widths: Sequence[int] = (16, 32, 64, 96),
         squeeze: int = 32,
@@ -86,6 +88,8 @@ class SmallCNN(nn.Module):
     ) -> None:
         super().__init__()
         check_size(resize, 1, "SmallCNN got resize")
+        self.follows = channels is None
+        channels = 3 if channels is None else channels
         sizes = [dimension, channels, squeeze, *widths]
         if not widths or min(sizes) < 1 or cell < 0:
             raise InputError(
@@ -114,6 +118,20 @@ class SmallCNN(nn.Module):
         )
         self.linear = nn.Linear(squeeze * height * width, dimension)
         self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
+
+    def follow(self, channels: int) -> None:
+        """Take frames of so many channels where none were asked for: the first layer begins anew."""
+        if self.follows and channels != self.channels:
+            self.channels = channels
+            first = nn.Conv2d(channels, self.widths[0], 5, stride=2, padding=2, bias=False)
+            self.convolutions[0] = first.to(self.linear.weight)
+
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        stored = state.get(f"{prefix}convolutions.0.weight")
+        if stored is not None and stored.ndim == 4 and stored.shape[1]:
+            self.follow(stored.shape[1])
+            self.follows = False
+        super()._load_from_state_dict(state, prefix, *args)
 
     def forward(self, frames: Tensor) -> Tensor:
         if frames.ndim != 4 or frames.shape[1] != self.channels:

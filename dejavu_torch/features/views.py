@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -101,6 +101,7 @@ class Stretches(Traverse):
     Args:
         traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
         seed: of the changes. places: of the map, among which they are looked up; None is N.
+        starts: of the stretches of 20 frames that are taken instead; None is as above.
 
     Raises:
         InputError: ready features.
@@ -113,13 +114,14 @@ class Stretches(Traverse):
         strengths: Mapping[str, Any],
         seed: int = 0,
         places: int | None = None,
+        starts: Sequence[int] | None = None,
     ) -> None:
         from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
 
         if len(traverse.frame_shape) != 3:
             raise InputError(f"{traverse.name} holds ready features; expected frames to calibrate by")
-        length = min(STRETCH, max(1, frames // EVERY))
-        starts = range(0, frames - length + 1, EVERY * length)
+        length = min(STRETCH, max(1, frames // EVERY)) if starts is None else STRETCH
+        starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
         most = min(MOST, max(LEAST, SCORES // (places or frames)))
         self.starts = starts[:: max(1, -(-len(starts) * length // most))]
         wanted = min(FEWEST, TIMES * frames, most)

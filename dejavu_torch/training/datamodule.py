@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -20,6 +20,7 @@ from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import open_source, routes_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.memory import concatenate
+from dejavu_torch.features.views import STRETCH, Stretches
 from dejavu_torch.memory import check_room
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
@@ -27,6 +28,8 @@ from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 READ_AT_ONCE = 64  # frames
+FEW = 300  # frames, below which a network learns less than a map has untrained
+FEWEST = 2  # stretches that are held out
 
 
 class Batch(NamedTuple):
@@ -89,20 +92,21 @@ class Clips(DistributedSampler[list[int]]):
     """Each frame about once an epoch, in clips of consecutive frames from all over the route.
 
     Args:
-        lengths: frames of each traverse; no clip crosses from one to the next.
+        runs: of frames, as one for each traverse; no clip crosses from one to the next.
         batch_size: frames of a batch. clip: frames of a clip; a last clip that is shorter is left out.
         process: this one's number, of so many `processes`, each of which takes its part of a batch.
     """
 
     def __init__(
-        self, lengths: list[int], batch_size: int, clip: int, process: int = 0, processes: int = 1
+        self, runs: list[range], batch_size: int, clip: int, process: int = 0, processes: int = 1
     ) -> None:
-        super().__init__(cast(Any, range(sum(lengths))), processes, process)  # which Lightning leaves alone
-        self.lengths, self.clip = lengths, clip
+        self.runs, self.lengths, self.clip = runs, [len(run) for run in runs], clip
+        # which Lightning leaves alone
+        super().__init__(cast(Any, range(sum(self.lengths))), processes, process)
         self.drawn_at: Tensor | None = None  # the state of the random numbers ahead of the present order
         self.drawn_to: Tensor | None = None  # and behind it
         self.replayed: tuple[Tensor, int] | None = None  # such a state, and batches of it that are done
-        every = sum(length // clip for length in lengths)
+        every = sum(length // clip for length in self.lengths)
         self.clips = min(batch_size // clip, every) // processes  # of a process's part of a batch
         if not self.clips:
             raise InputError(
@@ -125,11 +129,10 @@ class Clips(DistributedSampler[list[int]]):
         yield from batches[done:]
 
     def _drawn(self) -> list[list[int]]:
-        starts, first = [], 0
-        for length in self.lengths:
-            left_over = int(torch.randint(length % self.clip + 1, ()))
-            starts.append(first + left_over + torch.arange(length // self.clip) * self.clip)
-            first += length
+        starts = []
+        for run in self.runs:
+            left_over = int(torch.randint(len(run) % self.clip + 1, ()))
+            starts.append(run.start + left_over + torch.arange(len(run) // self.clip) * self.clip)
         order = torch.cat(starts)
         order = order[torch.randperm(len(order))]
         frames = order[:, None] + torch.arange(self.clip)
@@ -161,6 +164,10 @@ class RouteData(LightningDataModule):
             and their own size otherwise.
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
+        held_out: share of the reference's frames that training never sees, in evenly spaced stretches of 20,
+            by which the map is calibrated and judged at the end; at most 0.5, 0 is none. Nor is anything held
+            out of a route of fewer than 300 frames, of several routes, of ready features, or where there is a
+            validation.
 
     Convention: frames are kept as bytes; beyond `concatenate`'s share of memory they lie in a file.
 
@@ -190,8 +197,11 @@ class RouteData(LightningDataModule):
         resize: tuple[int, int] | None = None,
         augmentation: Augmentation | None = None,
         velocity: GroundOdometry | None = None,
+        held_out: float = 0.05,
     ) -> None:
         super().__init__()
+        if not 0 <= held_out <= 0.5:
+            raise InputError(f"held_out is {held_out}; expected a share of the frames, from 0 to 0.5")
         if tolerance < 0 or clip < 1 or not 2 <= batch_size < LARGEST or batch_size % clip:
             raise InputError(
                 f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}; expected a tolerance of 0 "
@@ -216,7 +226,7 @@ class RouteData(LightningDataModule):
         self.tolerance, self.batch_size, self.clip = tolerance, batch_size, clip
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
-        self.velocity = velocity
+        self.velocity, self.held_out = velocity, held_out
         self.routes: list[Traverse] = []  # at even steps, where there is `velocity`
         self.sets: dict[str, StoredFrames] = {}
         self.replayed: tuple[Tensor, int] | None = None  # of the next `train_dataloader`, see `Clips`
@@ -276,6 +286,21 @@ class RouteData(LightningDataModule):
         """Places numbered so that those of two routes are further apart than the tolerance; -1 stays -1."""
         starts = torch.tensor(self.lengths, device=places.device).cumsum(0)[:-1]
         return places + self.tolerance * torch.bucketize(places, starts, right=True)
+
+    @property
+    def held(self) -> list[int]:
+        """The first places of the stretches that training never sees."""
+        frames = self.sets["reference"].values
+        one_map = len(self.routes) == 1 and frames.ndim == 4
+        if not one_map or not self.held_out or len(frames) < FEW or self.sources["validation"] is not None:
+            return []
+        count = max(FEWEST, round(self.held_out * len(frames) / STRETCH))
+        return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]
+
+    def held_frames(self, strengths: Mapping[str, Any]) -> Stretches | None:
+        """These stretches as they may look on another visit; None where there are none."""
+        places = len(self.sets["reference"].values)
+        return Stretches(self.reference, places, strengths, starts=self.held) if self.held else None
 
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
@@ -388,12 +413,16 @@ class RouteData(LightningDataModule):
         """Batches of all processes of the training; their parts for one of so many."""
         sets = [self.sets[name] for name in ("reference", "second") if name in self.sets]
         parts = [part for one in sets for part in one.parts]
-        lengths = [len(part) for part in parts]
-        if max(lengths) < self.clip:
-            raise InputError(f"clip is {self.clip} and the route has {max(lengths)} frames; expected fewer")
         frames = StoredFrames(parts, _joined([one.truth.positives for one in sets]))
+        held = torch.tensor(self.held, dtype=torch.int64)[:, None] + torch.arange(STRETCH)
+        kept = ~torch.isin(frames.truth.positives, held).any(1)
+        each = torch.arange(len(frames)).split([len(part) for part in parts])
+        runs = [run for part in each for run in _runs(part[kept[part]])]
+        longest = max(map(len, runs))
+        if longest < self.clip:
+            raise InputError(f"clip is {self.clip} and the route has {longest} frames; expected fewer")
         batch_size = self.batch_size * self._processes[1]
-        return _loader(frames, Clips(lengths, batch_size, self.clip, process, processes))
+        return _loader(frames, Clips(runs, batch_size, self.clip, process, processes))
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """The validation traverse, or the reference."""
@@ -453,6 +482,12 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
 def as_frames(values: Tensor) -> Tensor:
     """Bytes as frames in [0, 1]; features as they are."""
     return values.float() / 255 if values.dtype == torch.uint8 else values
+
+
+def _runs(frames: Tensor) -> list[range]:
+    """The runs of consecutive numbers of (n,) sorted ones."""
+    breaks = (frames.diff() > 1).nonzero()[:, 0] + 1
+    return [range(int(p[0]), int(p[-1]) + 1) for p in frames.tensor_split(breaks.tolist()) if len(p)]
 
 
 def _joined(positives: list[Tensor]) -> GroundTruth:

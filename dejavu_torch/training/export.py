@@ -9,11 +9,15 @@ from typing import Any
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.features.views import Views
+from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.model import DejaVu
+from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
-from dejavu_torch.training.worth import beside_untrained
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.training.worth import beside_untrained, fitted
+from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
 
@@ -26,8 +30,8 @@ class MapExport(Callback):
 
     Of several routes it is their descriptor, without a map, in `descriptor.safetensors`.
 
-    Where training has ended and there is a traverse to validate or to test on, `scores` are what the map is
-    worth on it, see `beside_untrained`; they are logged too.
+    Where training has ended, `scores` are what the map is worth on the traverse to validate or to test on,
+    else on stretches that training never saw, see `beside_untrained`; they are logged too.
 
     Args:
         name: of the map file, in the trainer's default_root_dir.
@@ -59,9 +63,11 @@ class MapExport(Callback):
         elif best is not None:
             load_weights(pl_module, best)
         data = pl_module.data
-        self.write(pl_module, Path(trainer.default_root_dir), data.reference)
-        unseen = data.unseen()
-        if self.written is None or unseen is None:
+        self.write(pl_module, Path(trainer.default_root_dir), data)
+        if self.written is None or not self.written[1].map.places:
+            return
+        unseen = data.unseen() or held_frames(self.written[1], data)
+        if unseen is None:
             return
         self.scores = beside_untrained(self.written[1], data.reference, *unseen, data.tolerance)
         figures = {f"unseen/auc of {name}": one.auc for name, one in self.scores.items()}
@@ -77,20 +83,41 @@ class MapExport(Callback):
             assert isinstance(pl_module, PlaceRecognitionTask)
             self.write(pl_module, Path(trainer.default_root_dir))
 
-    def write(self, task: PlaceRecognitionTask, folder: Path, reference: Traverse | None = None) -> None:
-        """Write the task's map, calibrated by its reference where one is given; a warning where it has none
-        yet."""
+    def write(self, task: PlaceRecognitionTask, folder: Path, data: RouteData | None = None) -> None:
+        """Write the task's map, calibrated by what training has not seen of the data where it is given; a
+        warning where it has none yet."""
         try:
             model = task.deployed()
         except InputError as error:
             log.warning("no map is written: %s", error)
             return
-        if reference is not None and model.map.places:
-            model.calibrate_if_possible(reference)
+        if data is not None and model.map.places:
+            calibrate(model, data)
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / (self.name if model.map.places else DESCRIPTOR)
         model.save(path)
         self.written = (path, model)
+
+
+def held_frames(model: DejaVu, data: RouteData) -> tuple[Traverse, GroundTruth] | None:
+    """The stretches that training never saw, changed, and their places; None where there are none."""
+    found = data.held_frames(STRENGTHS if model.whitening is None else model.whitening.strengths)
+    return None if found is None else (found, as_ground_truth(found.places[:, None]))
+
+
+def calibrate(model: DejaVu, data: RouteData) -> None:
+    """By the traverse to validate on, else by stretches that training never saw; else not at all."""
+    validated = data.sources["validation"] is not None
+    unseen = data.unseen() if validated else held_frames(model, data)
+    if unseen is None:
+        return
+    frames, truth = unseen
+    if validated and len(frames.frame_shape) == 3:
+        frames = fitted(frames, model.frame_shape or ())
+    try:
+        model.calibrate_if_possible(data.reference, Views(frames, truth.positives[:, 0]))
+    except InputError as error:
+        log.warning("the map is not calibrated: %s", error)
 
 
 class LastCheckpoint(Checkpoint):

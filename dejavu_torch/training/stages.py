@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.database.distance import phase_distances
+from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.database.spectrum import Transform
 from dejavu_torch.features.embedding import Coder, Embedding, to_length
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.text import one_line
+from dejavu_torch.training.chance import phase_chance, place_chance
 from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames
 from dejavu_torch.training.losses import Losses, place_cross_entropy
 from dejavu_torch.training.processes import noise_like, own_part, own_random
@@ -27,7 +30,10 @@ ROUNDS = 10  # views of each training frame, for whitening and code
 NUMBERS = 2**27  # of all views at most, but for one of each frame: half a gigabyte
 BATCH = 128  # views of a step: they cost little
 TEMPERATURE = 0.1  # of cosine distances, at the start
+WIDE = 1e6  # step of a map without lines, beside descriptors of about 1
 NOISE = 0.5  # on descriptors in training, beside components of about 1
+
+log = logging.getLogger("dejavu_torch")
 
 
 class Views(NamedTuple):
@@ -61,6 +67,10 @@ class Stage(nn.Module):
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         """The losses of a batch."""
         raise NotImplementedError(f"{type(self).__name__} takes no steps")
+
+    def chance(self, task: PlaceRecognitionTask) -> dict[str, float]:
+        """The least that each loss can be without a look at the frames, of those that tell places apart."""
+        return {}
 
 
 class DescriptorStage(Stage):
@@ -104,7 +114,7 @@ class DescriptorStage(Stage):
                 one = described(task, reference.values[:1], descriptor_of(task))
             self.make(count, one.shape[1], task)
             if task.made:
-                _check_map(task, len(reference), one.shape[1])
+                check_map(task, len(reference), one.shape[1])
         elif len(self.proxies) != count:
             raise InputError(
                 f"the descriptor was learned on {len(self.proxies)} stretches of {every} frames, "
@@ -123,6 +133,9 @@ class DescriptorStage(Stage):
 
     def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         return self.losses_to(self.proxies, task, batch)
+
+    def chance(self, task: PlaceRecognitionTask) -> dict[str, float]:
+        return {"descriptor": place_chance(sum(task.data.lengths), task.data.tolerance)}
 
     def losses_to(self, proxies: Tensor, task: PlaceRecognitionTask, batch: Batch) -> Losses:
         """The losses of a batch, to proxies (W,K)."""
@@ -225,6 +238,10 @@ class CodeStage(Stage):
         temperature, tolerance = task.log_temperature.exp(), task.data.tolerance
         return task.losses(distances, task.scores(distances), positives, task.route, temperature, tolerance)
 
+    def chance(self, task: PlaceRecognitionTask) -> dict[str, float]:
+        place = {"place": place_chance(task.route.places, task.data.tolerance)}
+        return place | ({"phase": phase_chance(task.route.plan)} if task.losses.phase else {})
+
 
 def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: float = 0.0) -> list[Stage]:
     """The stages that a backbone needs.
@@ -318,11 +335,30 @@ def views_of(task: PlaceRecognitionTask, rounds: int, most: int) -> Iterator[Vie
                     yield Views(views, batch.truth.positives[known].to(task.device))
 
 
-def _check_map(task: PlaceRecognitionTask, places: int, dimension: int) -> None:
-    """Refuse ahead of the training a map that could not be made behind it, as of too few bytes."""
-    whitening = task.dejavu.whitening
+def check_map(task: PlaceRecognitionTask, places: int, dimension: int) -> None:
+    """Refuse ahead of the training a map that could not be made behind it, as of too few bytes.
+
+    Bytes that the user did not ask for give way: what a map takes without any line comes on top of them.
+    """
+    whitening, mapper = task.dejavu.whitening, task.dejavu.mapper
     numbers = dimension if whitening is None else whitening.kept(places, dimension, True)
-    task.dejavu.mapper(torch.randn(places, numbers, generator=torch.Generator().manual_seed(0)))
+    descriptors = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0))
+    wanted, gives_way = getattr(mapper, "route_bytes_per_place", None), task.gives_way
+    task.gives_way = False  # it is settled
+    try:
+        mapper(descriptors)
+        return
+    except InputError:
+        if not gives_way or wanted is None:
+            raise
+    empty = SpectralMapper(None, step=WIDE, chunk=cast(Any, mapper.chunk))(descriptors)
+    more = min(wanted + empty.summary().route_bytes / places, 4 * numbers)
+    mapper.route_bytes_per_place = math.ceil(100 * more) / 100
+    mapper(descriptors)
+    log.warning(
+        "a map of %d places cannot have route_bytes_per_place=%g: it has %g",
+        *(places, wanted, mapper.route_bytes_per_place),
+    )
 
 
 def place_descriptors(task: PlaceRecognitionTask) -> Tensor:
@@ -342,6 +378,8 @@ def make_map(task: PlaceRecognitionTask) -> None:
     model, whitening = task.dejavu, task.dejavu.whitening
     with torch.random.fork_rng(), torch.no_grad(), in_mode(model, False):
         features = stored_features(task, model.describe)
+        if task.gives_way:
+            check_map(task, *features.shape)
         if whitening is not None:
             torch.manual_seed(whitening.seed)
             views = views_of(task, whitening.copies(*features.shape), whitening.most_views)

@@ -29,6 +29,7 @@ from dejavu_torch.features.whitening import STRENGTHS, Whitening
 from dejavu_torch.model import DejaVu, check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
+from dejavu_torch.training.chance import LastLosses
 from dejavu_torch.training.checkpoint import (
     CheckpointFiles,
     check_random,
@@ -36,7 +37,7 @@ from dejavu_torch.training.checkpoint import (
     read_checkpoint,
     taking_over,
 )
-from dejavu_torch.training.datamodule import Batch, Clips, RouteData
+from dejavu_torch.training.datamodule import FEW, Batch, Clips, RouteData, as_frames
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.processes import average_gradients, averaged, share, shared_statistics
@@ -45,6 +46,7 @@ from dejavu_torch.training.stages import (
     RateStage,
     Stage,
     Views,
+    WhiteningStage,
     coded_places,
     has_descriptor,
     make_map,
@@ -111,6 +113,8 @@ class PlaceRecognitionTask(pl.LightningModule):
     Raises:
         InputError: settings out of range; a backbone that gives no (B,D); a loss that is not finite; a
             checkpoint of other settings.
+        NothingLearned: an InputError; the mean loss of 100 steps behind the rise of the learning rate, or of
+            the last 100 of a stage, is that of a guess.
     """
 
     def __init__(
@@ -176,9 +180,11 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.feature_weights, self.refresh = feature_weights, refresh
         self.losses = Objective() if losses is None else losses
         self.lr, self.weight_decay, self.weight_bits = lr, weight_decay, weight_bits
+        self.gives_way = False  # whether bytes per place that a short route cannot meet are raised
         self.stages = nn.ModuleList(stages_of(backbone, descriptor, self.made, rate))
         self.index = 0  # of the stage
         self.began = 0  # the step at which it began
+        self.last = LastLosses()  # of the stage
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
         self.places: Tensor | None = None  # its descriptors of the reference
         self.metric: PlaceRecognition | None = None  # `setup` makes it
@@ -238,12 +244,17 @@ class PlaceRecognitionTask(pl.LightningModule):
         """
         if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             self.trainer.strategy.checkpoint_io = CheckpointFiles()
-        share(self, self.trainer)
         reference = self.data.sets["reference"]
+        if isinstance(self.dejavu.features, SmallCNN) and reference.values.ndim == 4:
+            one = self.dejavu.preprocess(as_frames(reference.values[:1]))
+            self.dejavu.features.follow(one.shape[1])
+        share(self, self.trainer)
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
         self._check_route(self.dejavu.map.places)
         self._check_routes()
+        if stage == "fit" and sum(self.data.lengths) < FEW:
+            self._say_few()
         if reference.values.ndim == 2 and self.made:
             raise InputError(
                 f"{self.data.reference.name} holds ready features, and the map of a "
@@ -255,10 +266,11 @@ class PlaceRecognitionTask(pl.LightningModule):
                 "those of the map of one route; expected model.rate 0, or one route"
             )
         still = not self.data.augmentation.acts and self.data.sources["second"] is None
-        if self.made and self.dejavu.whitening is not None and still:
+        whitens = any(isinstance(one, WhiteningStage) for one in self.stages)
+        if still and (whitens or (self.made and self.dejavu.whitening is not None)):
             raise InputError(
                 "data.augmentation changes nothing and there is no data.second: nothing shows the whitening "
-                "what two visits differ in; expected one of them, or model.whitening none"
+                f"what two visits differ in; expected one of them{', or model.whitening none' * self.made}"
             )
         if reference.values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")
@@ -266,6 +278,17 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
         # a further training describes its own frames
         self.began, self.views, self.places, self.views_drawn_at = 0, None, None, None
+        self.last = LastLosses()
+
+    def _say_few(self) -> None:
+        source = self.data.sources["source"]
+        alone = self.data.sources["validation"] is None and len(self.data.routes) == 1
+        name = source if isinstance(source, (str, Path)) else self.data.route_name
+        log.warning(
+            "%s has %d frames, below %d: the untrained map that `dejavu learn` makes is likely better%s",
+            *(name, sum(self.data.lengths), FEW),
+            ", and nothing is held out to calibrate the trained one by, as data.validation would" * alone,
+        )
 
     # the map
 
@@ -364,6 +387,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         return steps if self.in_last_stage else min(self.began + round(self.stage.share * steps), steps - 1)
 
     def _advance(self, step: int) -> None:
+        self.last.check(self.stage.chance(self))
+        self.last = LastLosses()
         self.stage.end(self)
         self.zero_grad()
         self.index, self.began = self.index + 1, step
@@ -422,6 +447,8 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"the loss is {float(figures[0])} at step {self.global_step} ({seen}); expected a finite "
                 "number: try a lower lr, or 32-bit precision"
             )
+        if self.global_step - self.began >= warm_up(self._stop() - self.began):
+            self.last.add(parts)
         self.log_dict({f"train/{name}": part for name, part in parts.items()})
         self.log(
             "train/left_out",
@@ -433,6 +460,15 @@ class PlaceRecognitionTask(pl.LightningModule):
         )
         self.log("train/loss", figures[0], prog_bar=True)
         return total
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Give up a training that learns nothing, as soon as that can be told."""
+        if not self.last.learned:
+            self.last.check(self.stage.chance(self))
+
+    def on_train_end(self) -> None:
+        """The same at the end."""
+        self.last.check(self.stage.chance(self))
 
     def on_after_backward(self) -> None:
         """The gradients of all processes, ahead of their scaling and clipping."""
@@ -733,6 +769,11 @@ def freeze_parts(
     ]
 
 
+def warm_up(steps: int) -> int:
+    """Steps of a stage of so many in which the learning rate rises."""
+    return max(1, round(steps / 10))
+
+
 def adamw_of(parameters: Iterable[nn.Parameter], lr: float, weight_decay: float, steps: int) -> Any:
     """AdamW, and a schedule: the learning rate rises over the first tenth of the steps, then falls along a
     cosine to 0. Only what is multiplied with something decays: matrices and kernels.
@@ -746,7 +787,7 @@ def adamw_of(parameters: Iterable[nn.Parameter], lr: float, weight_decay: float,
         {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
     ]
     optimizer = AdamW([group for group in groups if group["params"]], lr=lr)
-    rise = max(1, round(steps / 10))
+    rise = warm_up(steps)
 
     def height(step: int) -> float:
         if step < rise:

@@ -36,8 +36,8 @@ def beside_untrained(
         By name, the trained map first; nothing where no query has a known place.
     """
     if len(query.frame_shape) == 3:
-        query = _fitted(query, reference.frame_shape)
-    trained = _fitted(query, model.frame_shape or ()) if len(query.frame_shape) == 3 else query
+        query = fitted(query, reference.frame_shape)
+    trained = fitted(query, model.frame_shape or ()) if len(query.frame_shape) == 3 else query
     found = {TRAINED: _match(model, trained)}
     hog = hog_baselines(reference, query, model.batch_size, tolerance)
     found |= {HOG: hog["hog"].found.match()} if hog else {}
@@ -63,7 +63,8 @@ def better(scores: Mapping[str, Scores]) -> list[str]:
     return [name for name, one in others if one.auc > first.auc]
 
 
-def _fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
+def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
+    """Frames of that shape, as they are or brought to it."""
     return traverse if tuple(traverse.frame_shape) == tuple(shape) else Fitted(traverse, shape)
 
 

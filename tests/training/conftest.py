@@ -10,6 +10,7 @@ import torch
 from small_training import CONFIG, MINE, footage, train
 
 from dejavu_torch import DejaVu
+from dejavu_torch.training.task import PlaceRecognitionTask
 
 CALIBRATED = ("test_export", "test_train_command")
 
@@ -39,6 +40,13 @@ def _without_calibration(request: pytest.FixtureRequest, monkeypatch: pytest.Mon
     """Of many small trainings, of which it takes a third; those of the command are calibrated."""
     if request.path.stem not in CALIBRATED:
         monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda *_: None)
+
+
+@pytest.fixture(autouse=True)
+def _without_a_word_on_short_routes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As all of these are; test_held_out.py is about it."""
+    if request.path.stem != "test_held_out":
+        monkeypatch.setattr(PlaceRecognitionTask, "_say_few", lambda _: None)
 
 
 @pytest.fixture
