@@ -49,7 +49,7 @@ def test_it_is_frozen_while_a_map_is_learned(network: nn.Module) -> None:
     DejaVu(net, Whitening(numbers=4, views=1)).learn(open_source("sim:aerial?frames=40"))
     assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
     assert all(parameter.grad is None for parameter in net.parameters())
-    assert net.training
+    assert not net.training
     network.eval()
 
 

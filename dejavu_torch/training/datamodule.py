@@ -315,7 +315,7 @@ class RouteData(LightningDataModule):
             self.sets.clear()
             self._wanted = wanted
         if "reference" not in self.sets:
-            opened = [_open(source) for source in self.listed["source"]]
+            opened = [self._fit(_open(source)) for source in self.listed["source"]]
             self.routes = [resampled(route, self.velocity, self.batch_size) for route in opened]
             size, parts = self._size, []
             for route in self.routes:
@@ -357,7 +357,13 @@ class RouteData(LightningDataModule):
         """Another traverse of route i, at its steps."""
         route = self.routes[i]
         step = route.step if isinstance(route, ResampledTraverse) else None
-        return resampled(_open(self.listed[name][i]), self.velocity, self.batch_size, step)
+        traverse = self._fit(_open(self.listed[name][i]), route.frame_shape)
+        return resampled(traverse, self.velocity, self.batch_size, step)
+
+    def _fit(self, traverse: Traverse, shape: tuple[int, ...] | None = None) -> Traverse:
+        """At the size that `DejaVu.fit` of the task's model gives frames; as it is where `resize` gives one."""
+        model = None if self.trainer is None else getattr(self.trainer.lightning_module, "dejavu", None)
+        return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
 
     def _read(self, name: str) -> StoredFrames:
         if len(self.routes) == 1:

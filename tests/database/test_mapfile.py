@@ -907,7 +907,7 @@ def test_recipes_of_nested_modules() -> None:
     recipe = recipe_of(own)
     assert recipe.class_path == "Embedding"
     network = recipe.init_args.pop("network")
-    network_of = {"layer": None, "mean": None, "std": None}
+    network_of = {"layer": None, "mean": None, "std": None, "output": None}
     coder = network_of | {"hidden": 0, "noise": 1.0, "kept": 128}
     assert recipe.init_args == coder | {"dimension": 5, "channels": 1, "resize": [8, 8], "grid": 2, "cell": 0}
     assert network["class_path"] == "SmallCNN"
