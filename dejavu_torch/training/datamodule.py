@@ -361,7 +361,7 @@ class RouteData(LightningDataModule):
         return resampled(traverse, self.velocity, self.batch_size, step)
 
     def _fit(self, traverse: Traverse, shape: tuple[int, ...] | None = None) -> Traverse:
-        """At the size that `DejaVu.fit` of the task's model gives frames; as it is where `resize` gives one."""
+        """At the size that `DejaVu.fit` of the task's model gives; as it is where `resize` gives one."""
         model = None if self.trainer is None else getattr(self.trainer.lightning_module, "dejavu", None)
         return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
 
