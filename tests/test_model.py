@@ -293,7 +293,8 @@ def test_frames_that_are_not_in_0_to_1_are_warned_of_once(
     lines = [line for line in caplog.messages if "[0, 1]" in line]
     assert [("255" in line, "40" in line) for line in lines] == [(True, False)] * (most > 2)
     caplog.clear()
-    model.localize(frames[:30])
+    for _ in range(2):
+        model.localize(ArrayTraverse(frames[:30], "a drive"))
     assert len([line for line in caplog.messages if "255" in line]) == (most > 2)
     caplog.clear()
     DejaVu().learn(torch.rand(40, 9) * most)  # ready features
@@ -541,8 +542,12 @@ def test_large_frames_are_reduced_and_queries_follow(
         for frames in (large, large[..., ::2, ::2], nn.functional.interpolate(small, scale_factor=3)):
             assert known.localize(frames).index.tolist() == [*range(24)]
             assert known(frames).argmin(1).tolist() == [*range(24)]
-    views = model.places_shown(model.fit(ArrayTraverse(large)), ArrayTraverse(large))
+    views = model.places_shown(ArrayTraverse(large), ArrayTraverse(large))
     assert views.traverse.frame_shape == (1, 80, 160)
+    caplog.clear()
+    for frames in large[:3]:
+        model.localize(frames[None])
+    assert len(caplog.messages) <= 1  # told once
     large.requires_grad_()
     model(large[:1]).sum().backward()
     assert large.grad is not None
@@ -558,6 +563,11 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
     assert model.fit(open_source(images)).frame_shape == (1, 80, 160)
     assert model.fit(open_source(f"{images}?start=1")).frame_shape == (1, 80, 160)
     assert model.fit(open_source(f"{images}?width=300&start=1")).frame_shape == (1, 150, 300)
+    assert DejaVu().fit(ArrayTraverse(torch.rand(1, 1, 20, 500))).frame_shape == (
+        1,
+        16,
+        400,
+    )  # a block of HOG
     assert DejaVu(HOG(resize=(100, 100))).fit(open_source(images)).frame_shape == (1, 100, 200)
     assert DejaVu(preprocess=Preprocess(size=None)).fit(open_source(images)).frame_shape == (1, 200, 400)
     assert DejaVu(preprocess=Preprocess(size=50)).fit(open_source(images)).frame_shape == (1, 25, 50)

@@ -111,6 +111,13 @@ def test_frames_that_show_no_place_are_left_out(reference: Traverse, second: Tra
     assert (first - other).abs().max() <= 1  # a step of rounding
 
 
+def test_wide_descriptors_reduce_the_route_they_are_of_alone() -> None:
+    model = DejaVu(whitening="none").learn(torch.rand(60, 300))
+    assert model.map.dimension < 61
+    assert model.learn(torch.rand(60, 40)).map.dimension == 40
+    assert model.whitening is None
+
+
 def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> None:
     model = spectral()
     views = model.views(reference, second)

@@ -292,7 +292,7 @@ def run_localize(
     _accept_by(model, threshold, precision)
     if top is not None:
         check_candidates(top, APART, model.map.places)
-    query = open_source(source)
+    query = model.fit(open_source(source), model.frame_shape or ())
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
@@ -796,7 +796,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     print(f"map format {FORMAT}, its checksums agree")
     known = [name for name, platt in (model.calibration or NEVER)._asdict().items() if platt is not None]
     print(f"calibrated for: {', '.join(known) or 'nothing'}; precision: {model.precision}")
-    print(f"threshold: {model.threshold}; L1 here by {l1_backend()}, spectrogram by {BACKEND}")
+    print(f"single queries: {model.acceptance()}")
+    print(f"L1 here by {l1_backend()}, spectrogram by {BACKEND}")
     if model.map.places:
         _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
     else:

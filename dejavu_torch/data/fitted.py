@@ -72,12 +72,16 @@ def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
         >>> at_size(open_source("sim:aerial?frames=40"), (32, 32)).frame_shape
         (3, 32, 32)
     """
-    if isinstance(traverse, (Video, ImageFolder)):
-        return type(traverse)(traverse.path, width=size[1], height=size[0])
-    if isinstance(traverse, Chain):
-        return Chain([at_size(one, size) for one in traverse.traverses])
-    if isinstance(traverse, FrameRange):
-        part = copy.copy(traverse)
-        part.traverse, part.sized = at_size(traverse.traverse, size), True
-        return part
-    return Fitted(traverse, (traverse.frame_shape[0], *size))
+    other = copy.copy(traverse)
+    other.sized = True
+    if isinstance(other, ImageFolder):
+        other.alike, other._first = True, None  # nobody asked for one size of all
+    if isinstance(other, (Video, ImageFolder)):
+        other.height, other.width = size
+    elif isinstance(other, Chain):
+        other.traverses = [at_size(one, size) for one in other.traverses]
+    elif isinstance(other, FrameRange):
+        other.traverse = at_size(other.traverse, size)
+    else:
+        return Fitted(traverse, (traverse.frame_shape[0], *size))
+    return other

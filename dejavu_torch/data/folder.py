@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.data.files import reading, state_of
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
-from dejavu_torch.resize import MOST_PIXELS, resize_frames
+from dejavu_torch.resize import MOST_PIXELS, is_stretched, resize_frames
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError
 
@@ -68,7 +68,10 @@ class ImageFolder(IndexedTraverse):
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
         self.length = len(self.files)
-        self._first: tuple[str, str] | None = None  # name and shape of the first image that was read
+        self.alike = (
+            False  # whether images of other aspect ratios, as portraits among landscapes, are refused
+        )
+        self._first: tuple[str, str, tuple[int, int]] | None = None  # that was read: name, shape, own size
 
     def read(self, frames: range) -> Tensor:
         images = [self._image(self.files[i]) for i in frames]
@@ -85,14 +88,21 @@ class ImageFolder(IndexedTraverse):
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file, max(self.width, self.height))
+        own = (image.shape[1], image.shape[2])
         size = fitted_size(file, image.shape[1], image.shape[2], self.width, self.height)
         if size != image.shape[1:]:
             image = resize_frames(image[None], size)[0].clamp(0, 1)
         channels, height, width = image.shape
         shape = f"{height} x {width} pixels of {channels} channel{'s' * (channels > 1)}"
-        self._first = self._first or (file.name, shape)
-        if shape != self._first[1]:
-            raise InputError(f"{file} is {shape}; expected {self._first[1]} as {self._first[0]}")
+        self._first = self._first or (file.name, shape, own)
+        name, expected, first = self._first
+        if shape != expected:
+            raise InputError(f"{file} is {shape}; expected {expected} as {name}")
+        if self.alike and is_stretched(own, first):
+            sides = [" x ".join(map(str, one)) for one in (own, first)]
+            raise InputError(
+                f"{file} is {sides[0]} pixels; expected the aspect ratio of {sides[1]}, as {name}"
+            )
         return image
 
 

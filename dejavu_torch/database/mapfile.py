@@ -19,7 +19,7 @@ from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import whole_file
 from dejavu_torch.types import InputError
 
-FORMAT = 8
+FORMAT = 9
 SEALED = 7  # the first with checksums; before it the version stood by itself
 NAME = "dejavu_torch-map"
 ZIP = b"PK\x03\x04"  # what an archive begins with

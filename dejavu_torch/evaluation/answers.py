@@ -61,8 +61,8 @@ def next_steps(together: bool, strict: bool) -> list[str]:
             given.
     """
     steps = {
-        "--filter counts the queries before each as well, if they are consecutive": not together,
-        "--precision .9 accepts only what is so probably right": not strict,
+        "--filter also uses the preceding queries, if they are consecutive": not together,
+        "--precision .9 accepts only answers that are at least that probable": not strict,
     }
     return [step for step, fits in steps.items() if fits]
 

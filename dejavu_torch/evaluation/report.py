@@ -76,7 +76,8 @@ class Report(NamedTuple):
         scores = ", ".join(f"{name} {value}" for name, value in zip(*rows, strict=True) if name)
         beside = f"; beside it {', '.join(self.contenders)}" if self.contenders else ""
         first = summary(self).partition(". ")[0].rstrip(".")
-        return f"{first}\n{scores or self.ours.name}{beside}\nall of report.json: as_json()"
+        line = told_line(self.facts, bool(scores))
+        return "\n".join(filter(None, [first, f"{scores}{beside}", line, "all of report.json: as_json()"]))
 
 
 def score_table(report: Report, every: bool = False) -> list[list[str]]:

@@ -257,7 +257,8 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
     platt = model.matching(None).platt if sequence is None else None
     if platt is not None:  # of `evidence_of`
         facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
-        facts |= {} if model.precision is None else {"precision": model.precision}
+        precision = model.acceptance().precision
+        facts |= {} if precision is None else {"precision": precision}
     threshold = model.threshold_of(sequence)
     if threshold is None and sequence is not None:
         threshold = sequence.likely  # of sequences the file has no calibration

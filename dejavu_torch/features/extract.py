@@ -68,8 +68,8 @@ def feature_batches(
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
 
 
-def warn_of_bright(frames: Tensor, name: str) -> None:
-    """A line where frames (B,C,H,W) are no numbers in [0, 1]; of ready features (B,D) nothing."""
+def warn_of_bright(frames: Tensor, name: str) -> bool:
+    """Whether frames (B,C,H,W) are no numbers in [0, 1], and then a line; ready features (B,D) may be any."""
     most = float(frames.detach().amax()) if frames.ndim == 4 and len(frames) else 0.0
     if most > BRIGHTEST:
         log.warning(
@@ -77,6 +77,7 @@ def warn_of_bright(frames: Tensor, name: str) -> None:
             name,
             most,
         )
+    return most > BRIGHTEST
 
 
 def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:

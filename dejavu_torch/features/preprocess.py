@@ -208,8 +208,9 @@ class Preprocess(nn.Module):
         clip_limit: for "clahe": a grey level counts at most this many times as often as in a flat
             histogram; 0 is no limit.
         grid: (rows, columns) of tiles for "clahe".
-        size: pixels that the longer side of a traverse's frames is reduced to where it has more; None keeps
-            the frames' size. `DejaVu` does so as frames are read, ahead of all else; forward does not.
+        size: pixels that the longer side of a traverse's frames is reduced to where it has more, but no
+            further than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so as
+            frames are read, ahead of all else; forward does not.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) where `channel` is None.
 

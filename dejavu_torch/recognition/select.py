@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dejavu_torch.types import InputError, Match
 
+HIGHEST = torch.finfo(torch.float64).max  # of the numbers that a file can hold: every score is below
 PROBABLE = 0.5  # what a calibrated map accepts from, where nobody says otherwise
 
 
@@ -27,13 +28,13 @@ class Acceptance(NamedTuple):
     def __str__(self) -> str:
         if self.precision is not None:
             told = f"accepted where the probability is at least {self.precision:.9g}"
-        elif self.threshold is None:
+        elif self.threshold is None or self.threshold >= HIGHEST:
             told = "every query with a finite score is accepted"
         elif self.given:
             told = f"accepted where the score is below {self.threshold:.9g}"
         else:
             told = f"accepted where the filter itself gives more than {math.exp(-self.threshold):.9g}"
-        return told if self.given else f"no threshold given or stored in the map: {told}"
+        return told if self.given else f"no threshold given or stored for this way of matching: {told}"
 
 
 def best_match(scores: Tensor, threshold: float | None = None) -> Match:

@@ -255,8 +255,12 @@ def test_a_second_traverse_tells_what_a_visit_changes(
     assert warned(caplog) == []
     model = DejaVu.load(tmp_path / "map.safetensors")
     expected = evaluate(model.localize(noisy), torch.arange(FRAMES)[:, None], tolerance=2)._asdict()
-    for stage, name, prefix in (("test", "query", "test/"), ("validate", "validation", "val/")):
-        data, task, running = data_of(**given, **{name: noisy}), spectral(), trainer(tmp_path)
+    for stage, name, truth, prefix in (
+        ("test", "query", "truth", "test/"),
+        ("validate", "validation", "validation_truth", "val/"),
+    ):
+        data = data_of(**given, **{name: noisy, truth: "0"})
+        task, running = spectral(), trainer(tmp_path)
         (figures,) = getattr(running, stage)(task, data, ckpt_path=last, verbose=False, weights_only=True)
         assert torch.equal(levels(task.dejavu), levels(model))
         named = {f"{prefix}{name}": value for name, value in expected.items()}
