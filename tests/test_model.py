@@ -567,7 +567,7 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
         1,
         16,
         400,
-    )  # a block of HOG
+    )  # a block
     assert DejaVu(HOG(resize=(100, 100))).fit(open_source(images)).frame_shape == (1, 100, 200)
     assert DejaVu(preprocess=Preprocess(size=None)).fit(open_source(images)).frame_shape == (1, 200, 400)
     assert DejaVu(preprocess=Preprocess(size=50)).fit(open_source(images)).frame_shape == (1, 25, 50)

@@ -68,9 +68,7 @@ class ImageFolder(IndexedTraverse):
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
         self.length = len(self.files)
-        self.alike = (
-            False  # whether images of other aspect ratios, as portraits among landscapes, are refused
-        )
+        self.alike = False  # whether images of other aspect ratios are refused, as portraits
         self._first: tuple[str, str, tuple[int, int]] | None = None  # that was read: name, shape, own size
 
     def read(self, frames: range) -> Tensor:
@@ -100,9 +98,7 @@ class ImageFolder(IndexedTraverse):
             raise InputError(f"{file} is {shape}; expected {expected} as {name}")
         if self.alike and is_stretched(own, first):
             sides = [" x ".join(map(str, one)) for one in (own, first)]
-            raise InputError(
-                f"{file} is {sides[0]} pixels; expected the aspect ratio of {sides[1]}, as {name}"
-            )
+            raise InputError(f"{file} is {sides[0]} pixels; expected the aspect ratio of {name}, {sides[1]}")
         return image
 
 
