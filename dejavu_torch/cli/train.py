@@ -49,6 +49,7 @@ RANGES = {  # of numbers that Lightning takes as they are, and fails on later
 MAY_BE_NULL = ("trainer.val_check_interval", "trainer.check_val_every_n_epoch")
 BF16 = ("bf16-mixed", "bf16")
 EVERY = 500  # steps between two validations, and between two checkpoints
+TOLERANCE = 5  # of `dejavu compare`, unless it is given
 TRAINER = {
     "max_steps": 3000,
     "accelerator": "auto",
@@ -449,7 +450,11 @@ def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str])
         print(f"next: dejavu learn ROUTE {made}")
         return
     reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], unseen_of(data) or "SECOND"))
-    print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))}{features} --out report")
+    truth = data.truths["validation" if data.sources["validation"] is not None else "query"][0]
+    options = f" --truth {shlex.quote(str(truth))}" if truth is not None else ""
+    options += f" --tolerance {data.tolerance}" if data.tolerance != TOLERANCE else ""
+    scored = f"--map {shlex.quote(str(path))}{features}{options}"
+    print(f"next: dejavu compare {reference} {query} {scored} --out report")
 
 
 def run_train(arguments: Sequence[str]) -> None:

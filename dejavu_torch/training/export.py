@@ -9,6 +9,7 @@ from typing import Any
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
+from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.views import Views
@@ -16,7 +17,7 @@ from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.model import DejaVu
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
-from dejavu_torch.training.worth import beside_untrained, fitted
+from dejavu_torch.training.worth import beside_untrained
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
@@ -91,24 +92,31 @@ class MapExport(Callback):
         except InputError as error:
             log.warning("no map is written: %s", error)
             return
-        if data is not None and model.map.places:
-            calibrate(model, data)
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / (self.name if model.map.places else DESCRIPTOR)
-        model.save(path)
+        model.save(path)  # whatever becomes of its calibration
         self.written = (path, model)
+        if data is not None and model.map.places:
+            calibrate(model, data)
+            model.save(path)
 
 
-def held_frames(model: DejaVu, data: RouteData) -> tuple[Traverse, GroundTruth] | None:
-    """The stretches that training never saw, changed, and their places; None where there are none."""
-    found = data.held_frames(STRENGTHS if model.whitening is None else model.whitening.strengths)
+def held_frames(
+    model: DejaVu, data: RouteData, shape: tuple[int, ...] | None = None
+) -> tuple[Traverse, GroundTruth] | None:
+    """The stretches that training never saw, changed, and their places; None where there are none.
+
+    Args:
+        shape: (C,H,W) of the frames; None is that of the reference.
+    """
+    found = data.held_frames(STRENGTHS if model.whitening is None else model.whitening.strengths, shape)
     return None if found is None else (found, as_ground_truth(found.places[:, None]))
 
 
 def calibrate(model: DejaVu, data: RouteData) -> None:
     """By the traverse to validate on, else by stretches that training never saw; else not at all."""
     validated = data.sources["validation"] is not None
-    unseen = data.unseen() if validated else held_frames(model, data)
+    unseen = data.unseen() if validated else held_frames(model, data, model.frame_shape)
     if unseen is None:
         return
     frames, truth = unseen

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,14 @@ import torch
 from helpers import refused
 from small_training import backbone, data_of, footage, new_task, train, trainer, warned
 
-from dejavu_torch import DejaVu, RouteData, SpectralMapper
+from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
+from dejavu_torch.training.worth import UNTRAINED, beside_untrained
 
 FRAMES = 320
+CALIBRATE = DejaVu.calibrate_if_possible  # which conftest.py patches away
 
 
 def long(**settings: Any) -> RouteData:
@@ -62,7 +66,7 @@ def test_nothing_is_held_out_where_it_would_serve_for_nothing(source: Any) -> No
     data = RouteData(source, tolerance=2)
     data.setup("fit")
     assert data.held == []
-    validated = long(validation=ArrayTraverse(footage(0.1, FRAMES)))
+    validated = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0")
     assert places_of(validated) == set(range(FRAMES))
 
 
@@ -90,10 +94,11 @@ def test_what_training_has_not_seen_calibrates(
 
 
 @pytest.mark.slow
-def test_at_the_end_the_map_is_set_beside_the_untrained_one(
+def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda *_: None)
+    """At another size than the reference's, with a backbone that takes no other."""
+    monkeypatch.setattr(DejaVu, "calibrate_if_possible", CALIBRATE)
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
     np.save(tmp_path / "long.npy", footage(frames=FRAMES, side=32).numpy())
     words = [
@@ -104,11 +109,38 @@ def test_at_the_end_the_map_is_set_beside_the_untrained_one(
         "--trainer.limit_val_batches",
         0,
     ]
+    words += ["--data.resize", "[16,16]", "--model.backbone", "mine.Plain"]
     train("fit", *words, "--trainer.default_root_dir", tmp_path / "run")
     said = capsys.readouterr().out
     assert "stretches that training never saw" in said
     rows = [line.split("AUC")[0].strip() for line in said.splitlines() if "recall@1" in line]
     assert rows == ["the trained map", "HOG of all frames", "the untrained map"]
+    model = DejaVu.load(tmp_path / "run" / "map.safetensors", import_module("mine").Plain())
+    assert model.frame_shape == (1, 16, 16)
+    assert model.calibration is not None
+
+
+def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise RuntimeError("shapes cannot be multiplied")
+
+    monkeypatch.setattr(DejaVu, "calibrate_if_possible", failing)
+    with pytest.raises(RuntimeError, match="shapes"):
+        trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(), long())
+    assert DejaVu.load(tmp_path / "map.safetensors").map.places == FRAMES
+
+
+@pytest.mark.parametrize("size", [None, 160])
+def test_the_untrained_map_is_of_frames_of_the_queries_size(
+    caplog: pytest.LogCaptureFixture, size: int | None
+) -> None:
+    """Of raw frames as `data.resize` leaves them, above what a map reduces them to by default."""
+    reference, query = (ArrayTraverse(footage(noise, 24, 176)) for noise in (0.0, 0.1))
+    model = DejaVu(backbone(), mapper=SpectralMapper(6.0), preprocess=Preprocess(size=size))
+    model.learn(ArrayTraverse(footage(0.0, 24, 32)))
+    scores = beside_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
+    assert UNTRAINED in scores
+    assert len([line for line in warned(caplog) if "brought to" in line]) == (size is not None)
 
 
 # short routes --------------------------------------------------------------------------------------------
@@ -184,6 +216,15 @@ def test_a_network_takes_as_many_channels_as_the_frames_have(tmp_path: Path, cha
     again = type(network)(8, resize=(16, 16), widths=(4, 8), squeeze=4)
     new_task(backbone=again, start=start)  # takes its channels too
     assert again.channels == channels
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_a_first_layer_that_is_frozen_stays_so_on_grey_frames(tmp_path: Path, frozen: bool) -> None:
+    network = type(backbone())(8, resize=(16, 16), widths=(4, 8), squeeze=4)
+    task = new_task(backbone=network, freeze=["convolutions"] if frozen else [])
+    trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(task, data_of())
+    assert network.channels == 1
+    assert {p.requires_grad for p in network.convolutions.parameters()} == {not frozen}
 
 
 def test_a_checkpoint_brings_its_channels(folder: Path, tmp_path: Path) -> None:

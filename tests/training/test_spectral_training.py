@@ -173,7 +173,7 @@ def test_a_checkpoint_holds_no_map_and_validating_it_makes_one(tmp_path: Path) -
         n for n, t in state.items() if "dejavu.map" in n and isinstance(t, torch.Tensor) and t.numel()
     ]
     task, running = spectral(mapper=SpectralMapper(6.0)), trainer(tmp_path)  # this run's budget
-    noisy = data_of(validation=ArrayTraverse(footage(0.05)))
+    noisy = data_of(validation=ArrayTraverse(footage(0.05)), validation_truth="0")
     (figures,) = running.validate(task, noisy, ckpt_path=path, verbose=False, weights_only=True)
     assert figures["val/recall_at_1"] > 0.5
     route = task.deployed()
@@ -256,7 +256,8 @@ def test_a_second_traverse_tells_what_a_visit_changes(
     model = DejaVu.load(tmp_path / "map.safetensors")
     expected = evaluate(model.localize(noisy), torch.arange(FRAMES)[:, None], tolerance=2)._asdict()
     for stage, name, prefix in (("test", "query", "test/"), ("validate", "validation", "val/")):
-        data, task, running = data_of(**given, **{name: noisy}), spectral(), trainer(tmp_path)
+        given |= {name: noisy, "truth" if name == "query" else "validation_truth": "0"}
+        data, task, running = data_of(**given), spectral(), trainer(tmp_path)
         (figures,) = getattr(running, stage)(task, data, ckpt_path=last, verbose=False, weights_only=True)
         assert torch.equal(levels(task.dejavu), levels(model))
         named = {f"{prefix}{name}": value for name, value in expected.items()}
