@@ -112,6 +112,8 @@ class MapTrainer(Trainer):
             datamodule.setup("export")
             model.setup("export")
             model.relearn()
+        else:
+            log.warning("the map is not calibrated: of templates `dejavu train fit` alone does that")
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
         export.write(model, folder, datamodule if model.made else None)
@@ -266,18 +268,19 @@ class TrainCLI(LightningCLI):
                 raise
             model = self.config[self.subcommand]["model"]
             first, model["lr"] = model["lr"], model["lr"] / 3
-            log.warning("%s; it begins again with model.lr %.3g in place of %.3g", error, model["lr"], first)
+            log.warning("%s; starting again with --model.lr %.3g instead of %.3g", error, model["lr"], first)
             self._set_seed()
             self.instantiate_classes()
             again = {"model": self.model, "datamodule": self.datamodule, "ckpt_path": None}
             try:
                 self._fit(**arguments | again)
             except NothingLearned as last:
-                source = shlex.quote(str(self.datamodule.sources["source"]))
-                raise InputError(
-                    f"{last}, with model.lr {first:.3g} and {model['lr']:.3g}: no map is written; "
-                    f"`dejavu learn {source} --map FILE` makes one untrained"
-                ) from last
+                told = f"{last}, with --model.lr {first:.3g} and {model['lr']:.3g}: no map is written"
+                routes = self.datamodule.listed["source"]
+                if len(routes) == 1:
+                    untrained = f"`dejavu learn {shlex.quote(str(routes[0]))} --map FILE` makes one untrained"
+                    told = f"{told}; {untrained}"
+                raise InputError(told) from last
 
     def _fit(self, **arguments: Any) -> None:
         """Train, and print what was written, also where the user interrupts."""

@@ -168,9 +168,9 @@ class RouteData(LightningDataModule):
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
         held_out: share of the reference's frames that training never sees, in evenly spaced stretches of 20,
-            by which the map is calibrated and judged at the end; at most 0.5, 0 is none. Nor is anything held
-            out of a route of fewer than 300 frames, of several routes, of ready features, or where there is a
-            validation.
+            by which `MapExport` calibrates and judges the map at the end; at most 0.5, 0 is none. Nor is
+            anything held out of a route of fewer than 300 frames, of several routes, of ready features, or
+            where there is a validation.
 
     Convention: frames are kept as bytes; beyond `concatenate`'s share of memory they lie in a file.
 
@@ -301,14 +301,18 @@ class RouteData(LightningDataModule):
         return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]
 
     def held_frames(
-        self, strengths: Mapping[str, Any], shape: tuple[int, ...] | None = None
+        self, starts: list[int], strengths: Mapping[str, Any], shape: tuple[int, ...] | None = None
     ) -> Stretches | None:
-        """These stretches as they may look on another visit, of `shape`, see `fitted`; None where there are
-        none."""
-        if not self.held:
+        """Those of these stretches that begin at `starts`, as they may look on another visit; None without
+        any.
+
+        Args:
+            strengths: see `Stretches`. shape: (C,H,W) of the frames; None is that of the reference.
+        """
+        if not starts:
             return None
         reference = self.reference if shape is None else fitted(self.reference, shape)
-        return Stretches(reference, len(self.sets["reference"].values), strengths, starts=self.held)
+        return Stretches(reference, len(self.sets["reference"].values), strengths, starts=starts)
 
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
@@ -436,7 +440,9 @@ class RouteData(LightningDataModule):
         runs = [run for part in each for run in _runs(part[kept[part]])]
         longest = max(map(len, runs))
         if longest < self.clip:
-            raise InputError(f"clip is {self.clip} and the route has {longest} frames; expected fewer")
+            seen = "the longest stretch that is trained on" if self.held else "the route"
+            share = f" (data.held_out is {self.held_out:g})" if self.held else ""
+            raise InputError(f"clip is {self.clip} and {seen} has {longest} frames{share}; expected fewer")
         batch_size = self.batch_size * self._processes[1]
         return _loader(frames, Clips(runs, batch_size, self.clip, process, processes))
 

@@ -67,7 +67,7 @@ class MapExport(Callback):
         self.write(pl_module, Path(trainer.default_root_dir), data)
         if self.written is None or not self.written[1].map.places:
             return
-        unseen = data.unseen() or held_frames(self.written[1], data)
+        unseen = data.unseen() or held_frames(self.written[1], data, pl_module.held)
         if unseen is None:
             return
         self.scores = beside_untrained(self.written[1], data.reference, *unseen, data.tolerance)
@@ -97,27 +97,35 @@ class MapExport(Callback):
         model.save(path)  # whatever becomes of its calibration
         self.written = (path, model)
         if data is not None and model.map.places:
-            calibrate(model, data)
+            calibrate(model, data, task.held)
             model.save(path)
 
 
 def held_frames(
-    model: DejaVu, data: RouteData, shape: tuple[int, ...] | None = None
+    model: DejaVu, data: RouteData, starts: list[int], shape: tuple[int, ...] | None = None
 ) -> tuple[Traverse, GroundTruth] | None:
     """The stretches that training never saw, changed, and their places; None where there are none.
 
     Args:
-        shape: (C,H,W) of the frames; None is that of the reference.
+        starts: their first places. shape: (C,H,W) of the frames; None is that of the reference.
     """
-    found = data.held_frames(STRENGTHS if model.whitening is None else model.whitening.strengths, shape)
+    strengths = STRENGTHS if model.whitening is None else model.whitening.strengths
+    found = data.held_frames(starts, strengths, shape)
     return None if found is None else (found, as_ground_truth(found.places[:, None]))
 
 
-def calibrate(model: DejaVu, data: RouteData) -> None:
-    """By the traverse to validate on, else by stretches that training never saw; else not at all."""
+def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
+    """By the traverse to validate on, else by stretches that training never saw; else not at all.
+
+    Args:
+        starts: the first places of these stretches.
+    """
     validated = data.sources["validation"] is not None
-    unseen = data.unseen() if validated else held_frames(model, data, model.frame_shape)
+    unseen = data.unseen() if validated else held_frames(model, data, starts, model.frame_shape)
     if unseen is None:
+        if data.held:
+            told = "the map is not calibrated: the training has seen what data.held_out %g leaves out"
+            log.warning(told, data.held_out)
         return
     frames, truth = unseen
     if validated and len(frames.frame_shape) == 3:

@@ -13,9 +13,11 @@ from helpers import refused
 from small_training import backbone, data_of, footage, new_task, train, trainer, warned
 
 from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
+from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
+from dejavu_torch.training.export import LastCheckpoint
 from dejavu_torch.training.worth import UNTRAINED, beside_untrained
 
 FRAMES = 320
@@ -93,6 +95,24 @@ def test_what_training_has_not_seen_calibrates(
     assert set(views.places.tolist()) == (set(range(FRAMES)) if validated else held)
 
 
+@pytest.mark.parametrize("first", [{"held_out": 0}, {}], ids=["all seen", "held out"])
+def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, first: dict[str, Any]
+) -> None:
+    seen: list[Views] = []
+    monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda _, reference, views: seen.append(views))
+    monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
+    made = {"mapper": SpectralMapper(6.0), "whitening": "none"}
+    quiet = {"max_steps": 2, "limit_val_batches": 0}
+    trainer(tmp_path / "one", LastCheckpoint(), **quiet).fit(new_task(**made), long(**first))
+    seen.clear()
+    running = MapTrainer(accelerator="cpu", logger=False, default_root_dir=tmp_path / "two")
+    running.export(new_task(**made), long(), str(tmp_path / "one" / "checkpoints" / "last.ckpt"))
+    assert (tmp_path / "two" / "map.safetensors").is_file()
+    assert len(seen) == ("held_out" not in first)
+    assert len([line for line in warned(caplog) if "not calibrated" in line]) == len(first)
+
+
 @pytest.mark.slow
 def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -143,6 +163,11 @@ def test_the_untrained_map_is_of_frames_of_the_queries_size(
     assert len([line for line in warned(caplog) if "brought to" in line]) == (size is not None)
 
 
+def test_a_clip_longer_than_what_is_left_between_stretches_is_refused() -> None:
+    with refused("clip is 32", "20 frames", "data.held_out is 0.5"):
+        long(clip=32, batch_size=32, held_out=0.5).train_dataloader()
+
+
 # short routes --------------------------------------------------------------------------------------------
 
 
@@ -165,7 +190,7 @@ def test_bytes_that_nobody_asked_for_give_way(tmp_path: Path, caplog: pytest.Log
     task = new_task(**given)
     task.gives_way = True
     trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(task, data_of())
-    assert [line for line in warned(caplog) if "route_bytes_per_place=0.3" in line and "1.43" in line]
+    assert [line for line in warned(caplog) if "route_bytes_per_place 0.3" in line and "1.43" in line]
     summary = DejaVu.load(tmp_path / "map.safetensors").summary()
     assert summary.lines > 0
     assert summary.route_bytes / 40 <= 1.43
