@@ -50,7 +50,11 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
         ("fit", ["--ckpt_path", "gone.ckpt"], ["gone.ckpt"]),
         ("fit", ["--ckpt_path", "a_file"], ["checkpoint cannot be read"]),
         ("fit", ["--ckpt_path", "foreign.ckpt"], ["no checkpoint of a training"]),
-        ("test", ["--ckpt_path", "foreign.ckpt", "--data.query", "two.npy"], ["no checkpoint of a training"]),
+        (
+            "test",
+            ["--ckpt_path", "foreign.ckpt", "--data.query", "two.npy", "--data.truth", "0"],
+            ["no checkpoint of a training"],
+        ),
         ("fit", ["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
         ("fit", ["--model.backbone.channels", "3"], ["got frames (40, 1, 16, 16)", "expected (B,3,H,W)"]),
         ("fit", ["--data.source", "colour.npy"], ["got frames (40, 3, 16, 16)", "expected (B,1,H,W)"]),
