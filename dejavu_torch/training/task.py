@@ -190,7 +190,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.metric: PlaceRecognition | None = None  # `setup` makes it
         self.steps = 0  # of the training that a checkpoint comes from
         self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
-        self.held_before: list[Any] | None = None  # stretches, of the training that a checkpoint comes from
+        self.held_before: list[int] | None = None  # stretches, of the training that a checkpoint comes from
         self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
         self.before: dict[str, Tensor] = {}  # the step: state of the random numbers, buffers of the backbone
         self.views_drawn_at: Tensor | None = None  # and ahead of the views
@@ -595,11 +595,9 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"routes of the checkpoint are {str(self.routes)[:40]}; expected a list of names and lengths"
             )
         self._check_routes()
-        self.held_before = checkpoint.get("held", [])
-        if not isinstance(self.held_before, list):
-            raise InputError(
-                f"held of the checkpoint is {str(self.held_before)[:40]}; expected a list of places"
-            )
+        self.held_before = held = checkpoint.get("held", [])
+        if not isinstance(held, list) or not all(isinstance(one, int) for one in held):
+            raise InputError(f"held of the checkpoint is {str(held)[:40]}; expected a list of places")
         if not self.made:
             self._take_templates(checkpoint["state_dict"])
         self.index, self.began = checkpoint["stage"], checkpoint["began"]
