@@ -192,7 +192,7 @@ class DejaVu(nn.Module):
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self.threshold = None if threshold is None else min(threshold, HIGHEST)
+        self.threshold = None if threshold is None else float(min(threshold, HIGHEST))
         self.precision = precision
         self.batch_size = batch_size
         self.velocity = velocity

@@ -49,6 +49,7 @@ RANGES = {  # of numbers that Lightning takes as they are, and fails on later
 MAY_BE_NULL = ("trainer.val_check_interval", "trainer.check_val_every_n_epoch")
 BF16 = ("bf16-mixed", "bf16")
 EVERY = 500  # steps between two validations, and between two checkpoints
+TOLERANCE = 5  # of `dejavu compare`, unless it is given
 TRAINER = {
     "max_steps": 3000,
     "accelerator": "auto",
@@ -111,6 +112,8 @@ class MapTrainer(Trainer):
             datamodule.setup("export")
             model.setup("export")
             model.relearn()
+        else:
+            log.warning("the map is not calibrated: of templates `dejavu train fit` alone does that")
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
         export.write(model, folder, datamodule if model.made else None)
@@ -265,18 +268,19 @@ class TrainCLI(LightningCLI):
                 raise
             model = self.config[self.subcommand]["model"]
             first, model["lr"] = model["lr"], model["lr"] / 3
-            log.warning("%s; it begins again with model.lr %.3g in place of %.3g", error, model["lr"], first)
+            log.warning("%s; starting again with --model.lr %.3g instead of %.3g", error, model["lr"], first)
             self._set_seed()
             self.instantiate_classes()
             again = {"model": self.model, "datamodule": self.datamodule, "ckpt_path": None}
             try:
                 self._fit(**arguments | again)
             except NothingLearned as last:
-                source = shlex.quote(str(self.datamodule.sources["source"]))
-                raise InputError(
-                    f"{last}, with model.lr {first:.3g} and {model['lr']:.3g}: no map is written; "
-                    f"`dejavu learn {source} --map FILE` makes one untrained"
-                ) from last
+                told = f"{last}, with --model.lr {first:.3g} and {model['lr']:.3g}: no map is written"
+                routes = self.datamodule.listed["source"]
+                if len(routes) == 1:
+                    untrained = f"`dejavu learn {shlex.quote(str(routes[0]))} --map FILE` makes one untrained"
+                    told = f"{told}; {untrained}"
+                raise InputError(told) from last
 
     def _fit(self, **arguments: Any) -> None:
         """Train, and print what was written, also where the user interrupts."""
@@ -449,7 +453,11 @@ def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str])
         print(f"next: dejavu learn ROUTE {made}")
         return
     reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], unseen_of(data) or "SECOND"))
-    print(f"next: dejavu compare {reference} {query} --map {shlex.quote(str(path))}{features} --out report")
+    truth = data.truths["validation" if data.sources["validation"] is not None else "query"][0]
+    options = f" --truth {shlex.quote(str(truth))}" if truth is not None else ""
+    options += f" --tolerance {data.tolerance}" if data.tolerance != TOLERANCE else ""
+    scored = f"--map {shlex.quote(str(path))}{features}{options}"
+    print(f"next: dejavu compare {reference} {query} {scored} --out report")
 
 
 def run_train(arguments: Sequence[str]) -> None:

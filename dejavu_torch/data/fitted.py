@@ -64,6 +64,11 @@ class Fitted(Traverse):
         return self.traverse.frame_time(i)
 
 
+def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
+    """Frames of that shape (C,H,W), as they are or brought to it."""
+    return traverse if tuple(traverse.frame_shape) == tuple(shape) else Fitted(traverse, shape)
+
+
 def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
     """The frames of a traverse at another size (height, width): images and videos are decoded at it.
 

@@ -124,7 +124,8 @@ class SmallCNN(nn.Module):
         if self.follows and channels != self.channels:
             self.channels = channels
             first = nn.Conv2d(channels, self.widths[0], 5, stride=2, padding=2, bias=False)
-            self.convolutions[0] = first.to(self.linear.weight)
+            trained = next(self.convolutions[0].parameters()).requires_grad  # unless it is frozen
+            self.convolutions[0] = first.to(self.linear.weight).requires_grad_(trained)
 
     def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: Any) -> None:
         stored = state.get(f"{prefix}convolutions.0.weight")

@@ -67,5 +67,7 @@ class LastLosses:
         if self.learned or falling or min(chance.values()) == 0:
             return
         means = {name: sum(one) / 2 for name, one in halves.items()}
-        seen = ", ".join(f"{name} {mean:.3g}, a guess has {chance[name]:.3g}" for name, mean in means.items())
-        raise NothingLearned(f"nothing is learned: the mean loss of the last {LAST} steps is {seen}")
+        seen = ", ".join(
+            f"the {name} loss is {mean:.3g} (chance {chance[name]:.3g})" for name, mean in means.items()
+        )
+        raise NothingLearned(f"nothing is learned: over the last {LAST} steps {seen}")

@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.files import LARGEST
+from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import open_source, routes_of
@@ -150,12 +151,14 @@ class RouteData(LightningDataModule):
             behind the other, and nothing crosses from one to the next.
         second: another traverse of the same route to train on as well: its frames are positives of the
             places they show. Of several routes it is a list as long, None for those without.
-        second_truth: which places those are, see `find_ground_truth`; a list likewise.
+        second_truth: which places those are, as --truth of `dejavu compare`; a list likewise. None also means
+            frame i is place i where the traverse is as long as the reference.
         validation: a traverse to validate on during training. None: the reference itself under augmentation,
             the same each time; its figures say what is learned, not how another traverse fares.
-        validation_truth: see `find_ground_truth`.
-        query: the traverse that `test` localizes. truth: its places, see `find_ground_truth`; of `second` and
-            `validation`, where they are as long, frame i is place i without one.
+        validation_truth: its places, as --truth of `dejavu compare`.
+        query: the traverse that `test` localizes, and that judges the map at the end of `fit` where there is
+            no validation.
+        truth: the places of the query, as --truth of `dejavu compare`.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
@@ -165,9 +168,9 @@ class RouteData(LightningDataModule):
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
         held_out: share of the reference's frames that training never sees, in evenly spaced stretches of 20,
-            by which the map is calibrated and judged at the end; at most 0.5, 0 is none. Nor is anything held
-            out of a route of fewer than 300 frames, of several routes, of ready features, or where there is a
-            validation.
+            by which `MapExport` calibrates and judges the map at the end; at most 0.5, 0 is none. Nor is
+            anything held out for templates, of a route of fewer than 300 frames, of several routes, of ready
+            features, or where there is a validation.
 
     Convention: frames are kept as bytes; beyond `concatenate`'s share of memory they lie in a file.
 
@@ -291,16 +294,27 @@ class RouteData(LightningDataModule):
     def held(self) -> list[int]:
         """The first places of the stretches that training never sees."""
         frames = self.sets["reference"].values
-        one_map = len(self.routes) == 1 and frames.ndim == 4
+        task = None if self.trainer is None else self.trainer.lightning_module
+        # the templates of a place that is never seen would not be found
+        one_map = len(self.routes) == 1 and frames.ndim == 4 and getattr(task, "made", True)
         if not one_map or not self.held_out or len(frames) < FEW or self.sources["validation"] is not None:
             return []
         count = max(FEWEST, round(self.held_out * len(frames) / STRETCH))
         return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]
 
-    def held_frames(self, strengths: Mapping[str, Any]) -> Stretches | None:
-        """These stretches as they may look on another visit; None where there are none."""
-        places = len(self.sets["reference"].values)
-        return Stretches(self.reference, places, strengths, starts=self.held) if self.held else None
+    def held_frames(
+        self, starts: list[int], strengths: Mapping[str, Any], shape: tuple[int, ...] | None = None
+    ) -> Stretches | None:
+        """Those of these stretches that begin at `starts`, as they may look on another visit; None without
+        any.
+
+        Args:
+            strengths: see `Stretches`. shape: (C,H,W) of the frames; None is that of the reference.
+        """
+        if not starts:
+            return None
+        reference = self.reference if shape is None else fitted(self.reference, shape)
+        return Stretches(reference, len(self.sets["reference"].values), strengths, starts=starts)
 
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
@@ -328,6 +342,8 @@ class RouteData(LightningDataModule):
         for name in (*also, *needed.get(stage, ())):
             if self.sources[name] is not None and name not in self.sets:
                 self.sets[name] = self._read(name)
+        if stage == "fit":
+            self.unseen()  # what it refuses at the end is refused ahead of the training
         if stage == "test" and "query" not in self.sets:
             raise InputError("there is nothing to test on; expected data.query, a second traverse")
 
@@ -384,7 +400,7 @@ class RouteData(LightningDataModule):
         self._check_length(traverse.name, len(values))
         if values.shape[1:] != reference.shape[1:]:
             raise _other_frames(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
-        named = name != "query"  # as another traverse of the same places
+        named = name == "second"  # as another traverse of the same places
         counts = len(reference), len(values)
         known = ground_truth_of(self.truths[name][i], route, traverse, *counts, aligned=named)
         if known is None:
@@ -426,7 +442,9 @@ class RouteData(LightningDataModule):
         runs = [run for part in each for run in _runs(part[kept[part]])]
         longest = max(map(len, runs))
         if longest < self.clip:
-            raise InputError(f"clip is {self.clip} and the route has {longest} frames; expected fewer")
+            seen = "the longest stretch that is trained on" if self.held else "the route"
+            share = f" (data.held_out is {self.held_out:g})" if self.held else ""
+            raise InputError(f"clip is {self.clip} and {seen} has {longest} frames{share}; expected fewer")
         batch_size = self.batch_size * self._processes[1]
         return _loader(frames, Clips(runs, batch_size, self.clip, process, processes))
 

@@ -9,14 +9,16 @@ from typing import Any
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
+from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.model import DejaVu
-from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.datamodule import FEW, RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
-from dejavu_torch.training.worth import beside_untrained, fitted
+from dejavu_torch.training.worth import beside_untrained
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
@@ -66,7 +68,7 @@ class MapExport(Callback):
         self.write(pl_module, Path(trainer.default_root_dir), data)
         if self.written is None or not self.written[1].map.places:
             return
-        unseen = data.unseen() or held_frames(self.written[1], data)
+        unseen = data.unseen() or held_frames(self.written[1], data, pl_module.held)
         if unseen is None:
             return
         self.scores = beside_untrained(self.written[1], data.reference, *unseen, data.tolerance)
@@ -91,25 +93,42 @@ class MapExport(Callback):
         except InputError as error:
             log.warning("no map is written: %s", error)
             return
-        if data is not None and model.map.places:
-            calibrate(model, data)
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / (self.name if model.map.places else DESCRIPTOR)
-        model.save(path)
+        model.save(path)  # whatever becomes of its calibration
         self.written = (path, model)
+        if data is not None and model.map.places:
+            calibrate(model, data, task.held)
+            model.save(path)
 
 
-def held_frames(model: DejaVu, data: RouteData) -> tuple[Traverse, GroundTruth] | None:
-    """The stretches that training never saw, changed, and their places; None where there are none."""
-    found = data.held_frames(STRENGTHS if model.whitening is None else model.whitening.strengths)
+def held_frames(
+    model: DejaVu, data: RouteData, starts: list[int], shape: tuple[int, ...] | None = None
+) -> tuple[Traverse, GroundTruth] | None:
+    """The stretches that training never saw, changed, and their places; None where there are none.
+
+    Args:
+        starts: their first places. shape: (C,H,W) of the frames; None is that of the reference.
+    """
+    strengths = STRENGTHS if model.whitening is None else model.whitening.strengths
+    found = data.held_frames(starts, strengths, shape)
     return None if found is None else (found, as_ground_truth(found.places[:, None]))
 
 
-def calibrate(model: DejaVu, data: RouteData) -> None:
-    """By the traverse to validate on, else by stretches that training never saw; else not at all."""
+def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
+    """By the traverse to validate on, else by stretches that training never saw; else not at all.
+
+    Args:
+        starts: the first places of these stretches.
+    """
     validated = data.sources["validation"] is not None
-    unseen = data.unseen() if validated else held_frames(model, data)
+    unseen = data.unseen() if validated else held_frames(model, data, starts, model.frame_shape)
     if unseen is None:
+        if data.held:
+            told = "the map is not calibrated: the training has seen what data.held_out %g leaves out"
+            log.warning(told, data.held_out)
+        elif isinstance(model.mapper, TemplateMapper) and model.map.places >= FEW:
+            log.warning("the map is not calibrated: of templates nothing is held out; data.validation would")
         return
     frames, truth = unseen
     if validated and len(frames.frame_shape) == 3:

@@ -356,7 +356,7 @@ def check_map(task: PlaceRecognitionTask, places: int, dimension: int) -> None:
     mapper.route_bytes_per_place = math.ceil(100 * more) / 100
     mapper(descriptors)
     log.warning(
-        "a map of %d places cannot have route_bytes_per_place=%g: it has %g",
+        "%d places need more than --model.mapper.route_bytes_per_place %g: %g is used",
         *(places, wanted, mapper.route_bytes_per_place),
     )
 

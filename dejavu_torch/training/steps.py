@@ -54,7 +54,7 @@ class StepBar(ProgressBar):
             self.told, self.told_at = step, now
             left = (now - self.since) * (self.total - step) / (step - self.began)
             told = f"step {step} of {self.total}, loss {self._loss(trainer):.3g}"
-            tqdm.write(f"{told}, {tqdm.format_interval(left)} left", file=sys.stderr)
+            tqdm.write(f"dejavu: training: {told}, {tqdm.format_interval(left)} left", file=sys.stderr)
 
     def _loss(self, trainer: pl.Trainer) -> float:
         return float(trainer.callback_metrics.get("train/loss", float("nan")))

@@ -190,6 +190,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.metric: PlaceRecognition | None = None  # `setup` makes it
         self.steps = 0  # of the training that a checkpoint comes from
         self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
+        self.held_before: list[int] | None = None  # stretches, of the training that a checkpoint comes from
         self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
         self.before: dict[str, Tensor] = {}  # the step: state of the random numbers, buffers of the backbone
         self.views_drawn_at: Tensor | None = None  # and ahead of the views
@@ -236,6 +237,12 @@ class PlaceRecognitionTask(pl.LightningModule):
         None where it does not, or where a contrast is evened ahead of it, at the frames' own size.
         """
         return None if self.dejavu.preprocess.contrast else getattr(self.dejavu.features, "resize", None)
+
+    @property
+    def held(self) -> list[int]:
+        """The first places of the stretches that no step has seen, nor one of the checkpoint's training."""
+        before = self.held_before
+        return [start for start in self.data.held if before is None or start in before]
 
     def setup(self, stage: str) -> None:
         """Get ready for a route; the first map is made later, where no checkpoint brings one.
@@ -287,7 +294,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         log.warning(
             "%s has %d frames, below %d: the untrained map that `dejavu learn` makes is likely better%s",
             *(name, sum(self.data.lengths), FEW),
-            ", and nothing is held out to calibrate the trained one by, as data.validation would" * alone,
+            ", and the trained map is not calibrated without data.validation" * alone,
         )
 
     # the map
@@ -548,7 +555,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Keep the stage, and what is trained; a map that is made is made anew."""
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
-        checkpoint["routes"] = self._routes()
+        checkpoint |= {"routes": self._routes(), "held": self.held}
         checkpoint[RANDOM] = self._random()
         if (
             checkpoint[RANDOM] is not None and self._in_step()
@@ -588,6 +595,9 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"routes of the checkpoint are {str(self.routes)[:40]}; expected a list of names and lengths"
             )
         self._check_routes()
+        self.held_before = held = checkpoint.get("held", [])
+        if not isinstance(held, list) or not all(isinstance(one, int) for one in held):
+            raise InputError(f"held of the checkpoint is {str(held)[:40]}; expected a list of places")
         if not self.made:
             self._take_templates(checkpoint["state_dict"])
         self.index, self.began = checkpoint["stage"], checkpoint["began"]

@@ -1,4 +1,4 @@
-"""What a trained map is worth on a second traverse, beside what needs no training."""
+"""What a trained map is worth on frames that training has not seen, beside what needs no training."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import copy
 import logging
 from collections.abc import Mapping
 
-from dejavu_torch.data.fitted import Fitted
+from dejavu_torch.data.fitted import fitted
 from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.matching import SINGLE
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
@@ -26,7 +27,7 @@ def beside_untrained(
     """Scores of a trained map, of HOG of all frames, and of the spectral map of whitened HOG.
 
     The untrained map is that of `DejaVu()`, by the model's own mapper where this is not of templates: of as
-    many route bytes. What cannot be made of these frames is left out.
+    many route bytes. What cannot be made of these frames is left out, with a warning.
 
     Args:
         model: with its map, on any device. reference, query: resampled where the model is.
@@ -43,10 +44,15 @@ def beside_untrained(
     found |= {HOG: hog["hog"].found.match()} if hog else {}
     mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
     try:
-        untrained = DejaVu(mapper=mapper, batch_size=model.batch_size).learn(reference)
+        preprocess = Preprocess(size=model.preprocess.size)
+        untrained = DejaVu(mapper=mapper, batch_size=model.batch_size, preprocess=preprocess)
+        reference = untrained.fit(reference)
+        untrained.learn(reference)
+        if len(query.frame_shape) == 3:
+            query = fitted(query, reference.frame_shape)
         found[UNTRAINED] = _match(untrained, query)
     except InputError as error:
-        log.info("no untrained map to compare with: %s", error)
+        log.warning("no untrained map to compare with: %s", error)
     scores = {name: contend(name, match, truth, tolerance).scores for name, match in found.items()}
     return {name: one for name, one in scores.items() if one is not None}
 
@@ -61,11 +67,6 @@ def better(scores: Mapping[str, Scores]) -> list[str]:
     """
     (_, first), *others = scores.items()
     return [name for name, one in others if one.auc > first.auc]
-
-
-def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
-    """Frames of that shape, as they are or brought to it."""
-    return traverse if tuple(traverse.frame_shape) == tuple(shape) else Fitted(traverse, shape)
 
 
 def _match(model: DejaVu, query: Traverse) -> Match:

@@ -74,7 +74,7 @@ def test_chance_is_told_by_the_losses_of_the_last_steps(
     for i in range(steps):
         last.add({"place": torch.tensor(place[2 * i // LAST]), "phase": torch.tensor(phase)})
     if refused_:
-        with refused("nothing is learned", "a guess has 3", f"phase {phase:g}, a guess has 2"):
+        with refused("nothing is learned", "chance 3", f"phase loss is {phase:g}", "chance 2"):
             last.check({"place": 3.0, "phase": 2.0})
     else:
         last.check({"place": 3.0, "phase": 2.0})
@@ -84,7 +84,7 @@ def test_chance_is_told_by_the_losses_of_the_last_steps(
 @pytest.mark.usefixtures("few")
 def test_frames_that_are_all_alike_end_a_training_ahead_of_its_last_step(tmp_path: Path, kind: str) -> None:
     running = trainer(tmp_path, max_steps=9 * FEW, limit_val_batches=0)
-    with refused("nothing is learned", "a guess has 2.08"):  # log(40 places / 5 right ones)
+    with refused("nothing is learned", "chance 2.08"):  # log(40 places / 5 right ones)
         running.fit(task_of(kind), data_of(ALIKE))
     assert FEW < running.global_step < 9 * FEW
     assert not list(tmp_path.iterdir())
@@ -116,12 +116,20 @@ def test_what_forgets_all_is_told_at_the_end(tmp_path: Path) -> None:
     assert not (tmp_path / "map.safetensors").exists()
 
 
+@pytest.mark.parametrize("routes", [1, 2])
 @pytest.mark.usefixtures("few")
 def test_the_command_begins_again_once_and_then_gives_up(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    folder: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    routes: int,
 ) -> None:
-    np.save(tmp_path / "alike.npy", ALIKE.numpy())
-    words = ["fit", "--config", "train.yaml", "--data.source", tmp_path / "alike.npy"]
+    paths = [tmp_path / "alike.npy", tmp_path / "again.npy"][:routes]
+    for path in paths:
+        np.save(path, ALIKE.numpy())
+    source = str(paths[0]) if routes == 1 else f"[{','.join(map(str, paths))}]"
+    words = ["fit", "--config", "train.yaml", "--data.source", source, "--model.mapper", "SpectralMapper"]
     words += ["--trainer.max_steps", STEPS, "--trainer.limit_val_batches", 0, "--model.lr", 0.003]
     words += ["--trainer.default_root_dir", tmp_path / "run"]
     with pytest.raises(SystemExit) as stop:
@@ -129,9 +137,11 @@ def test_the_command_begins_again_once_and_then_gives_up(
     assert stop.value.code == 2
     (again,), (last,) = warned(caplog), capfd.readouterr().err.splitlines()
     assert "nothing is learned" in again
-    assert "begins again with model.lr 0.001 in place of 0.003" in again
+    assert "--model.lr 0.001 instead of 0.003" in again
     assert "nothing is learned" in last
-    assert f"`dejavu learn {tmp_path / 'alike.npy'} --map FILE`" in last
+    # which takes one route
+    assert (f"`dejavu learn {tmp_path / 'alike.npy'} --map FILE`" in last) == (routes == 1)
+    assert ("dejavu learn" in last) == (routes == 1)
     assert not list((tmp_path / "run").rglob("*.safetensors"))
     logs = sorted((tmp_path / "run").rglob("config.yaml"))  # of both
     assert [yaml.safe_load(one.read_text())["model"]["lr"] for one in logs] == [0.003, 0.001]

@@ -84,7 +84,7 @@ def test_what_is_judged_and_ignored_reaches_the_metric(tmp_path: Path) -> None:
 
 
 def test_validation_and_query_come_in_order_as_they_are() -> None:
-    data = route(validation=numbered(24, 100), query=numbered(20, 200), truth="2")
+    data = route(validation=numbered(24, 100), validation_truth="0", query=numbered(20, 200), truth="2")
     data.setup("test")
     for loader, there, shift in (
         (data.val_dataloader(), numbered(24, 100), 0),
@@ -210,7 +210,7 @@ def test_the_reference_is_validated_under_the_same_changes_each_time() -> None:
     assert torch.equal(validated(data, frames), one)
     assert not torch.allclose(validated(data, frames, first=8), one, atol=1e-3)
     assert not torch.allclose(one, frames, atol=1e-3)
-    assert torch.equal(validated(route(validation=numbered(24, 100)), frames), frames)
+    assert torch.equal(validated(route(validation=numbered(24, 100), validation_truth="0"), frames), frames)
 
 
 def test_ready_features_are_left_as_they_are() -> None:
@@ -249,7 +249,9 @@ def test_frames_are_kept_as_bytes_and_resized() -> None:
         ({"frames": 1, "tolerance": 0}, ("from 0 has 1 frame and", "longer")),
         ({"validation": numbered(2, 100)}, ("from 100 has 2 frames", "tolerance is 2")),
         ({"validation": numbered(20, 100)}, ("from 100", "20 frames", "24 places", "data.validation_truth")),
+        ({"validation": numbered(24, 100)}, ("from 100", "data.validation_truth")),  # which nobody gave
         ({"second": numbered(20, 100)}, ("expected data.second_truth",)),
+        ({"query": numbered(24, 100)}, ("from 100", "expected data.truth")),  # ahead of the training
         ({"stage": "test", "query": numbered(20, 100)}, ("expected data.truth",)),
         ({"stage": "test"}, ("nothing to test on", "data.query")),
         ({"second": numbered(24, 100, side=9)}, ("(1, 9, 9)", "(1, 8, 8)", "same channels", "data.resize")),
@@ -279,7 +281,7 @@ def test_a_source_that_is_none_is_refused(name: str, given: object) -> None:
 
 def test_a_tensor_of_frames_is_a_traverse() -> None:
     frames = torch.rand(24, 3, 8, 8)
-    data = RouteData(frames, validation=frames, tolerance=2)
+    data = RouteData(frames, validation=frames, validation_truth="0", tolerance=2)
     data.setup("fit")
     assert data.sets["reference"].values.shape == data.sets["validation"].values.shape == (24, 3, 8, 8)
     with refused("(24, 3, 8)", "expected frames"):

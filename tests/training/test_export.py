@@ -33,7 +33,7 @@ def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Pa
     stop = EarlyStopping("val/auc", mode="max", patience=2)
     task = new_task(lr=1e-4, weight_bits=32)
     running = trainer(tmp_path, every, best, stop, Wreck(), max_epochs=9, max_steps=-1)
-    running.fit(task, data_of(batch_size=20, validation=ArrayTraverse(footage(0.02))))
+    running.fit(task, data_of(batch_size=20, validation=ArrayTraverse(footage(0.02)), validation_truth="0"))
     assert 2 < running.current_epoch < 9
     state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
     model = DejaVu.load(tmp_path / "map.safetensors")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,17 @@ import torch
 from helpers import refused
 from small_training import backbone, data_of, footage, new_task, train, trainer, warned
 
-from dejavu_torch import DejaVu, RouteData, SpectralMapper
+from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
+from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
+from dejavu_torch.training.export import LastCheckpoint
+from dejavu_torch.training.worth import UNTRAINED, beside_untrained
 
 FRAMES = 320
+MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map
+CALIBRATE = DejaVu.calibrate_if_possible  # which conftest.py patches away
 
 
 def long(**settings: Any) -> RouteData:
@@ -62,13 +69,20 @@ def test_nothing_is_held_out_where_it_would_serve_for_nothing(source: Any) -> No
     data = RouteData(source, tolerance=2)
     data.setup("fit")
     assert data.held == []
-    validated = long(validation=ArrayTraverse(footage(0.1, FRAMES)))
+    validated = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0")
     assert places_of(validated) == set(range(FRAMES))
 
 
 def test_a_share_out_of_range_is_refused() -> None:
     with refused("held_out is 0.6", "from 0 to 0.5"):
         data_of(held_out=0.6)
+
+
+def test_templates_are_trained_on_all_places(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = long()
+    trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(), data)
+    assert data.held == []
+    assert len([line for line in warned(caplog) if "not calibrated" in line]) == 1
 
 
 @pytest.mark.parametrize("validated", [False, True])
@@ -83,17 +97,35 @@ def test_what_training_has_not_seen_calibrates(
     monkeypatch.setattr(DejaVu, "calibrate_if_possible", taken)
     monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
     data = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0") if validated else long()
-    trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(), data)
+    trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), data)
     (views,) = seen
     held = {start + i for start in data.held for i in range(STRETCH)}
     assert set(views.places.tolist()) == (set(range(FRAMES)) if validated else held)
 
 
+@pytest.mark.parametrize("first", [{"held_out": 0}, {}], ids=["all seen", "held out"])
+def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, first: dict[str, Any]
+) -> None:
+    seen: list[Views] = []
+    monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda _, reference, views: seen.append(views))
+    monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
+    quiet = {"max_steps": 2, "limit_val_batches": 0}
+    trainer(tmp_path / "one", LastCheckpoint(), **quiet).fit(new_task(**MADE), long(**first))
+    seen.clear()
+    running = MapTrainer(accelerator="cpu", logger=False, default_root_dir=tmp_path / "two")
+    running.export(new_task(**MADE), long(), str(tmp_path / "one" / "checkpoints" / "last.ckpt"))
+    assert (tmp_path / "two" / "map.safetensors").is_file()
+    assert len(seen) == ("held_out" not in first)
+    assert len([line for line in warned(caplog) if "not calibrated" in line]) == len(first)
+
+
 @pytest.mark.slow
-def test_at_the_end_the_map_is_set_beside_the_untrained_one(
+def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda *_: None)
+    """At another size than the reference's, with a backbone that takes no other."""
+    monkeypatch.setattr(DejaVu, "calibrate_if_possible", CALIBRATE)
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
     np.save(tmp_path / "long.npy", footage(frames=FRAMES, side=32).numpy())
     words = [
@@ -104,11 +136,44 @@ def test_at_the_end_the_map_is_set_beside_the_untrained_one(
         "--trainer.limit_val_batches",
         0,
     ]
+    words += ["--data.resize", "[16,16]", "--model.backbone", "mine.Plain", "--model.whitening", "none"]
+    words += ["--model.mapper", "SpectralMapper", "--model.mapper.route_bytes_per_place", 8]
     train("fit", *words, "--trainer.default_root_dir", tmp_path / "run")
     said = capsys.readouterr().out
     assert "stretches that training never saw" in said
     rows = [line.split("AUC")[0].strip() for line in said.splitlines() if "recall@1" in line]
     assert rows == ["the trained map", "HOG of all frames", "the untrained map"]
+    model = DejaVu.load(tmp_path / "run" / "map.safetensors", import_module("mine").Plain())
+    assert model.frame_shape == (1, 16, 16)
+    assert model.calibration is not None
+
+
+def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise RuntimeError("shapes cannot be multiplied")
+
+    monkeypatch.setattr(DejaVu, "calibrate_if_possible", failing)
+    with pytest.raises(RuntimeError, match="shapes"):
+        trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), long())
+    assert DejaVu.load(tmp_path / "map.safetensors").map.places == FRAMES
+
+
+@pytest.mark.parametrize("size", [None, 160])
+def test_the_untrained_map_is_of_frames_of_the_queries_size(
+    caplog: pytest.LogCaptureFixture, size: int | None
+) -> None:
+    """Of raw frames as `data.resize` leaves them, above what a map reduces them to by default."""
+    reference, query = (ArrayTraverse(footage(noise, 24, 176)) for noise in (0.0, 0.1))
+    model = DejaVu(backbone(), mapper=SpectralMapper(6.0), preprocess=Preprocess(size=size))
+    model.learn(ArrayTraverse(footage(0.0, 24, 32)))
+    scores = beside_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
+    assert UNTRAINED in scores
+    assert len([line for line in warned(caplog) if "brought to" in line]) == (size is not None)
+
+
+def test_a_clip_longer_than_what_is_left_between_stretches_is_refused() -> None:
+    with refused("clip is 32", "20 frames", "data.held_out is 0.5"):
+        long(clip=32, batch_size=32, held_out=0.5).train_dataloader()
 
 
 # short routes --------------------------------------------------------------------------------------------
@@ -133,7 +198,7 @@ def test_bytes_that_nobody_asked_for_give_way(tmp_path: Path, caplog: pytest.Log
     task = new_task(**given)
     task.gives_way = True
     trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(task, data_of())
-    assert [line for line in warned(caplog) if "route_bytes_per_place=0.3" in line and "1.43" in line]
+    assert [line for line in warned(caplog) if "route_bytes_per_place 0.3" in line and "1.43" in line]
     summary = DejaVu.load(tmp_path / "map.safetensors").summary()
     assert summary.lines > 0
     assert summary.route_bytes / 40 <= 1.43
@@ -184,6 +249,15 @@ def test_a_network_takes_as_many_channels_as_the_frames_have(tmp_path: Path, cha
     again = type(network)(8, resize=(16, 16), widths=(4, 8), squeeze=4)
     new_task(backbone=again, start=start)  # takes its channels too
     assert again.channels == channels
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_a_first_layer_that_is_frozen_stays_so_on_grey_frames(tmp_path: Path, frozen: bool) -> None:
+    network = type(backbone())(8, resize=(16, 16), widths=(4, 8), squeeze=4)
+    task = new_task(backbone=network, freeze=["convolutions"] if frozen else [])
+    trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(task, data_of())
+    assert network.channels == 1
+    assert {p.requires_grad for p in network.convolutions.parameters()} == {not frozen}
 
 
 def test_a_checkpoint_brings_its_channels(folder: Path, tmp_path: Path) -> None:

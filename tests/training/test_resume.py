@@ -148,10 +148,13 @@ def test_damaged_random_numbers_are_refused(tmp_path: Path, parts: Any, change: 
         run(tmp_path / "again", MAKE["spectral"], part)
 
 
-@pytest.mark.parametrize("routes", [7, None, ["a"], "one"])
-def test_damaged_routes_are_refused(tmp_path: Path, parts: Any, routes: Any) -> None:
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [*(("routes", one) for one in (7, None, ["a"], "one")), *(("held", one) for one in (7, None, ["a"]))],
+)
+def test_damaged_routes_and_stretches_are_refused(tmp_path: Path, parts: Any, key: str, value: Any) -> None:
     part = tmp_path / "part.ckpt"
     checkpoint = torch.load(parts("spectral") / "3.ckpt", weights_only=True)
-    torch.save(checkpoint | {"routes": routes}, part)
-    with refused(f"routes of the checkpoint are {routes}", "names and lengths"):
+    torch.save(checkpoint | {key: value}, part)
+    with refused(f"{key} of the checkpoint", str(value)):
         run(tmp_path / "again", MAKE["spectral"], part)

@@ -173,7 +173,7 @@ def test_a_checkpoint_holds_no_map_and_validating_it_makes_one(tmp_path: Path) -
         n for n, t in state.items() if "dejavu.map" in n and isinstance(t, torch.Tensor) and t.numel()
     ]
     task, running = spectral(mapper=SpectralMapper(6.0)), trainer(tmp_path)  # this run's budget
-    noisy = data_of(validation=ArrayTraverse(footage(0.05)))
+    noisy = data_of(validation=ArrayTraverse(footage(0.05)), validation_truth="0")
     (figures,) = running.validate(task, noisy, ckpt_path=path, verbose=False, weights_only=True)
     assert figures["val/recall_at_1"] > 0.5
     route = task.deployed()

@@ -275,14 +275,17 @@ def test_figures_are_made_in_32_bits(tmp_path: Path, precision: Any) -> None:
 
 def test_without_training_the_phase_means_are_evaluated(tmp_path: Path) -> None:
     running, task = trainer(tmp_path), new_task()
-    running.validate(task, data_of(validation=ArrayTraverse(footage(0.2))), verbose=False)
+    running.validate(
+        task, data_of(validation=ArrayTraverse(footage(0.2)), validation_truth="0"), verbose=False
+    )
     task.deployed().save(tmp_path / "map.safetensors")
     assert_figures(running, task, footage(0.2))
     trainer(tmp_path).fit(task, data_of())  # and it can be trained all the same
 
 
 def test_figures_of_the_augmented_reference_are_called_so(tmp_path: Path) -> None:
-    for given, suffix in (({}, "_augmented"), ({"validation": ArrayTraverse(footage(0.2))}, "")):
+    validated = {"validation": ArrayTraverse(footage(0.2)), "validation_truth": "0"}
+    for given, suffix in (({}, "_augmented"), (validated, "")):
         (figures,) = trainer(tmp_path).validate(new_task(), data_of(**given), verbose=False)
         assert {f"val/auc{suffix}", f"val/recall_at_1{suffix}"} < set(figures)
         assert all(name.endswith(suffix) and name.count("augmented") == bool(suffix) for name in figures)

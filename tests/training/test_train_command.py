@@ -38,7 +38,8 @@ def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
     """The table of figures that a test or validation prints."""
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2].endswith(".ckpt")
-    assert lines[-1].startswith("next: dejavu compare one.npy two.npy --map run/map.safetensors")
+    command = "dejavu compare one.npy two.npy --map run/map.safetensors --truth 0 --tolerance 2 --out report"
+    assert lines[-1] == f"next: {command}"  # which scores
     rows = [line.split() for line in lines]
     return {row[0]: float(row[1]) for row in rows if row and row[0].startswith(("test/", "val/"))}
 
@@ -64,7 +65,7 @@ def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest
     match = DejaVu.load("run/map.safetensors").localize(ArrayTraverse(footage(0.1)))
     scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
     assert printed(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
-    train("validate", "--data.validation", "two.npy")
+    train("validate", "--data.validation", "two.npy", "--data.validation_truth", "0")
     assert printed(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
 
 
@@ -242,7 +243,12 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
     last = run / "checkpoints" / "last.ckpt"
     for size in (12, 6, 1.2):  # the map is made anew of the checkpoint's features
         options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
-        options += ["--data.validation", "two.npy"]  # which calibrates the map
+        options += [
+            "--data.validation",
+            "two.npy",
+            "--data.validation_truth",
+            "0",
+        ]  # which calibrates the map
         train("export", "--ckpt_path", last, *options)
         assert ("this route needs about" in capfd.readouterr().out) == (size == 1.2)
     maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("plain", "12", "6")]
@@ -331,13 +337,17 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
         plan, *rest = said.out.split("written to ")
         assert plan.endswith(f"{describe(DejaVu.load(tmp_path / 'map.safetensors').summary())}\n")
         assert "only a second traverse" in rest[0]
-        command = f"next: dejavu compare one.npy SECOND --map {tmp_path}/map.safetensors --out report"
+        command = (
+            f"next: dejavu compare one.npy SECOND --map {tmp_path}/map.safetensors --tolerance 2 --out report"
+        )
         assert rest[0].splitlines()[-1] == command
     # Python itself keeps deprecations to those who develop
     assert [str(w.message) for w in recwarn if not issubclass(w.category, DeprecationWarning)] == []
 
 
-@pytest.mark.parametrize("option", [("--data.validation",), ("--data.truth", "0", "--data.query")])
+@pytest.mark.parametrize(
+    "option", [("--data.validation_truth", "0", "--data.validation"), ("--data.truth", "0", "--data.query")]
+)
 def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
     folder: Path,
     tmp_path: Path,

@@ -61,7 +61,8 @@ def test_losses_are_those_of_the_cpu(
 @CUDA
 def test_a_map_trained_on_a_gpu_scores_alike_on_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
-    _, model = trained("augmented", "cuda", tmp_path, augmentation=Augmentation(), validation=footage(0.05))
+    given = {"validation": footage(0.05), "validation_truth": "0"}
+    _, model = trained("augmented", "cuda", tmp_path, augmentation=Augmentation(), **given)
     query = ArrayTraverse(footage(0.1))
     here = model.localize(query)
     there = model.to("cuda").localize(query)
