@@ -31,7 +31,7 @@ from PIL import Image
 from torch import Tensor
 
 from dejavu_torch import cli
-from dejavu_torch.cli import commands, train
+from dejavu_torch.cli import commands, live, train
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import FOLDER, with_configs
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -535,6 +535,7 @@ def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
         raise InputError("this would take too long here")
 
     bench.run_bench = frontier.run_storage = reproduce.reproduce = too_long  # type: ignore[assignment]
+    live._stay = lambda url: None  # type: ignore[assignment]  # a page is there until Ctrl-C
     if words[:1] == ["demo"]:
         compare.compare = too_long  # type: ignore[assignment]
     case.command(words)
