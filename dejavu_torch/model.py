@@ -617,7 +617,7 @@ class DejaVu(nn.Module):
             longest = None if traverse.sized else self.preprocess.size
             size, why = reduced_size((height, width), longest, self._least), "see preprocess.size"
         else:
-            size, why = _size_like((height, width), shape), "as the map's"
+            size, why = _size_like((height, width), shape), "the size of the map's frames"
         if size == (height, width):
             return traverse
         line = f"frames of {height} x {width} pixels are brought to {size[0]} x {size[1]}, {why}"
