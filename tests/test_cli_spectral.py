@@ -241,7 +241,10 @@ OWNER = "has no such setting", "TemplateMapper has"
     [
         (["--mapper.route_bytes_per_place", "0.5"], ("route_bytes_per_place is 0.5", "the mean")),
         (["--mapper.route_bytes_per_place", "900"], ("route_bytes_per_place is 900", "at most 96")),
-        (["--mapper.step", "0.1"], ("5.0", "step is 0.1", "one of them")),
+        (
+            ["--mapper.step", "0.1", "--mapper.route_bytes_per_place", "5"],
+            ("5.0", "step is 0.1", "one of them"),
+        ),
         (["--whitening.numbers", "120"], ("numbers is 120", "rank 95")),
         (["--whitening.strengths.colour2", "0"], ("colour2", "expected colour, rotation")),
         (["--whitening", "none.such"], ("whitening", "'none'")),
