@@ -205,7 +205,7 @@ def draw_coverage(
     colours = "A query in its right place is green, in a wrong one red."
     if truth is None:
         known = match.probability is not None
-        colours = "The darker, the more probably it is the right place." if known else ""
+        colours = "The darker a dot, the more probable its place." if known else ""
     picture = Picture(
         plot_coverage(match, truth, tolerance, borders, queries, unit),
         "places reported",
