@@ -18,6 +18,7 @@ from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
+from dejavu_torch.data.selection import runs as runs_of
 from dejavu_torch.data.source import open_source, routes_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.memory import concatenate
@@ -439,7 +440,7 @@ class RouteData(LightningDataModule):
         held = torch.tensor(self.held, dtype=torch.int64)[:, None] + torch.arange(STRETCH)
         kept = ~torch.isin(frames.truth.positives, held).any(1)
         each = torch.arange(len(frames)).split([len(part) for part in parts])
-        runs = [run for part in each for run in _runs(part[kept[part]])]
+        runs = [run for part in each for run in runs_of(part[kept[part]])]
         longest = max(map(len, runs))
         if longest < self.clip:
             seen = "the longest stretch that is trained on" if self.held else "the route"
@@ -506,12 +507,6 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
 def as_frames(values: Tensor) -> Tensor:
     """Bytes as frames in [0, 1]; features as they are."""
     return values.float() / 255 if values.dtype == torch.uint8 else values
-
-
-def _runs(frames: Tensor) -> list[range]:
-    """The runs of consecutive numbers of (n,) sorted ones."""
-    breaks = (frames.diff() > 1).nonzero()[:, 0] + 1
-    return [range(int(p[0]), int(p[-1]) + 1) for p in frames.tensor_split(breaks.tolist()) if len(p)]
 
 
 def _joined(positives: list[Tensor]) -> GroundTruth:
