@@ -6,13 +6,13 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     III    the whole method                      DejaVu              model
     III-A  spectrogram, two strongest periods    SpectrogramAnalysis periods.spectrogram
     III-A  layers of features of like period     FrequencyLayer      types, periods.layers
-    eq. 2  phase masks M(i, tau, k)              phase_mask          database.templates
-    eq. 1  templates mu(H, tau, k)               PhaseTemplates      database.templates
-           the map they make                     TemplateMapper      database.template_map
-    eq. 3  distance to every phase of a layer    phase_distances     database.distance
-    eq. 4  scores S(i) of all places             TemplateMap         database.template_map
-           any kind of map                       PlaceMap            database.place_map
-           (ours) their generalisation           SpectralMapper      database.spectral
+    eq. 2  phase masks M(i, tau, k)              phase_mask          maps.templates
+    eq. 1  templates mu(H, tau, k)               PhaseTemplates      maps.templates
+           the map they make                     TemplateMapper      maps.template_map
+    eq. 3  distance to every phase of a layer    phase_distances     maps.distance
+    eq. 4  scores S(i) of all places             TemplateMap         maps.template_map
+           any kind of map                       PlaceMap            maps.place_map
+           (ours) their generalisation           SpectralMapper      maps.spectral
     eq. 5  best place, eq. 6 acceptance          best_match          recognition.select
     IV-A   HOG features                          HOG, hog            features.hog
     IV-A   window slid along an aerial image     SlidingWindow       data.strip
@@ -39,11 +39,6 @@ from dejavu_torch.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from dejavu_torch.data.source import open_source
-    from dejavu_torch.database.distance import phase_distances
-    from dejavu_torch.database.place_map import PlaceMap
-    from dejavu_torch.database.spectral import SpectralMapper
-    from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
-    from dejavu_torch.database.templates import PhaseTemplates, phase_mask
     from dejavu_torch.evaluation.curves import evaluate, pr_curve
     from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.embedding import Embedding
@@ -51,6 +46,11 @@ if TYPE_CHECKING:
     from dejavu_torch.features.preprocess import Preprocess
     from dejavu_torch.features.whitening import Whitening
     from dejavu_torch.live.localizer import LiveLocalizer
+    from dejavu_torch.maps.distance import phase_distances
+    from dejavu_torch.maps.place_map import PlaceMap
+    from dejavu_torch.maps.spectral import SpectralMapper
+    from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
+    from dejavu_torch.maps.templates import PhaseTemplates, phase_mask
     from dejavu_torch.model import DejaVu
     from dejavu_torch.motion.odometry import GroundOdometry
     from dejavu_torch.periods.imposed import ImposedPeriods
@@ -106,17 +106,17 @@ _HOMES = {
     "InputError": "types",
     "LiveLocalizer": "live.localizer",
     "Match": "types",
-    "PhaseTemplates": "database.templates",
+    "PhaseTemplates": "maps.templates",
     "PlaceFilter": "recognition.filter",
-    "PlaceMap": "database.place_map",
+    "PlaceMap": "maps.place_map",
     "PlaceRecognitionTask": "training.task",
     "Preprocess": "features.preprocess",
     "RouteData": "training.datamodule",
     "SequenceMatcher": "recognition.sequence",
-    "SpectralMapper": "database.spectral",
+    "SpectralMapper": "maps.spectral",
     "SpectrogramAnalysis": "periods.spectrogram",
-    "TemplateMap": "database.template_map",
-    "TemplateMapper": "database.template_map",
+    "TemplateMap": "maps.template_map",
+    "TemplateMapper": "maps.template_map",
     "Traverse": "types",
     "Whitening": "features.whitening",
     "best_match": "recognition.select",
@@ -124,8 +124,8 @@ _HOMES = {
     "evaluate": "evaluation.curves",
     "hog": "features.hog",
     "open_source": "data.source",
-    "phase_distances": "database.distance",
-    "phase_mask": "database.templates",
+    "phase_distances": "maps.distance",
+    "phase_mask": "maps.templates",
     "pr_curve": "evaluation.curves",
 }
 

@@ -13,12 +13,12 @@ from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.names import names_of
 from dejavu_torch.data.positions import positions_behind
-from dejavu_torch.database.mapfile import checksums, digests
-from dejavu_torch.database.merged import MergedMap, MergedMapper
-from dejavu_torch.database.recipe import difference, recipe_of
-from dejavu_torch.database.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.views import Views
+from dejavu_torch.maps.mapfile import checksums, digests
+from dejavu_torch.maps.merged import MergedMap, MergedMapper
+from dejavu_torch.maps.recipe import difference, recipe_of
+from dejavu_torch.maps.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.model import REGISTRY, DejaVu, check_sizes, shown_by
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.streaming.coder import Made, code_here, with_visits

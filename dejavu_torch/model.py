@@ -22,15 +22,6 @@ from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import decode_names, encode_names, names_of
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.selection import Selection, runs
-from dejavu_torch.database.mapfile import HEADER, checksums, digests, map_size, read_map, write_map
-from dejavu_torch.database.merged import MergedMapper
-from dejavu_torch.database.place_map import Mapper, PlaceMap
-from dejavu_torch.database.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
-from dejavu_torch.database.schema import checked, checked_fields
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
-from dejavu_torch.database.summary import MapSummary
-from dejavu_torch.database.template_map import TemplateMapper
-from dejavu_torch.database.weights import BITS, is_rounded, packed, round_weights, unpacked
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import (
@@ -46,6 +37,15 @@ from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
 from dejavu_torch.features.whitening import STRENGTHS, WIDEST, Whitening
+from dejavu_torch.maps.mapfile import HEADER, checksums, digests, map_size, read_map, write_map
+from dejavu_torch.maps.merged import MergedMapper
+from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
+from dejavu_torch.maps.schema import checked, checked_fields
+from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.summary import MapSummary
+from dejavu_torch.maps.template_map import TemplateMapper
+from dejavu_torch.maps.weights import BITS, is_rounded, packed, round_weights, unpacked
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.periods.finder import ForeignPeriods

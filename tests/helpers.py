@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
+from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import FrequencyLayer, InputError, Plan, Traverse

@@ -22,9 +22,9 @@ from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import with_configs
-from dejavu_torch.database.mapfile import read_map
-from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features import views
+from dejavu_torch.maps.mapfile import read_map
+from dejavu_torch.maps.spectral import SpectralMap
 
 ROUTE = "sim:aerial?frames=96"
 SECOND = "sim:aerial?frames=96&traverse=1"

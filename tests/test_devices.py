@@ -29,7 +29,7 @@ from dejavu_torch import (
 )
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.place_map import Mapper
+from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.recognition.candidates import best_candidates
 from dejavu_torch.types import SequenceModel
 

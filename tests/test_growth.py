@@ -26,12 +26,12 @@ from dejavu_torch import (
 )
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
-from dejavu_torch.database.mapfile import read_map, write_map
-from dejavu_torch.database.merged import MergedMap
-from dejavu_torch.database.spectral import SpectralMap, code_chunk
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import append, average, learn_mean, merge, shown_on_map
+from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.merged import MergedMap
+from dejavu_torch.maps.spectral import SpectralMap, code_chunk
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.streaming import coder
 from dejavu_torch.types import Traverse

@@ -17,10 +17,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.template_map import log_posterior
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.template_map import log_posterior
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.select import best_match

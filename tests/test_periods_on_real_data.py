@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 

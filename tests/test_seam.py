@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from dejavu_torch import HOG, best_match, evaluate
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.place_map import Mapper, PlaceMap
-from dejavu_torch.database.summary import MapSummary
-from dejavu_torch.database.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.experiments.compare import compare
+from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.summary import MapSummary
+from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu, read_place_map
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import FrequencyLayer

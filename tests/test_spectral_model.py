@@ -12,10 +12,10 @@ from torch import Tensor
 from dejavu_torch import DejaVu, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.views import AugmentedTraverse, Views
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.types import Traverse
 
 FRAMES = 300

@@ -23,13 +23,13 @@ from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.chain import chained, parts_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
-from dejavu_torch.database.merged import MergedMap
-from dejavu_torch.database.place_map import PlaceMap
-from dejavu_torch.database.recipe import recipe_of, with_parts
-from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
+from dejavu_torch.maps.merged import MergedMap
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.recipe import recipe_of, with_parts
+from dejavu_torch.maps.spectral import SpectralMap
 from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision, check_sizes
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
@@ -772,8 +772,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         map: map file
         features: class of the map's features, if not ours
     """
-    from dejavu_torch.database.l1 import l1_backend
-    from dejavu_torch.database.mapfile import FORMAT
+    from dejavu_torch.maps.l1 import l1_backend
+    from dejavu_torch.maps.mapfile import FORMAT
     from dejavu_torch.periods.stft import BACKEND
 
     model = DejaVu.load(map, features)

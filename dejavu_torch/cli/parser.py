@@ -16,9 +16,9 @@ from torch import nn
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
-from dejavu_torch.database.spectral import SpectralMapper
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError

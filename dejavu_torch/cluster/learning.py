@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from tqdm import tqdm
 
 from dejavu_torch.cluster.session import Cluster, Failure
-from dejavu_torch.database.spectral import CodedChunk
+from dejavu_torch.maps.spectral import CodedChunk
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, joined
 from dejavu_torch.types import InputError, Traverse
 

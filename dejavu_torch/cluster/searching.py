@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.cluster.session import RETRIES, Cluster, error_line
-from dejavu_torch.database.merged import MergedMap
-from dejavu_torch.database.place_map import PlaceMap
-from dejavu_torch.database.spectral import CodedChunk, SpectralMap
+from dejavu_torch.maps.merged import MergedMap
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.spectral import CodedChunk, SpectralMap
 from dejavu_torch.recognition.search import (
     SCORES_AT_ONCE,
     Best,

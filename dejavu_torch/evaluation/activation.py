@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import counted, is_right
-from dejavu_torch.database.template_map import TemplateMap
+from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.types import FrequencyLayer, GroundTruth
 
 DISTANCES_AT_ONCE = 2**22  # numbers of Q x P held at a time

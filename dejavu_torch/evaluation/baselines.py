@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from dejavu_torch.database.distance import Metric, phase_distances
-from dejavu_torch.database.spectral import SpectralMap
-from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.controls import leave_out_match, null_model
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.maps.distance import Metric, phase_distances
+from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.finder import ForeignPeriods

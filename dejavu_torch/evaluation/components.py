@@ -10,8 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.spectral import SpectralMap
-from dejavu_torch.database.spectrum import from_spectrum, period_of
+from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectrum import from_spectrum, period_of
 
 COUNTS = (1, 4, 16)  # strongest periods that are added up, beside all
 

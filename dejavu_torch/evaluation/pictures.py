@@ -11,9 +11,6 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.positions import unit_of
-from dejavu_torch.database.spectral import SpectralMap
-from dejavu_torch.database.spectrum import period_of, spectrum
-from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.activation import activation_rates, best_phases, layer_distances
 from dejavu_torch.evaluation.components import components
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, distinct
@@ -48,6 +45,9 @@ from dejavu_torch.evaluation.score_plots import (
 )
 from dejavu_torch.evaluation.spectral_plots import Lines, plot_spectrum
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectrum import period_of, spectrum
+from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of

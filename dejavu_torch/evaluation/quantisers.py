@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, keyframes
 from dejavu_torch.evaluation.controls import shuffled
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.types import InputError
 
 CENTROIDS = 256  # of a codebook: a code is a byte

@@ -23,14 +23,14 @@ from tqdm import tqdm
 
 import dejavu_torch
 from dejavu_torch.data.output import check_output_folder, whole_folder
-from dejavu_torch.database.distance import phase_distances
-from dejavu_torch.database.l1 import l1_backend
-from dejavu_torch.database.spectral import SpectralMapper
-from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.evaluation.plots import Plot
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.hog import HOG, hog
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.distance import phase_distances
+from dejavu_torch.maps.l1 import l1_backend
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher

@@ -18,8 +18,8 @@ from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.simulate.aerial import AerialRoad
-from dejavu_torch.database.spectral import CodedChunk, SpectralMap, SpectralMapper
 from dejavu_torch.experiments.bench import Row, write_bench
+from dejavu_torch.maps.spectral import CodedChunk, SpectralMap, SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming.coder import ChunkCoder, code_here
 from dejavu_torch.types import Traverse

@@ -22,12 +22,6 @@ from dejavu_torch.data.ground_truth import (
     ground_truth_in_places,
     offset_of,
 )
-from dejavu_torch.database.l1 import l1_backend
-from dejavu_torch.database.place_map import PlaceMap
-from dejavu_torch.database.recipe import recipe_of
-from dejavu_torch.database.spectral import SpectralMap
-from dejavu_torch.database.summary import MapSummary
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqslam_baseline
 from dejavu_torch.evaluation.contenders import Contender, contend
@@ -41,6 +35,12 @@ from dejavu_torch.experiments.storage import noise_over_map, storage_curve
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
+from dejavu_torch.maps.l1 import l1_backend
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.recipe import recipe_of
+from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.summary import MapSummary
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import REGISTRY, DejaVu, check_sizes
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND

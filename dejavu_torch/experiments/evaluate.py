@@ -18,7 +18,6 @@ from dejavu_torch.data.ground_truth import (
     offset_of,
 )
 from dejavu_torch.data.positions import unit_of
-from dejavu_torch.database.merged import MergedMap
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import (
@@ -33,6 +32,7 @@ from dejavu_torch.evaluation.pictures import draw_coverage, draw_curves
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
+from dejavu_torch.maps.merged import MergedMap
 from dejavu_torch.model import read_place_map
 from dejavu_torch.text import printable
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse

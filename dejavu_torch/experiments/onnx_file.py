@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 import dejavu_torch
 from dejavu_torch.data.output import check_output_file, whole_file
-from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.features.extract import in_mode
+from dejavu_torch.maps.spectral import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.calibration import MARGIN
 from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN

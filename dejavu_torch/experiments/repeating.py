@@ -11,9 +11,9 @@ from torch import Tensor
 
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
-from dejavu_torch.database.quantisation import quantise
-from dejavu_torch.database.spectrum import spectrum
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.maps.quantisation import quantise
+from dejavu_torch.maps.spectrum import spectrum
 from dejavu_torch.model import DejaVu
 
 LOOKED_AT = 16  # numbers of a descriptor that a step is chosen by

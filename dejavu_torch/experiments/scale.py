@@ -22,7 +22,6 @@ import dejavu_torch
 from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
 from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_file, whole_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
-from dejavu_torch.database import codec, l1, sparse_product
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.score_plots import plot_growth
 from dejavu_torch.experiments.bench import Row, peak_memory, programs
@@ -50,6 +49,7 @@ from dejavu_torch.experiments.scale_contenders import (
 from dejavu_torch.experiments.scale_report import RECALL, ScaleRow, exponents, pictured, with_ratios
 from dejavu_torch.experiments.template_search import PLACES as TEMPLATES
 from dejavu_torch.experiments.template_search import bench_templates
+from dejavu_torch.maps import codec, l1, sparse_product
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match
 

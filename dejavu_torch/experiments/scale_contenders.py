@@ -14,8 +14,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from dejavu_torch.data.frame_range import IndexedTraverse
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.experiments.repeating import step_that_holds
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.search import Search
 

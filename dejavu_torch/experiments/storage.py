@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
-from dejavu_torch.database.spectrum import from_spectrum, spectrum
 from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_frames
 from dejavu_torch.evaluation.contenders import evaluate_each
 from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.pictures import Localization
 from dejavu_torch.evaluation.score_plots import Stored
+from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.recognition.matching import Found
 from dejavu_torch.types import InputError
 

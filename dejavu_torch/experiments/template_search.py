@@ -10,9 +10,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.layer_search import LayerSearch
-from dejavu_torch.database.template_map import TemplateMap
 from dejavu_torch.experiments.bench import Program, Row, benchmark, in_one_thread
+from dejavu_torch.maps.layer_search import LayerSearch
+from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError
 

@@ -19,12 +19,12 @@ from tqdm import tqdm
 import dejavu_torch
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.precision import has_bf16

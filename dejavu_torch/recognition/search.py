@@ -10,9 +10,9 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.coefficients import Coefficients
-from dejavu_torch.database.place_map import PlaceMap
-from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.maps.coefficients import Coefficients
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.spectral import SpectralMap
 from dejavu_torch.recognition.candidates import Candidates
 from dejavu_torch.types import InputError
 

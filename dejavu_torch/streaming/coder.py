@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.selection import Selection
-from dejavu_torch.database.spectral import CodedChunk, code_chunk
-from dejavu_torch.database.spectrum import Transform
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.spectral import CodedChunk, code_chunk
+from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.types import InputError, Traverse
 
 SHARD = 1024  # places at least, of the chunks that are made, kept and lost together

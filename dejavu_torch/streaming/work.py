@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.output import PREFIX, make_output_folder, remove_empty_folders, whole_file
-from dejavu_torch.database.codec import Stream
-from dejavu_torch.database.mapfile import read_map, write_map
-from dejavu_torch.database.spectral import CodedChunk
+from dejavu_torch.maps.codec import Stream
+from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.spectral import CodedChunk
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here
 from dejavu_torch.types import InputError, Traverse
 

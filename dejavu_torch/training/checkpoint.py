@@ -20,8 +20,8 @@ from torch.optim import Optimizer
 
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import make_output_folder, whole_file
-from dejavu_torch.database.place_map import EXTRA
-from dejavu_torch.database.schema import checked_fields
+from dejavu_torch.maps.place_map import EXTRA
+from dejavu_torch.maps.schema import checked_fields
 from dejavu_torch.model import STATE_TYPES
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError

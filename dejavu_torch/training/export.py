@@ -11,10 +11,10 @@ from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import STRENGTHS
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.training.datamodule import FEW, RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.template_map import TemplateMap, weight_per_feature
+from dejavu_torch.maps.template_map import TemplateMap, weight_per_feature
 from dejavu_torch.training.processes import mean_of_all
 from dejavu_torch.types import InputError, Plan
 

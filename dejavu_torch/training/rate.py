@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.quantisation import quantise
-from dejavu_torch.database.spectrum import Transform, from_spectrum
+from dejavu_torch.maps.quantisation import quantise
+from dejavu_torch.maps.spectrum import Transform, from_spectrum
 from dejavu_torch.training.losses import laplace_bits
 from dejavu_torch.types import InputError
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.database.distance import phase_distances
-from dejavu_torch.database.spectral import SpectralMapper
-from dejavu_torch.database.spectrum import Transform
 from dejavu_torch.features.embedding import Coder, Embedding, to_length
 from dejavu_torch.features.extract import features_of, in_mode
+from dejavu_torch.maps.distance import phase_distances
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.text import one_line
 from dejavu_torch.training.chance import phase_chance, place_chance
 from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames

@@ -17,15 +17,15 @@ from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from dejavu_torch.database.place_map import Mapper, PlaceMap
-from dejavu_torch.database.template_map import TemplateMap, TemplateMapper, log_posterior
-from dejavu_torch.database.weights import BITS, in_bits, round_weights, unpacked
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
+from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper, log_posterior
+from dejavu_torch.maps.weights import BITS, in_bits, round_weights, unpacked
 from dejavu_torch.model import DejaVu, check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match

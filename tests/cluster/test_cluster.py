@@ -26,10 +26,10 @@ from dejavu_torch.cluster.searching import ClusterSearcher, _map_of, _parts
 from dejavu_torch.cluster.session import Cluster
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database import spectral
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import append, merge
+from dejavu_torch.maps import spectral
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
 from dejavu_torch.streaming.work import WorkFolder

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.components import components
+from dejavu_torch.maps.spectral import SpectralMapper
 
 
 def waves(places: int = 240) -> Tensor:

@@ -11,8 +11,8 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.database.place_map import Route
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches, write_matches
+from dejavu_torch.maps.place_map import Route
 from dejavu_torch.types import Match
 
 INF = float("inf")

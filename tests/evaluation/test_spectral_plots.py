@@ -10,8 +10,6 @@ from torch import Tensor
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
-from dejavu_torch.database.spectrum import period_of
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.pictures import (
@@ -26,6 +24,8 @@ from dejavu_torch.evaluation.pictures import (
 )
 from dejavu_torch.evaluation.report import PICTURES
 from dejavu_torch.evaluation.score_plots import Stored
+from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.spectrum import period_of
 
 PLACES = 240
 

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu, InputError, SequenceMatcher, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.distance import phase_distances
-from dejavu_torch.database.spectral import SpectralMap
 from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.maps.distance import phase_distances
+from dejavu_torch.maps.spectral import SpectralMap
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import FrequencyLayer, Training, Traverse
 

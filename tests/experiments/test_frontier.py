@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.quantisers import Kept
 from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments import frontier
@@ -36,6 +35,7 @@ from dejavu_torch.experiments.frontier import (
     storage_tables,
     whitenings,
 )
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.recognition.matching import Matching
 
 PLACES, NUMBERS = 300, 24

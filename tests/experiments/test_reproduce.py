@@ -18,7 +18,6 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.data.simulate.train import Railway
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.experiments.compare import Comparison, compare
@@ -39,6 +38,7 @@ from dejavu_torch.experiments.reproduce import (
     structure_cuts,
     structure_places,
 )
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import Match

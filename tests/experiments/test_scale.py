@@ -19,7 +19,6 @@ from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.evaluation.baselines import as_int8, interpolated
 from dejavu_torch.experiments import scale, scale_contenders
 from dejavu_torch.experiments.made import BLOCK, Likeness, MadeRoute, likeness
@@ -37,6 +36,7 @@ from dejavu_torch.experiments.scale_contenders import (
 )
 from dejavu_torch.experiments.scale_report import ScaleRow, exponents, scale_tables
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 
 

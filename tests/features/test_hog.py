@@ -13,8 +13,8 @@ from skimage.feature import hog as skimage_hog
 from torch import Tensor
 
 from dejavu_torch import HOG, hog
-from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.features.hog import cell_histograms, gradients
+from dejavu_torch.maps.recipe import recipe_of
 from dejavu_torch.model import REGISTRY
 from dejavu_torch.resize import resize_frames
 

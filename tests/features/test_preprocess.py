@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from kornia.enhance import equalize_clahe
 from torch import Tensor
 
-from dejavu_torch.database.recipe import recipe_of
 from dejavu_torch.features.preprocess import Preprocess, equalise, normalise_patches, select_channel
+from dejavu_torch.maps.recipe import recipe_of
 from dejavu_torch.model import REGISTRY
 
 

@@ -17,9 +17,9 @@ from torch import Tensor
 from dejavu_torch.cli.presets import FOLDER
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.spectral import SpectralMapper
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods

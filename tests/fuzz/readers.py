@@ -38,15 +38,15 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.camera import Camera
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database import mapfile
-from dejavu_torch.database.codec import Stream, decode, encode
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.matches import read_matches
 from dejavu_torch.experiments import bench, compare, frontier, reproduce
 from dejavu_torch.experiments import evaluate as evaluating
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.live.localizer import LiveLocalizer
+from dejavu_torch.maps import mapfile
+from dejavu_torch.maps.codec import Stream, decode, encode
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu, read_place_map
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.filter import PlaceFilter

@@ -13,8 +13,8 @@ from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.positions import place_of
-from dejavu_torch.database.spectral import SpectralMapper
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.database.recipe import build, recipe_of
-from dejavu_torch.database.template_map import Reduction, TemplateMap, TemplateMapper
+from dejavu_torch.maps.recipe import build, recipe_of
+from dejavu_torch.maps.template_map import Reduction, TemplateMap, TemplateMapper
 from dejavu_torch.model import REGISTRY
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods

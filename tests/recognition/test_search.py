@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
-from dejavu_torch.database import spectral
-from dejavu_torch.database.codec import to_int8
-from dejavu_torch.database.coefficients import coefficients_of
-from dejavu_torch.database.merged import MergedMap
-from dejavu_torch.database.place_map import PlaceMap
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper
-from dejavu_torch.database.template_map import TemplateMapper
+from dejavu_torch.maps import spectral
+from dejavu_torch.maps.codec import to_int8
+from dejavu_torch.maps.coefficients import coefficients_of
+from dejavu_torch.maps.merged import MergedMap
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition import matching, search
 from dejavu_torch.recognition.calibration import Calibration, Platt, evidence_of

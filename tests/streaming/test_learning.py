@@ -20,10 +20,10 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.chain import Chain
 from dejavu_torch.data.output import PREFIX
 from dejavu_torch.data.source import open_source
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
 from dejavu_torch.streaming.coder import ChunkCoder, code_here, joined

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import PhaseTemplates, TemplateMap
-from dejavu_torch.database.template_map import Reduction, log_posterior
+from dejavu_torch.maps.template_map import Reduction, log_posterior
 from dejavu_torch.training.losses import Losses, Objective, phase_cross_entropy, place_cross_entropy
 from dejavu_torch.types import FrequencyLayer, Plan
 

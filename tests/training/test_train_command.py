@@ -22,11 +22,11 @@ from torch import nn
 from dejavu_torch import DejaVu, RouteData, TemplateMap
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.mapfile import read_map
-from dejavu_torch.database.spectral import SpectralMap
-from dejavu_torch.database.summary import describe
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.maps.mapfile import read_map
+from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.summary import describe
 
 
 def figures(path: Path) -> dict[str, list[float]]:

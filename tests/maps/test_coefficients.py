@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import DejaVu
-from dejavu_torch.database import spectral
-from dejavu_torch.database.codec import to_int8
-from dejavu_torch.database.coefficients import (
+from dejavu_torch.maps import spectral
+from dejavu_torch.maps.codec import to_int8
+from dejavu_torch.maps.coefficients import (
     Coefficients,
     check_sizes,
     coded_levels,
@@ -24,7 +24,7 @@ from dejavu_torch.database.coefficients import (
     joined,
     levels_of,
 )
-from dejavu_torch.database.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.types import InputError
 
 

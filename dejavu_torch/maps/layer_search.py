@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from dejavu_torch.database.template_map import Segment, TemplateMap
+    from dejavu_torch.maps.template_map import Segment, TemplateMap
 
 LOOK_UP = 8  # how many places are scored in the time that one phase of two layers takes
 FIXED = 2**15  # and in that of a search of any size

@@ -10,7 +10,7 @@ import torch
 from helpers import refused
 from torch import Tensor
 
-from dejavu_torch.database.spectrum import Transform, from_spectrum, period_of, spectrum
+from dejavu_torch.maps.spectrum import Transform, from_spectrum, period_of, spectrum
 
 TRANSFORMS: tuple[Transform, ...] = ("dft", "dct")
 

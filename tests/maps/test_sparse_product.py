@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from dejavu_torch.database import sparse_product, spectral
-from dejavu_torch.database.codec import to_int8
-from dejavu_torch.database.coefficients import Coefficients, coefficients_of, levels_of
-from dejavu_torch.database.compiling import compiled
-from dejavu_torch.database.sparse_product import _compiled, compiled_sums
-from dejavu_torch.database.spectral import SpectralMap
+from dejavu_torch.maps import sparse_product, spectral
+from dejavu_torch.maps.codec import to_int8
+from dejavu_torch.maps.coefficients import Coefficients, coefficients_of, levels_of
+from dejavu_torch.maps.compiling import compiled
+from dejavu_torch.maps.sparse_product import _compiled, compiled_sums
+from dejavu_torch.maps.spectral import SpectralMap
 
 pytest.importorskip("numba")
 

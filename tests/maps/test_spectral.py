@@ -14,9 +14,9 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.database.quantisation import dead_zone, quantise
-from dejavu_torch.database.spectral import SpectralMap, SpectralMapper, code_chunk
-from dejavu_torch.database.spectrum import Transform, from_spectrum, spectrum
+from dejavu_torch.maps.quantisation import dead_zone, quantise
+from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper, code_chunk
+from dejavu_torch.maps.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer, InputError
 
 

@@ -13,8 +13,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.database import codec
-from dejavu_torch.database.codec import coded_bytes, encode
+from dejavu_torch.maps import codec
+from dejavu_torch.maps.codec import coded_bytes, encode
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.positions import borders, count_places, look_up, place_of, shown_frames
-from dejavu_torch.database.summary import MapSummary
+from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError, SequenceModel
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives

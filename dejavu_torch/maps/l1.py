@@ -16,7 +16,7 @@ from torch.autograd import forward_ad
 from torch.nn import Parameter
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
-from dejavu_torch.database.compiling import compiled
+from dejavu_torch.maps.compiling import compiled
 
 log = logging.getLogger("dejavu_torch")
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dejavu_torch.database.compiling import compiled
+from dejavu_torch.maps.compiling import compiled
 from dejavu_torch.memory import free_memory
 from dejavu_torch.types import InputError
 

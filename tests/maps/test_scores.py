@@ -24,7 +24,7 @@ from dejavu_torch import (
     best_match,
     phase_distances,
 )
-from dejavu_torch.database.template_map import log_posterior, segments
+from dejavu_torch.maps.template_map import log_posterior, segments
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import common_period
 from dejavu_torch.types import Plan

@@ -20,13 +20,13 @@ from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.names import encode_names
-from dejavu_torch.database.mapfile import FORMAT, NAME, write_map
-from dejavu_torch.database.recipe import Recipe
-from dejavu_torch.database.recipe import recipe_of as recipe_in
-from dejavu_torch.database.template_map import TemplateMapper
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.maps.mapfile import FORMAT, NAME, write_map
+from dejavu_torch.maps.recipe import Recipe
+from dejavu_torch.maps.recipe import recipe_of as recipe_in
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import REGISTRY, DejaVu, read_place_map
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis

@@ -19,9 +19,9 @@ from test_spectral import held, route
 from torch import Tensor
 
 from dejavu_torch import memory
-from dejavu_torch.database import quantisation
-from dejavu_torch.database.quantisation import CLOSE, HALVINGS, RouteLines, _close_step
-from dejavu_torch.database.spectral import SpectralMapper
+from dejavu_torch.maps import quantisation
+from dejavu_torch.maps.quantisation import CLOSE, HALVINGS, RouteLines, _close_step
+from dejavu_torch.maps.spectral import SpectralMapper
 
 SETTINGS: list[dict[str, Any]] = [
     {},

@@ -12,12 +12,12 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.database.distance import Metric, check_metric, metric_name, phase_distances
-from dejavu_torch.database.layer_search import LayerSearch
-from dejavu_torch.database.place_map import Mapper, PlaceMap
-from dejavu_torch.database.summary import MapSummary, summarise
-from dejavu_torch.database.templates import PhaseTemplates
-from dejavu_torch.database.trajectories import LayerSums
+from dejavu_torch.maps.distance import Metric, check_metric, metric_name, phase_distances
+from dejavu_torch.maps.layer_search import LayerSearch
+from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.summary import MapSummary, summarise
+from dejavu_torch.maps.templates import PhaseTemplates
+from dejavu_torch.maps.trajectories import LayerSums
 from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis

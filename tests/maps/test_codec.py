@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.database import codec
-from dejavu_torch.database.codec import (
+from dejavu_torch.maps import codec
+from dejavu_torch.maps.codec import (
     BYTE,
     Stream,
     _shift,

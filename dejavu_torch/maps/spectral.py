@@ -14,14 +14,14 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.codec import (
+from dejavu_torch.maps.codec import (
     Stream,
     check_claim,
     decode,
     encode,
     to_int8,
 )
-from dejavu_torch.database.coefficients import (
+from dejavu_torch.maps.coefficients import (
     Coefficients,
     check_sizes,
     coded_levels,
@@ -33,11 +33,11 @@ from dejavu_torch.database.coefficients import (
     nonzero_of,
     with_escapes,
 )
-from dejavu_torch.database.place_map import Mapper, PlaceMap
-from dejavu_torch.database.quantisation import RouteLines, dead_zone, quantise
-from dejavu_torch.database.sparse_product import WORTH_COMPILING, compiled_sums
-from dejavu_torch.database.spectrum import Slots, Transform, from_slots, period_of, slots, spectrum
-from dejavu_torch.database.summary import ChunkSummary, MapSummary
+from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.quantisation import RouteLines, dead_zone, quantise
+from dejavu_torch.maps.sparse_product import WORTH_COMPILING, compiled_sums
+from dejavu_torch.maps.spectrum import Slots, Transform, from_slots, period_of, slots, spectrum
+from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")

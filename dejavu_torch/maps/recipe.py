@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from torch import nn
 
-from dejavu_torch.database.schema import checked, checked_fields
+from dejavu_torch.maps.schema import checked, checked_fields
 from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.types import InputError
 

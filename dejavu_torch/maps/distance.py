@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.l1 import compiled_l1
+from dejavu_torch.maps.l1 import compiled_l1
 from dejavu_torch.types import InputError
 
 Metric = str | Callable[[Tensor, Tensor], Tensor]

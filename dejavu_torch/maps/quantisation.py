@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.codec import coded_bytes, to_int8
-from dejavu_torch.database.spectrum import Transform, spectrum
+from dejavu_torch.maps.codec import coded_bytes, to_int8
+from dejavu_torch.maps.spectrum import Transform, spectrum
 from dejavu_torch.memory import empty
 
 ROUNDING = 0.35  # what is added ahead of rounding down: a dead zone of 1.3 steps around 0

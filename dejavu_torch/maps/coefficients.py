@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.codec import ESCAPE, to_int8
+from dejavu_torch.maps.codec import ESCAPE, to_int8
 from dejavu_torch.types import InputError
 
 AT_ONCE = 2**20  # levels looked through at a time

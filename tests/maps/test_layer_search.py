@@ -12,8 +12,8 @@ from helpers import Fixed, template_model
 from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
-from dejavu_torch.database import layer_search
-from dejavu_torch.database.layer_search import LayerSearch, sliding_minimum
+from dejavu_torch.maps import layer_search
+from dejavu_torch.maps.layer_search import LayerSearch, sliding_minimum
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 
 from dejavu_torch import FrequencyLayer
-from dejavu_torch.database.summary import describe, summarise
+from dejavu_torch.maps.summary import describe, summarise
 from dejavu_torch.types import Plan
 
 PLAN: Plan = (

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.database.coefficients import Coefficients
-from dejavu_torch.database.compiling import compiled
-from dejavu_torch.database.l1 import numbers_of
+from dejavu_torch.maps.coefficients import Coefficients
+from dejavu_torch.maps.compiling import compiled
+from dejavu_torch.maps.l1 import numbers_of
 
 WORTH_COMPILING = 2**16  # coefficients of a map: of fewer torch takes less than a millisecond
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
-from dejavu_torch.database.trajectories import LayerSums
+from dejavu_torch.maps.trajectories import LayerSums
 from dejavu_torch.types import Plan
 
 SPEEDS = st.lists(st.sampled_from([1.0, 0.0, 0.5, 2.0, -1.0, 1.3, -0.6]), min_size=1, max_size=3)

@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.types import SequenceModel
 
 if TYPE_CHECKING:
-    from dejavu_torch.database.template_map import Segment, TemplateMap
+    from dejavu_torch.maps.template_map import Segment, TemplateMap
 
 
 LOOK_UP = 4  # how many scores of neighbouring places are added in the time of one number of a table

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from torch import Tensor, nn
 
-from dejavu_torch.database.mapfile import read_map, write_map
-from dejavu_torch.database.weights import fits, in_bits, is_rounded, packed, quantised, round_weights, rounded
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.weights import fits, in_bits, is_rounded, packed, quantised, round_weights, rounded
 from dejavu_torch.model import DejaVu
 
 FINITE = st.floats(-(2.0**126), 2.0**126, width=32)
