@@ -15,7 +15,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.distance import Metric, phase_distances
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
