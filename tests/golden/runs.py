@@ -16,7 +16,6 @@ from dejavu_torch.cli import main
 
 HERE = Path(__file__).parent
 SMALL = "size=32"
-SCREEN = "height=32&width=64"
 
 
 def _visits(route: str) -> tuple[str, str]:
@@ -37,8 +36,8 @@ RUNS: dict[str, tuple[str, ...]] = {
         *("--truth", "{data}/corridor/truth.csv"),
     ),
     "sequence": (
-        *_visits(f"underground?frames=100&{SCREEN}"),
-        *("--sequence", "5", "--speeds", "[0.8,1,1.25]", "--whitening", "none", "--mapper.chunk", "50"),
+        *_visits(f"aerial?seed=3&frames=200&noise=0.05&{SMALL}"),
+        *("--sequence", "5", "--speeds", "[0.8,1,1.25]", "--whitening", "none", "--mapper.chunk", "80"),
         *("--calibration", "none", "--top", "2"),
     ),
     "filter": (*_visits(f"aerial?seed=2&frames=200&{SMALL}"), "--filter", "--whitening.views", "1"),
