@@ -413,7 +413,9 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
         return {}
     energy = lines.value.new_zeros(route.dimension).index_add(0, lines.feature, lines.value.square())
     chosen = energy.argsort(descending=True, stable=True)[:STRONGEST].cpu()
-    values = run.reference_features[start:stop].cpu()[:, chosen].float() - route.means[0].cpu()[chosen].float()
+    values = (
+        run.reference_features[start:stop].cpu()[:, chosen].float() - route.means[0].cpu()[chosen].float()
+    )
     amplitudes = spectrum(values.T, route.transform).abs()[:, 1:]
     kept = torch.zeros(stop - start, route.dimension, dtype=torch.bool)
     kept[lines.line.cpu(), lines.feature.cpu()] = True

@@ -63,6 +63,7 @@ def _contenders(
     coder: ChunkCoder, route: Traverse, cluster: Cluster
 ) -> dict[tuple[str, int], Callable[[], list[Chunk]]]:
     """By name and number of threads in all: what makes all chunks."""
+
     def here() -> list[Chunk]:
         return [*code_here(coder, route, 0)]
 

@@ -99,7 +99,10 @@ class Held(Contender):
         if model.whitening is not None:
             model.whitening.load_state_dict(state)
         lengths = torch.linalg.vector_norm(held, dim=1).square()
-        return gathered(((lengths - 2 * part @ held.T).argmin(1) for part in model.describer.descriptors(queries)), queries)
+        return gathered(
+            ((lengths - 2 * part @ held.T).argmin(1) for part in model.describer.descriptors(queries)),
+            queries,
+        )
 
 
 class Faiss(Contender):

@@ -116,14 +116,12 @@ class RouteLines:
 
     def step_of(self, room: float) -> float:
         """The smallest step in which the lines take so many bytes, or fewer; of a long route, about it."""
-        close = CLOSE * room if self.lines.numel() > BLOCK else room
+        close = CLOSE if self.lines.numel() > BLOCK else 1.0
         return self._smallest_step(self.coded_bytes, room, close)
 
     def step_that_holds(self, share: float) -> float:
         """The smallest step in which even lines hold less than a share of the variance."""
-        return self._smallest_step(
-            lambda step: self.held(step, even=True), math.nextafter(share, 0), -math.inf
-        )
+        return self._smallest_step(lambda step: self.held(step, even=True), math.nextafter(share, 0))
 
     @cached_property
     def coarsest(self) -> float:
@@ -143,9 +141,9 @@ class RouteLines:
     def _widths(self, rows: slice, even: bool) -> Tensor | None:
         return None if even or self.width is None else self.width[rows]
 
-    def _smallest_step(self, value: Callable[[float], float], most: float, close: float) -> float:
-        """The smallest step of which the value, which falls with it, is at most so large: by bisection of its
-        logarithm, until the value is at least `close`."""
+    def _smallest_step(self, value: Callable[[float], float], most: float, close: float = 1.0) -> float:
+        """The smallest step whose value, which falls as the step grows, is at most so large: by bisection of
+        its logarithm, until the value is within that and `close` times it."""
         finest, coarsest = self.scale / FINEST, self.coarsest
         if value(finest) <= most:
             return finest
@@ -154,7 +152,7 @@ class RouteLines:
             middle = (low + high) / 2
             found = value(math.exp(middle))
             low, high = (low, middle) if found <= most else (middle, high)
-            if close <= found < most:
+            if close * most <= found < most:
                 break
         return math.exp(high)
 

@@ -184,6 +184,7 @@ class SpectralMap(PlaceMap):
         chunks = [*chunks]
         if not chunks:
             return
+        check_sizes(self.places + sum(chunk.places for chunk in chunks))
         self._encode()
         decoded = [self._decoded(chunk) for chunk in chunks]
         self._add(decoded, [chunk.places for chunk in chunks], [chunk.step for chunk in chunks])
@@ -225,7 +226,11 @@ class SpectralMap(PlaceMap):
             self.count_visits(
                 torch.cat([self.visit_counts[: self.places], self.lengths.new_ones(sum(places))])
             )
-        self.norms = torch.cat([self.norms, self._norms_of(range(first, len(self.chunks)))])
+        norms = [  # chunk by chunk: however a map is put together, they are the same to the bit
+            torch.stack([part.square_().sum(0) for part in self._features(g)]).sum(0).sqrt_()
+            for g in range(first, len(self.chunks))
+        ]
+        self.norms = torch.cat([self.norms, *norms])
 
     def _check_norms(self) -> None:
         if not self.norms.isfinite().all():
@@ -346,20 +351,14 @@ class SpectralMap(PlaceMap):
 
     def decode(self, chunk: int) -> Tensor:
         """The descriptors of a chunk as the map holds them, (W,K) float32."""
-        return torch.cat([part for part in self._features(range(chunk, chunk + 1))]).T
+        return torch.cat([*self._features(chunk)]).T
 
-    def _features(self, chunks: range) -> Iterator[Tensor]:
-        """The coded descriptors of equally long chunks, some of their features at a time: (F,W G) each."""
-        start, stop = self.chunks[chunks.start]
+    def _features(self, chunk: int) -> Iterator[Tensor]:
+        """The coded descriptors of a chunk, some of their features at a time: (F,W) each."""
+        start, stop = self.chunks[chunk]
         units = torch.eye(self.dimension, device=self.means.device)
-        yield from (self.products(some, chunks) for some in units.split(max(1, LONG // (stop - start))))
-
-    def _norms_of(self, chunks: range) -> Tensor:
-        squares = [
-            sum(part.square_().sum(0) for part in self._features(run))
-            for run in self._runs(chunks, self.dimension)
-        ]
-        return torch.cat([self.norms[:0], *squares]).sqrt_()  # type: ignore[list-item]
+        for some in units.split(max(1, LONG // (stop - start))):
+            yield self.products(some, range(chunk, chunk + 1))
 
     def inverse_norms(self, start: int = 0, stop: int | None = None) -> Tensor:
         """1 / norm of the places [start, stop), 0 of those that have next to none."""
