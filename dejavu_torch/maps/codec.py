@@ -1,4 +1,11 @@
-"""Integer levels as a stream of bytes: an arithmetic code that learns, as it goes, from what is near."""
+"""The entropy coder of a spectral map: int8 levels to bytes by adaptive arithmetic coding, and back.
+
+Each row begins with a bit that is 1 if all further levels are 0. A level is the number of bits of its
+magnitude in unary, its sign, and the bits below the leading one. The probability of a bit follows how often
+it was 1 in its context: for the unary bits, the magnitudes in this column and its neighbours over the rows
+before, and in all columns over the last few rows; for a sign, the sign two rows before, which is the line of
+the same kind, cosine or sine. All arithmetic is in integers, so that every machine decodes the same levels.
+"""
 
 from __future__ import annotations
 
@@ -22,58 +29,48 @@ log = logging.getLogger("dejavu_torch")
 
 Ints = NDArray[np.integer[Any]]
 
-ESCAPE = -128  # stands for a level that int8 does not hold
-LEVELS_PER_BYTE, LEVELS_AT_LEAST = 2**13, 2**22  # of a stream, at most
-LEVEL, COLUMN = 4, 2**10  # bytes that a level takes while it is decoded, and a column besides
-MOST = 15  # a magnitude counts for no more in what is near
-REACH = 128  # rows that are near
+ESCAPE = -128  # in place of a level that int8 does not hold
+LEVELS_PER_BYTE, LEVELS_AT_LEAST = 2**13, 2**22  # most levels of a stream
+LEVEL, COLUMN = 4, 2**13  # bytes to decode a level, and a column
+MOST = 15  # larger magnitudes count as this one in the sums of a context
+REACH, RING = 128, 256  # rows that a context looks back at most, and whose sums are kept
 
-# symbols: levels + ZERO, and in front of a row, that it goes on, or that all rows left are 0
-ZERO, GOES_ON, ENDS, SYMBOLS = 128, 256, 257, 258
-NONE, TOO_SHORT, TOO_MANY = 258, 259, 260  # no symbol, too few bytes, and too many rows for them
-# contexts: of a bit in every row, of signs, of the bits of a magnitude, and of how many bits it has
-END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 8 * 8
-NEAR = 34  # kinds of neighbourhood
+ZERO, GOES_ON, ENDS, SYMBOLS = 128, 256, 257, 258  # a symbol is a level + ZERO, or begins a row
+NO_SYMBOL, TOO_SHORT, TOO_MANY = 258, 259, 260  # why decoding fails
+END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 8 * 8  # the first context of each kind of bit
+NEAR = 34  # contexts by the magnitudes near a level
 CONTEXTS = LENGTH + 8 * NEAR
-FIRST = (2, 1)  # 0s and 1s of a context before there are any; each one counts 2
-
-BLOCK, PIECE = 2**14, 2**11  # levels whose neighbourhood is found, and that are coded, at a time
-PATH, SYMBOL = 17, 80  # bits of a symbol, and bytes, that it takes less of
-SPAN, BYTE = 56, 48  # bits of the coder's interval at first, and at least
+FIRST = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
+BLOCK, PIECE = 2**16, 2**12  # levels whose contexts are found, and that are encoded, at a time
+PATH, SYMBOL = 17, 80  # upper bounds of bits, and of bytes, per symbol
+SPAN, BYTE = 56, 48  # bits of the interval at first, and at least
 LEAST = 1 << BYTE
-WORTH_COMPILING = 2**21  # levels: without numba they take about as long as to compile
-LIGHTER = 8  # so many levels are counted in the time of one that is coded
+WORTH_COMPILING = 2**21  # levels that Python codes in the time that numba compiles
+LIGHTER = 8  # `coded_bytes` is so many times faster than `encode`
 
 
 class Stream(NamedTuple):
-    """bytes: (n,) uint8, compressed. checksum: of the levels and their shape, CRC-32."""
+    """bytes: (n,) uint8, compressed. checksum: CRC-32 of the levels and their shape."""
 
     bytes: Tensor
     checksum: int
 
 
 def encode(levels: Tensor) -> Stream:
-    """Compress integer levels by an adaptive arithmetic code; whole numbers alone decide its intervals.
+    """Compress integer levels.
 
     Shape: (W,K) int8 -> (n,) uint8.
-
-    Convention: row by row, first a bit: whether all that is left is 0. Then of each level how many bits its
-        magnitude has, in unary, its sign, and these bits below the first. The probability of a bit is that
-        with which it was 1 in its context: for the unary ones, how large the magnitudes are in the column and
-        its neighbours over the rows before, and in all columns over the last few; for a sign, that of the
-        column two rows before, which is the line of the same kind, cosine or sine.
     """
     whole = _numbers(levels)
     code = _code(whole.size)
-    tables = [code.numbers(table) for table in (_padded().ravel(), *_first_counts())]
-    packed, low, span, size = bytearray(), 0, 1 << SPAN, 0
+    tables = tuple(code.numbers(table) for table in (_paths(), *_first_counts()))
+    packed = bytearray()
+    low, span, size = 0, 1 << SPAN, 0
     for block in _symbols(whole, code):
-        begin, near, before = (part.ravel() for part in (block[0] * np.int16(PATH), *block[1:]))
-        for at in range(0, len(begin), PIECE):
-            if (needed := size + SYMBOL * PIECE) > len(packed):
-                packed.extend(bytes(needed))
-            parts = [code.numbers(part[at : at + PIECE]) for part in (begin, near, before)]
-            low, span, size = code.write(*parts, code.bytes(packed), *tables, low, span, size)
+        for at in range(0, len(block[0]), PIECE):
+            packed.extend(bytes(max(0, size + SYMBOL * PIECE - len(packed))))
+            piece = [code.numbers(part[at : at + PIECE]) for part in block]
+            low, span, size = code.write(*piece, code.bytes(packed), tables, low, span, size)
     packed[size:] = bytes(1)
     _shift(packed, low + LEAST - 1, size)  # a number in the interval whose further bytes are 0
     check_work(len(_filled(whole)), whole.shape[1], len(packed))
@@ -81,7 +78,7 @@ def encode(levels: Tensor) -> Stream:
 
 
 def coded_bytes(levels: Tensor) -> int:
-    """What `encode` needs, without coding: a byte more at most.
+    """The size of `encode`'s stream, or a byte more, without coding.
 
     Shape: (W,K) int8 -> scalar.
 
@@ -90,23 +87,19 @@ def coded_bytes(levels: Tensor) -> int:
         1
     """
     whole = _numbers(levels)
-    seen = np.zeros(SYMBOLS * NEAR * 3, np.int64)  # how often a symbol came with what is near
+    seen = np.zeros(SYMBOLS * NEAR * 3, np.int64)  # occurrences of each symbol in each neighbourhood
     for symbols, near, before in _symbols(whole, _code(whole.size // LIGHTER)):
-        seen += np.bincount(((symbols * np.int32(NEAR) + near) * 3 + before).ravel(), minlength=len(seen))
+        seen += np.bincount((symbols * np.int32(NEAR) + near) * 3 + before, minlength=len(seen))
     counts = np.zeros((CONTEXTS, 2))
     steps, taken = _taken()
     each = (taken @ seen.reshape(SYMBOLS, -1)).reshape(-1, NEAR, 3)
     for step, times in zip(steps.tolist(), each, strict=True):
         context, bit = step >> 1, step & 1
-        if context >= LENGTH:
-            counts[context : context + NEAR, bit] += times.sum(1)
-        elif context == SIGN:
-            counts[SIGN : SIGN + 3, bit] += times.sum(0)
-        else:
-            counts[context, bit] += times.sum()
+        bits = times.sum(1) if context >= LENGTH else times.sum(0 if context == SIGN else None)
+        counts[context : context + bits.size, bit] += bits
     start = torch.tensor(FIRST, dtype=torch.float64) / 2
     after = torch.from_numpy(counts) + start
-    # in whatever order they come, the bits of a context have a probability of gamma functions' quotients
+    # the probability of all bits of a context, in any order, is a quotient of gamma functions
     nats = after.sum(1).lgamma() - after.lgamma().sum(1) + start.lgamma().sum() - start.sum().lgamma()
     return int(float(nats.sum()) / math.log(256) + 1.01)
 
@@ -117,29 +110,41 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
     Raises:
         InputError: a truncated or altered stream, one of another size, or more than the memory holds.
     """
-    problem = ""
     check_claim(rows, columns)
     levels = np.zeros((rows, columns), np.int8)
-    try:
-        _decode(stream.bytes.numpy().tobytes(), levels)
-    except InputError:
-        raise
-    except (MemoryError, OverflowError, ValueError) as error:
-        problem = str(error)
-    if problem or _checksum(levels) != stream.checksum:
-        seen = problem or f"levels of checksum {_checksum(levels)}"
-        raise InputError(
-            f"the coded lines are truncated or altered: {seen}; expected {levels.size} levels of "
-            f"{stream.checksum}"
-        )
-    return torch.from_numpy(levels)
+    packed = stream.bytes.numpy().tobytes()
+    padded = bytearray(packed + bytes(SPAN // 8 - 1))
+    most = (LEVELS_AT_LEAST + LEVELS_PER_BYTE * len(packed)) // columns
+    code = _code(levels.size)
+    room = [
+        code.numbers(one) for one in (np.zeros((1, 1 + columns), np.int16), _sums(columns), _logarithms())
+    ]
+    tables = tuple(code.numbers(table) for table in (*_tree(), *_first_counts()))
+    why, read = code.read(code.bytes(padded), levels, most, *room, tables) if packed else (TOO_SHORT, 0)
+    if why == TOO_MANY:
+        check_work(most + 1, columns, len(packed))
+    checksum = _checksum(levels)
+    if why == NO_SYMBOL:
+        problem = "a level that int8 does not hold"
+    elif why == TOO_SHORT:
+        problem = f"{len(packed)} bytes are too few"
+    elif read < len(padded):
+        problem = f"{len(packed)} bytes, of which {len(padded) - read} are left over"
+    elif checksum != stream.checksum:
+        problem = f"levels of checksum {checksum}"
+    else:
+        return torch.from_numpy(levels)
+    raise InputError(
+        f"the coded lines are truncated or altered: {problem}; expected {levels.size} levels of "
+        f"{stream.checksum}"
+    )
 
 
 def check_claim(rows: int, columns: int) -> None:
-    """Refuse, before anything is made, more levels than the memory holds, or none.
+    """Refuse, before anything is allocated, an empty shape and more levels than the memory holds.
 
     Raises:
-        InputError: naming both.
+        InputError: naming both sizes.
     """
     if min(rows, columns) < 1 or (rows * LEVEL + COLUMN) * columns > free_memory():
         raise InputError(
@@ -148,10 +153,10 @@ def check_claim(rows: int, columns: int) -> None:
 
 
 def check_work(rows: int, columns: int, size: int) -> None:
-    """Refuse a stream that takes far longer to decode than its bytes are worth: zeros cost next to nothing.
+    """Refuse a short stream of very many zeros, which would take far too long to decode.
 
     Args:
-        rows: up to the last that is not 0. size: of the stream, bytes.
+        rows: up to the last that is not 0. size: bytes of the stream.
 
     Raises:
         InputError: naming the numbers.
@@ -161,6 +166,20 @@ def check_work(rows: int, columns: int, size: int) -> None:
             f"{rows} x {columns} levels in {size} bytes are next to nothing but zeros; "
             "expected more bytes per place"
         )
+
+
+def to_int8(levels: Tensor) -> tuple[Tensor, Tensor]:
+    """Levels as int8, and separately those that int8 does not hold, in their order.
+
+    Shape: (W,K) -> (W,K) int8, (E,) int32.
+    """
+    large = levels.abs() > 127
+    return torch.where(large, ESCAPE, levels).to(torch.int8), levels[large].to(torch.int32)
+
+
+def from_int8(small: Tensor, escapes: Tensor) -> Tensor:
+    """The inverse of `to_int8`, (W,K) int32."""
+    return small.to(torch.int32).masked_scatter(small == ESCAPE, escapes)
 
 
 def _numbers(levels: Tensor) -> Ints:
@@ -178,89 +197,45 @@ def _filled(levels: Ints) -> Ints:
     return levels[: int(filled[-1]) + 1 if len(filled) else 0]
 
 
-def _blocks(rows: int, columns: int) -> Iterator[tuple[int, int, tuple[Ints, Ints, int]]]:
-    """Rows [start, stop) at a time, and room for what `_near` sums up, which keeps that of the rows before.
-
-    The sums are those of each column and of all together, and the row that they begin with.
-    """
-    halo, step = min(REACH, rows), max(1, BLOCK // columns)
-    sums = np.zeros((halo + min(step, rows), columns), np.int32)
-    totals = np.zeros(len(sums), np.int64)
-    for start in range(0, rows, step):
-        yield start, min(start + step, rows), (sums, totals, start - halo)
-        sums[:halo], totals[:halo] = sums[-halo:], totals[-halo:]
-
-
 def _symbols(levels: Ints, code: _Code) -> Iterator[tuple[Ints, Ints, Ints]]:
-    """What is coded, a block of rows at a time: symbols, `_near`, signs two rows before, 0 to 2; (R,1+K)."""
+    """Blocks of symbols, each with the magnitudes near it and the sign two rows before (0 to 2)."""
     filled = _filled(levels)
-    for start, stop, sums in _blocks(*filled.shape):
-        shape = (stop - start, 1 + filled.shape[1])
-        symbols, near = np.full(shape, GOES_ON, np.int16), np.zeros(shape, np.int16)
-        np.add(filled[start:stop], ZERO, out=symbols[:, 1:], dtype=np.int16)
-        code.near(filled, start, near, *sums, _logarithms())
-        before = np.ones(shape, np.int8)
-        earlier = filled[max(start - 2, 0) : max(stop - 2, 0)]
-        before[len(before) - len(earlier) :, 1:] += np.sign(earlier)
-        yield symbols, near, before
-    if len(filled) < len(levels):
-        yield np.full((1, 1), ENDS, np.int16), np.zeros((1, 1), np.int16), np.zeros((1, 1), np.int8)
+    rows, columns = filled.shape
+    sums, step = _sums(columns), max(1, BLOCK // columns)
+    for start in range(0, rows, step):
+        block = filled[start : start + step]
+        symbols = np.full((len(block), 1 + columns), GOES_ON, np.int16)
+        near, before = np.zeros_like(symbols), np.ones(symbols.shape, np.int8)
+        np.add(block, ZERO, out=symbols[:, 1:], dtype=np.int16)
+        code.near(filled, start, near, sums, _logarithms())
+        earlier = filled[max(start - 2, 0) : max(start + len(block) - 2, 0)]
+        before[len(block) - len(earlier) :, 1:] += np.sign(earlier)
+        yield symbols.ravel(), near.ravel(), before.ravel()
+    if rows < len(levels):
+        yield np.array([ENDS], np.int16), np.zeros(1, np.int16), np.zeros(1, np.int8)
 
 
-def _decode(packed: bytes, levels: Ints) -> None:
-    """Fill in what `encode` packed; ValueError where there are more or fewer bytes."""
-    if not packed:
-        raise ValueError("no bytes")
-    rows, columns = levels.shape
-    code, near = _code(levels.size), np.zeros((1, 1 + columns), np.int16)
-    tables = [code.numbers(table) for table in (*_tree(), *_first_counts())]
-    most = (LEVELS_AT_LEAST + LEVELS_PER_BYTE * len(packed)) // columns
-    ahead = SPAN // 8
-    padded = bytearray(packed + bytes(ahead - 1))
-    why, value, span, read = GOES_ON, int.from_bytes(padded[:ahead], "big"), 1 << SPAN, ahead
-    for start, stop, sums in _blocks(rows, columns):
-        place = (start, stop, most, near, *sums, _logarithms())
-        why, value, span, read = code.read(code.bytes(padded), levels, *place, *tables, value, span, read)
-        if why != GOES_ON:
-            break
-    if why == TOO_MANY:
-        check_work(most + 1, columns, len(packed))
-    if why == NONE:
-        raise ValueError("a level that int8 does not hold")
-    if why == TOO_SHORT:
-        raise ValueError(f"{len(packed)} bytes are too few")
-    if read != len(padded):
-        raise ValueError(f"{len(packed)} bytes, of which {len(padded) - read} are left over")
+def _sums(columns: int) -> Ints:
+    """Room for the sums of magnitudes over all rows before a row: of all columns, then of each one."""
+    return np.zeros((RING, 1 + columns), np.int32)
 
 
-# The functions down to `_near` run as they stand, on lists, and compiled by numba, on arrays.
+# The functions from here to `_near` run as they are, on lists, and compiled by numba, on arrays.
 
 
 def _write(
-    begin: Any,
-    near: Any,
-    before: Any,
-    packed: Any,
-    steps: Any,
-    zeros: Any,
-    ones: Any,
-    low: int,
-    span: int,
-    size: int,
+    symbols: Any, near: Any, before: Any, packed: Any, tables: Any, low: int, span: int, size: int
 ) -> tuple[int, int, int]:
-    """Pack symbols behind the bytes that are there.
+    """Append symbols to the bytes; the interval's low and span, and the size, before and after.
 
     Args:
-        begin: of the symbols, where their paths do in `steps`, which is `_padded`. near, before: see
-            `_symbols`. packed: bytes, with room.
-        zeros, ones: how often each context had them. low, span: the interval. size: bytes that are there.
-
-    Returns:
-        low, span, size.
+        symbols, near, before: see `_symbols`. tables: `_paths`, and the counts of each context.
     """
-    for at, around, sign in zip(begin, near, before):  # noqa: B905, numba knows no `strict`
-        step = steps[at]
-        while step >= 0:
+    paths, zeros, ones = tables
+    for symbol, around, sign in zip(symbols, near, before):  # noqa: B905, numba knows no `strict`
+        for step in paths[symbol]:
+            if step < 0:
+                break
             context = step >> 1
             if context >= LENGTH:
                 context += around
@@ -278,13 +253,11 @@ def _write(
             while span < LEAST:
                 low, size = _shift(packed, low, size)
                 span <<= 8
-            at += 1
-            step = steps[at]
     return low, span, size
 
 
 def _shift(packed: Any, low: int, size: int) -> tuple[int, int]:
-    """Pack the first byte of the interval's lower end, carrying into those before it; what is left of it."""
+    """Append the first byte of the interval's lower end, and carry into the bytes before it."""
     byte = low >> BYTE
     if byte > 255:
         last = size - 1
@@ -297,47 +270,33 @@ def _shift(packed: Any, low: int, size: int) -> tuple[int, int]:
 
 
 def _read(
-    packed: Any,
-    levels: Ints,
-    start: int,
-    stop: int,
-    most: int,
-    near: Ints,
-    sums: Ints,
-    totals: Ints,
-    first: int,
-    logarithms: Ints,
-    contexts: Any,
-    after: Any,
-    zeros: Any,
-    ones: Any,
-    value: int,
-    span: int,
-    read: int,
-) -> tuple[int, int, int, int]:
-    """Fill in the levels of rows [start, stop).
+    packed: Any, levels: Ints, most: int, near: Any, sums: Any, logarithms: Any, tables: Any
+) -> tuple[int, int]:
+    """Fill in the levels, of at most so many rows that are not all 0.
 
     Args:
-        most: rows that the bytes are good for. near: (1,1+K), room. sums, totals, first: see `_blocks`.
-        contexts, after: see `_tree`. zeros, ones: how often each context had them. value, span: the bytes'
-            place in the interval. read: how many of them are.
+        near: room for one row. tables: `_tree` and the counts of each context.
 
     Returns:
-        `GOES_ON`, or why there are no more rows. value, span, read.
+        `GOES_ON`, `ENDS`, or why there are no more rows; how many bytes were read.
     """
-    for row in range(start, stop):
-        _near(levels, row, near, sums, totals, first, logarithms)
-        for f, around in enumerate(_listed(near[0])):
+    contexts, after, zeros, ones = tables
+    value, span, read = 0, 1 << SPAN, 0
+    for _ in range(SPAN // 8):
+        value = value << 8 | packed[read]
+        read += 1
+    for row in range(len(levels)):
+        _near(levels, row, near, sums, logarithms)
+        earlier = _listed(levels[row - 2 if row > 1 else row])
+        for f, around in enumerate(near[0]):
             node = 1 if f else 0
             while node >= 0:
                 context = contexts[node]
                 if context >= LENGTH:
                     context += around
                 elif context == SIGN:
-                    context += 1
-                    if row > 1:
-                        before = levels[row - 2, f - 1]
-                        context += int(before > 0) - int(before < 0)
+                    before = earlier[f - 1]
+                    context += 1 + int(before > 0) - int(before < 0)
                 zero, one = zeros[context], ones[context]
                 part = span // (zero + one) * zero
                 if value < part:
@@ -351,7 +310,7 @@ def _read(
                     node = after[2 * node + 1]
                 while span < LEAST:
                     if read == len(packed):
-                        return TOO_SHORT, value, span, read
+                        return TOO_SHORT, read
                     value = value << 8 | packed[read]
                     span <<= 8
                     read += 1
@@ -361,111 +320,84 @@ def _read(
             if symbol < GOES_ON:
                 levels[row, f - 1] = symbol - ZERO
             elif symbol > GOES_ON:
-                return symbol, value, span, read
+                return symbol, read
             elif row >= most:
-                return TOO_MANY, value, span, read
-    return GOES_ON, value, span, read
+                return TOO_MANY, read
+    return GOES_ON, read
 
 
 def _listed(numbers: Any) -> Any:
-    """What goes through them fastest."""
+    """The form whose elements Python reads fastest."""
     return numbers.tolist()
 
 
-def _reach(row: int) -> tuple[int, int]:
-    """How many rows before a row count for each of its columns, and for all together.
+def _near(levels: Ints, start: int, near: Any, sums: Any, logarithms: Any) -> None:
+    """The contexts of rows by the magnitudes near each level, into near[:,1:]; also adds the rows' sums."""
+    for i, found in enumerate(near):
+        row = start + i
+        now = sums[row % RING]
+        if row:
+            before, total = sums[(row - 1) % RING], 0
+            for f, level in enumerate(_listed(levels[row - 1])):
+                size = min(abs(0 + level), MOST)  # 0 + makes it int64 where compiled
+                now[1 + f] = before[1 + f] + size
+                total += size
+            now[0] = before[0] + total
+        far, close = min(max(row // 2, 16), REACH, row), min(max(row // 16, 2), 8, row)
+        then, last = sums[(row - far) % RING], sums[(row - min(row, 2)) % RING]
+        columns, far = len(now) - 1, max(far, 1)
+        mean = (now[0] - sums[(row - close) % RING][0] << 10) // (max(close, 1) * columns)
+        here = left = _column(now[1], then[1], last[1], far)
+        for f in range(1, 1 + columns):
+            g = min(f + 1, columns)
+            right = _column(now[g], then[g], last[g], far)
+            found[f] = _kind(left + 2 * here + right, mean, logarithms)
+            left, here = here, right
 
-    Convention: for a column half as many as there are, 16 to 128 of them, so that it reaches as far in
-        octaves everywhere; for all together, the last 8 or fewer.
-    """
-    return min(max(row // 2, 16), REACH, row), min(max(row // 16, 2), 8, row)
+
+def _column(now: Any, then: Any, last: Any, far: Any) -> Any:
+    """The mean magnitude over the last rows, in 256ths, with more weight on the last two."""
+    return ((now - then) << 8) // far + ((now - last) << 4)
 
 
-def _column(now: Any, then: Any, last: Any, reach: Any) -> Any:
-    """The mean magnitude over so many rows, in 256ths; the last two count for more. Numbers or arrays."""
-    return ((now - then) << 8) // reach + ((now - last) << 4)
+def _kind(wide: Any, mean: Any, logarithms: Any) -> Any:
+    """0 to `NEAR`, of the magnitudes near a level and the mean of the last rows."""
+    return (2 * logarithms[(wide >> 2) + 3] + logarithms[mean + 4]) // 9
 
 
-def _kind(wide: Any, row: Any, logarithms: Any) -> Any:
-    """0 to `NEAR`, of the mean of three columns, the middle one twice, and that of the row in 1024ths."""
-    return (2 * logarithms[(wide >> 2) + 3] + logarithms[row + 4]) // 9
-
-
-def _near(
-    levels: Ints, start: int, near: Ints, sums: Ints, totals: Ints, first: int, logarithms: Ints
-) -> None:
-    """How large the levels of rows may be by those of the rows before, 0 to `NEAR`, into (R,1+K).
-
-    Also fills in the sums of these rows; those of the rows before are there. See `_blocks`.
-    """
-    rows = np.arange(start, start + len(near))
-    at, end = start - first, start - first + len(near)
-    new = len(near) - (not start)  # before row 0 there is nothing
-    if new:
-        sizes = np.minimum(np.abs(levels[rows[-1] - new : rows[-1]], dtype=np.int16), MOST)
-        sums[end - new : end] = sizes.cumsum(0, dtype=np.int32) + sums[end - new - 1]
-        totals[at:end] = sums[at:end].sum(1)
-    far, close = _reaches()[:, np.minimum(rows, 2 * REACH)]
+def _near_arrays(levels: Ints, start: int, near: Ints, _: Ints, logarithms: Ints) -> None:
+    """`_near` by arrays, faster in Python."""
+    first, stop = max(start - REACH, 0), start + len(near)
+    sums = np.zeros((stop - first, levels.shape[1]), np.int32)  # over the rows from `first` on
+    np.minimum(np.abs(levels[first : stop - 1], dtype=np.int16), MOST).cumsum(0, out=sums[1:])
+    totals, rows = sums.sum(1), np.arange(start, stop)
+    far = np.minimum((rows // 2).clip(16, REACH), rows)
+    close = np.minimum((rows // 16).clip(2, 8), rows)
     here = rows - first
-    row = (totals[at:end] - totals[here - close] << 10) // (close.clip(1) * levels.shape[1])
-    now = sums[at:end]
-    column = _column(
-        now, sums.take(here - far, 0), sums.take(here - np.minimum(rows, 2), 0), far.clip(1)[:, None]
-    )
+    mean = (totals[here] - totals[here - close] << 10) // (close.clip(1) * levels.shape[1])
+    last = sums[here - np.minimum(rows, 2)]
+    column = _column(sums[here[0] :], sums[here - far], last, far.clip(1)[:, None].astype(np.int32))
     wide = 2 * column
     wide[:, 1:] += column[:, :-1]
     wide[:, :-1] += column[:, 1:]
     wide[:, 0] += column[:, 0]
     wide[:, -1] += column[:, -1]
-    near[:, 1:] = _kind(wide, row[:, None], logarithms)
-
-
-def _near_by_numbers(
-    levels: Ints, start: int, near: Ints, sums: Ints, totals: Ints, first: int, logarithms: Ints
-) -> None:
-    """`_near` where it is compiled: loops over numbers are several times as fast there as arrays."""
-    columns = levels.shape[1]
-    for i in range(len(near)):
-        row = start + i
-        now, total = sums[row - first], 0
-        if row:
-            before = sums[row - 1 - first]
-            for f in range(columns):
-                now[f] = before[f] + min(abs(np.int64(levels[row - 1, f])), MOST)
-                total += now[f]
-        totals[row - first] = total
-        far, close = _reach(row)
-        then, last = sums[row - far - first], sums[row - min(row, 2) - first]
-        mean = (total - totals[row - close - first] << 10) // (max(close, 1) * columns)
-        far = max(far, 1)
-        here = _column(now[0], then[0], last[0], far)
-        left = here
-        for f in range(columns):
-            g = min(f + 1, columns - 1)
-            right = _column(now[g], then[g], last[g], far)
-            near[i, 1 + f] = _kind(left + 2 * here + right, mean, logarithms)
-            left, here = here, right
+    near[:, 1:] = _kind(wide, mean[:, None], logarithms)
 
 
 @cache
 def _logarithms() -> Ints:
-    """8 log2 of 0 to 2^14, rounded down; by whole numbers, so that all machines find the same."""
+    """8 log2 of 0 to 2^14, rounded down, in integers."""
     return np.array([0, *((n**8).bit_length() - 1 for n in range(1, 2**14 + 1))], np.int16)
 
 
 @cache
-def _reaches() -> Ints:
-    """`_reach` of all rows but those that have that of the last one: (2,2*REACH+1)."""
-    return np.array([_reach(row) for row in range(2 * REACH + 1)], np.int32).T
+def _paths() -> Ints:
+    """The bits of each symbol as 2 * context + bit, then -1: (SYMBOLS,PATH).
 
-
-@cache
-def _paths() -> list[list[int]]:
-    """The bits of each symbol, as 2 * context + bit.
-
-    Signs and lengths have the first of their contexts; what is near tells which of them it is.
+    Signs and lengths have the first of their contexts.
     """
-    paths = []
+    paths = np.full((SYMBOLS, PATH), -1)
     for level in range(-ZERO, ZERO):
         size = abs(level)
         length = size.bit_length()
@@ -473,46 +405,37 @@ def _paths() -> list[list[int]]:
         if size:
             path.append((SIGN, int(level < 0)))
             path += [(BITS + (length - 1) * 8 + n, size >> n & 1) for n in reversed(range(length - 1))]
-        paths.append(path)
-    paths += [[(END, 0)], [(END, 1)]]
-    return [[2 * context + bit for context, bit in path] for path in paths]
-
-
-@cache
-def _padded() -> Ints:
-    """The paths, each with -1 behind it: (SYMBOLS,PATH)."""
-    return np.array([path + [-1] * (PATH - len(path)) for path in _paths()])
+        paths[level + ZERO, : len(path)] = [2 * context + bit for context, bit in path]
+    paths[GOES_ON, 0], paths[ENDS, 0] = 2 * END, 2 * END + 1
+    return paths
 
 
 @cache
 def _taken() -> tuple[Ints, NDArray[np.float64]]:
-    """The steps that there are, and whether each symbol takes them: (S,), (S,SYMBOLS)."""
-    steps = np.unique(_padded())[1:]
-    return steps, np.array([np.isin(steps, path) for path in _paths()]).T.astype(np.float64)
+    """All steps of the paths, and whether each symbol takes them: (S,), (S,SYMBOLS)."""
+    steps = np.unique(_paths())[1:]
+    return steps, (_paths() == steps[:, None, None]).any(2).astype(np.float64)
 
 
 @cache
 def _tree() -> tuple[Ints, Ints]:
-    """The paths as a tree: that of the bit of a row from node 0 on, that of levels from node 1 on.
+    """The paths as a tree: that of a row's first bit begins at node 0, that of levels at node 1.
 
     Returns:
-        The contexts of the nodes. At 2 * node + bit, the node that comes next, or -1 - symbol.
+        The context of each node. At 2 * node + bit, the next node, or -1 - symbol.
     """
-    contexts, after = [END, LENGTH], [0] * 4
-    nodes: dict[tuple[int, ...], int] = {}  # by the steps to them
-    for symbol, path in enumerate(_paths()):
-        node = int(symbol < GOES_ON)
-        for n, step in enumerate(path):
-            edge = 2 * node + (step & 1)
-            if n + 1 == len(path):
-                after[edge] = -1 - symbol
-                break
-            node = nodes.setdefault(tuple(path[: n + 1]), len(contexts))
-            if node == len(contexts):
-                contexts.append(path[n + 1] >> 1)
-                after += [-1 - NONE] * 2
-            after[edge] = node
-    return np.array(contexts), np.array(after)
+    nodes: dict[tuple[int, ...], int] = {(1,): 0, (0,): 1}  # by whether they begin a row, and the steps
+    contexts, after = np.zeros(2 * SYMBOLS, np.int64), np.full(4 * SYMBOLS, -1 - NO_SYMBOL)
+    for symbol, path in enumerate(_paths().tolist()):
+        key: tuple[int, ...] = (int(symbol >= GOES_ON),)
+        path = path[: path.index(-1)]
+        for step in path:
+            node = nodes[key]
+            key = (*key, step)
+            contexts[node] = step >> 1
+            more = len(key) <= len(path)
+            after[2 * node + (step & 1)] = nodes.setdefault(key, len(nodes)) if more else -1 - symbol
+    return contexts, after
 
 
 def _first_counts() -> tuple[Ints, Ints]:
@@ -521,16 +444,16 @@ def _first_counts() -> tuple[Ints, Ints]:
 
 
 class _Code(NamedTuple):
-    """The functions that take the time, and what they take arrays and bytes as."""
+    """The inner loops, and the form of arrays and bytes that they accept."""
 
     near: Callable[..., None]
     write: Callable[..., tuple[int, int, int]]
-    read: Callable[..., tuple[int, int, int, int]]
+    read: Callable[..., tuple[int, int]]
     numbers: Callable[[Ints], Any]
     bytes: Callable[[bytearray], Any]
 
 
-PLAIN = _Code(_near, _write, _read, lambda numbers: numbers.tolist(), lambda packed: packed)
+PLAIN = _Code(_near_arrays, _write, _read, lambda numbers: numbers.tolist(), lambda packed: packed)
 _coded = 0  # levels, by this process
 
 
@@ -543,44 +466,24 @@ def _code(levels: int) -> _Code:
 
 @cache
 def _compiled() -> _Code | None:
-    """The same functions compiled, or None where numba is not installed or does not work."""
-    levels, table = "int8[:,::1]", "int64[::1]"
-    place = f"int16[:,::1], int32[:,::1], {table}, int64, int16[::1]"
-    read = f"uint8[::1], {levels}, int64, int64, int64, {place}"
-    coder = f"{table}, {table}, int64, int64, int64"
+    """The loops compiled, or None if numba is missing or broken."""
+    table, levels = "int64[::1]", "int8[:,::1]"
+    near = "int16[:,::1], int32[:,::1], int16[::1]"
+    symbols = "int16[::1], int16[::1], int8[::1]"
+    paths, tree = f"Tuple((int64[:,::1], {table}, {table}))", f"UniTuple({table}, 4)"
     try:
         from numba.extending import overload, register_jitable
 
-        for function in (_shift, _reach, _column, _kind):
+        for function in (_shift, _near, _column, _kind):
             register_jitable(function)
         overload(_listed)(lambda numbers: lambda numbers: numbers)
-        overload(_near, strict=False)(  # its form has the types of arguments in its signature
-            lambda levels, start, near, sums, totals, first, logarithms: _near_by_numbers
-        )
         return _Code(
-            compiled(_near_by_numbers, f"void({levels}, int64, {place})"),
-            compiled(
-                _write,
-                f"UniTuple(int64, 3)(int16[::1], int16[::1], int8[::1], uint8[::1], {table}, {coder})",
-            ),
-            compiled(_read, f"UniTuple(int64, 4)({read}, {table}, {table}, {coder})"),
+            compiled(_near, f"void({levels}, int64, {near})"),
+            compiled(_write, f"UniTuple(int64, 3)({symbols}, uint8[::1], {paths}, int64, int64, int64)"),
+            compiled(_read, f"UniTuple(int64, 2)(uint8[::1], {levels}, int64, {near}, {tree})"),
             lambda numbers: numbers,
             lambda packed: np.frombuffer(packed, np.uint8),
         )
     except Exception as error:  # a broken compiler must not break what works without one
         log.info("levels are coded in Python, not by numba: %s", " ".join(str(error).split()))
         return None
-
-
-def to_int8(levels: Tensor) -> tuple[Tensor, Tensor]:
-    """Whole numbers as int8, and those that int8 does not hold, in their order.
-
-    Shape: (W,K) -> (W,K) int8, (E,) int32.
-    """
-    large = levels.abs() > 127
-    return torch.where(large, ESCAPE, levels).to(torch.int8), levels[large].to(torch.int32)
-
-
-def from_int8(small: Tensor, escapes: Tensor) -> Tensor:
-    """The inverse of `to_int8`, (W,K) int32."""
-    return small.to(torch.int32).masked_scatter(small == ESCAPE, escapes)

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dejavu_torch.maps import codec
-from dejavu_torch.maps.codec import coded_bytes, encode
+from dejavu_torch.maps.codec import Stream, coded_bytes, decode, encode
+from dejavu_torch.types import InputError
 
 
 @contextmanager
@@ -25,7 +26,7 @@ def coded_by(code: codec._Code) -> Iterator[None]:
 
 @given(st.integers(1, 700), st.integers(1, 12), st.integers(0, 400), st.integers(0, 2**32 - 1))
 def test_compiled_and_plain_are_one(rows: int, columns: int, spread: int, seed: int) -> None:
-    """What is near, the streams, and how a stream of anything ends."""
+    """Contexts, streams, and how an altered stream is refused."""
     fast = codec._compiled()
     assert fast is not None
     random = np.random.default_rng(seed)
@@ -43,12 +44,12 @@ def test_compiled_and_plain_are_one(rows: int, columns: int, spread: int, seed: 
             altered[seed // 8 % len(altered)] ^= 1 << seed % 8
             told.append([stream.bytes.tolist(), coded_bytes(torch.from_numpy(own)), stream.checksum])
             for packed in (altered, altered[: len(altered) // 2]):
-                found = np.zeros_like(own)
                 try:
-                    codec._decode(packed.tobytes(), found)
-                except ValueError as error:
+                    found = decode(Stream(torch.from_numpy(packed.copy()), stream.checksum), rows, columns)
+                except InputError as error:
                     told[-1].append(str(error))
-                told[-1].append(found.tolist())
+                else:
+                    told[-1].append(found.tolist())
     assert told[0] == told[1]
 
 
