@@ -51,7 +51,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "l1, sum": {"metric": "l1", "reduction": "sum"},
     "l2": {"metric": "l2"},
     "cosine, sum": {"metric": "cosine", "reduction": "sum"},
-    "callable": {"metric": lambda a, b: (a[:, None] - b).abs().amax(2)},
     "l1, temperature": {"temperature": 0.1},
 }
 

@@ -205,7 +205,7 @@ def _compact_stores(model: DejaVu, reference: Tensor, tolerance: int) -> dict[st
     one = "place" if len(model.map.positions) else "frame"
     apart, short = max(1, 2 * tolerance), as_int8(reference)
     between, spaced, keys = interpolated(short, model.map.summary().route_bytes)
-    metric = "l2" if model.map.metric == "l2" else "cosine"
+    metric: Metric = "l2" if model.map.metric == "l2" else "cosine"
 
     def store(name: str, stored: Tensor, numbers: int, k: int, apart: int = 1) -> Store:
         return Store(name, stored, metric, numbers * dimension + fixed, k, fixed, apart)

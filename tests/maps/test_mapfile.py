@@ -207,11 +207,6 @@ def test_features_of_other_settings_are_refused(path: Path) -> None:
         DejaVu.load(path, HOG(cell=8))
 
 
-def test_a_callable_metric_counts_its_bytes(path: Path) -> None:
-    model = template_model(periods=WINDOW, metric=torch.cdist).learn(waves())
-    assert model.summary().map_bytes == model.summary().map_bytes > 0
-
-
 def test_float64_templates_stay_float64(path: Path) -> None:
     model = template_model(periods=WINDOW).learn(waves().double() / 3)
     model.save(path)
@@ -295,8 +290,6 @@ def test_where_a_map_cannot_be_written(tmp_path: Path) -> None:
 def test_what_cannot_be_saved(path: Path) -> None:
     with refused("no map yet", "learn"):
         DejaVu().save(path)
-    with refused("callable metric", "expected a metric by name"):
-        template_model(periods=WINDOW, metric=lambda q, t: torch.cdist(q, t, 1)).learn(waves()).save(path)
     assert not path.exists()
 
 
