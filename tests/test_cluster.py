@@ -17,11 +17,6 @@ import numpy as np
 import pytest
 import torch
 from command_line import fails, frames, run, write_images
-from dejavu_torch.cluster.learning import code_on
-from dejavu_torch.cluster.searching import ClusterSearcher, _map_of, _parts
-from dejavu_torch.cluster.session import Cluster
-from dejavu_torch.streaming import coder, sample
-from dejavu_torch.streaming.work import WorkFolder
 from helpers import Fixed, Stream, refused, template_model
 from torch import Tensor, nn
 
