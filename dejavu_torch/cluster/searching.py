@@ -14,16 +14,7 @@ from dejavu_torch.cluster.session import RETRIES, Cluster, error_line
 from dejavu_torch.maps.merged import MergedMap
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral import CodedChunk, SpectralMap
-from dejavu_torch.recognition.search import (
-    SCORES_AT_ONCE,
-    Best,
-    Search,
-    Searched,
-    Searcher,
-    improved,
-    merged,
-    none_yet,
-)
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, Best, empty_topk, merge_topk, with_block
 from dejavu_torch.types import InputError
 
 
@@ -47,14 +38,14 @@ class Part(NamedTuple):
         return sum(chunk.places for chunk in self.chunks)
 
 
-class ClusterSearcher(Searcher):
-    """As `Searcher` by a scan, parts of the map being decoded and scored by one worker each.
+class ClusterSearcher:
+    """As `search`, parts of the map being decoded and scored by one worker each.
 
     Args:
         cluster: its workers hold the parts; one that dies is started again. route: a spectral map, or one
             merged of several.
 
-    Shape: queries (Q,K), n -> Best of (Q,n).
+    Shape: queries (Q,K), n -> (Q,n) scores and places.
 
     Convention: scores are those of a scan here, to the bit, since parts begin where its blocks do; so are the
         places, ties included.
@@ -64,7 +55,6 @@ class ClusterSearcher(Searcher):
     """
 
     def __init__(self, cluster: Cluster, route: PlaceMap) -> None:
-        super().__init__(route, "scan")
         self.cluster = cluster
         self.maps = _maps(route)
         sizes = [0] * cluster.workers
@@ -81,19 +71,10 @@ class ClusterSearcher(Searcher):
         actor = ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Worker)
         self.sent = [[ray.put(parts)] for parts in dealt if parts]
         self.actors = [actor.remote() for _ in self.sent]
-        self.told = Searched("scan", chunks=sum(len(one.chunks) for one in self.maps))
-
-    def fits(self, route: PlaceMap, method: Search) -> bool:
-        return route is self.route
-
-    def pays(self, n: int) -> bool:
-        return True  # all scores would be made here
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, n: int) -> Best:
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
-        n = min(n, self.route.places)
-        self.told = self.told._replace(queries=self.told.queries + len(queries))
         found = []
         longest = max(one.block_places for one in self.maps)
         for some in queries.split(max(1, SCORES_AT_ONCE // longest)):
@@ -105,9 +86,12 @@ class ClusterSearcher(Searcher):
             except self.cluster.ray.exceptions.RayError as error:
                 seen = f"a worker died with its part of the map ({error_line(error)})"
                 raise InputError(f"{seen}; expected workers that live, and memory for it") from error
-            parts = [Best(*(torch.from_numpy(column.copy()) for column in one)) for one in answers]
-            found.append(reduce(merged, parts))
-        return Best(*(torch.cat(column) for column in zip(*found, strict=True)))
+            parts = (
+                (torch.from_numpy(score.copy()), torch.from_numpy(place.copy())) for score, place in answers
+            )
+            found.append(reduce(merge_topk, parts))
+        score, place = map(torch.cat, zip(*found, strict=True))
+        return score, place
 
 
 class _Worker:
@@ -123,7 +107,7 @@ class _Worker:
 
     @torch.no_grad()
     def best(self, sent: list[Any], queries: Any, n: int, rebuild: list[bool]) -> tuple[Any, Any]:
-        """The n best places on the parts that were sent, the same ones each time; see `Best`.
+        """The n best places on the parts that were sent, the same ones each time: scores and places.
 
         Args:
             rebuild: of each map, see `SpectralMap.score_blocks`.
@@ -133,11 +117,11 @@ class _Worker:
 
             self.parts = [(number, part.start, _map_of(part)) for number, part in ray.get(sent[0])]
         some = torch.from_numpy(queries.copy())
-        found = none_yet(some, n)
+        found = empty_topk(some, n)
         for number, first, route in self.parts:
             for start, scores in route.score_blocks(some, rebuild=rebuild[number]):
-                found = improved(found, scores, first + start)
-        return found.score.numpy(), found.index.numpy()
+                found = with_block(found, scores, first + start)
+        return found[0].numpy(), found[1].numpy()
 
 
 def _map_of(part: Part) -> SpectralMap:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import accumulate, tee
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -14,7 +14,7 @@ from dejavu_torch.maps.place_map import EXTRA, Mapper, PlaceMap, Route
 from dejavu_torch.maps.schema import checked
 from dejavu_torch.maps.spectral import SpectralMap, SpectralState
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError
 
 
 class MergedState(NamedTuple):
@@ -126,15 +126,6 @@ class MergedMap(PlaceMap):
     @property
     def block_places(self) -> int:
         return max((part.block_places for part in self._parts), default=1)
-
-    def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
-        """See `PlaceMap`: along trajectories, route by route."""
-        if not sequence.shifts:
-            yield from super().sequences(batches, sequence)
-            return
-        each = zip(self._parts, tee(batches, len(self.parts)), strict=True)  # in step: a batch is held
-        for found in zip(*(part.sequences(one, sequence) for part, one in each), strict=True):
-            yield torch.cat(found, 1)
 
     def settings(self) -> dict[str, Any]:
         return {}

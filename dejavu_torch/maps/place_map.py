@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.positions import borders, count_places, look_up, place_of, shown_frames
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
 
@@ -111,13 +111,6 @@ class PlaceMap(nn.Module, ABC):
         Convention: what the minimum of `scores` is, the lowest place of equal scores; no gradient.
         """
         return None
-
-    def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
-        """Scores of consecutive queries together, from batches (B,D) of them: (B,N) each.
-
-        Convention: what `sequence` gives of `scores`; a kind of map may have a shorter way there.
-        """
-        return sequence.follow(batches, self)
 
     def extend(self, features: Tensor) -> None:
         """Add the places of (n,D) features behind the last one.

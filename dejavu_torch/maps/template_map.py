@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from functools import reduce
 from itertools import accumulate, pairwise
@@ -17,11 +17,10 @@ from dejavu_torch.maps.layer_search import LayerSearch
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.summary import MapSummary, summarise
 from dejavu_torch.maps.templates import PhaseTemplates
-from dejavu_torch.maps.trajectories import LayerSums
 from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel
+from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 Reduction = Literal["mean", "sum"]
 TRAINABLE = ("templates", "weights")
@@ -359,20 +358,6 @@ class TemplateMap(PlaceMap):
         found = [search.lowest(self.distances(part)) for part in queries.split(search.at_once)]
         scores, places = zip(*found, strict=True)
         return torch.cat(scores), torch.cat(places)
-
-    def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
-        """See `PlaceMap`; mean scores along trajectories come from `LayerSums` where that is less work."""
-        sums = LayerSums(self, sequence) if sequence.shifts and self.temperature is None else None
-        if sums is None or not sums.worth:
-            yield from super().sequences(batches, sequence)
-            return
-        kept = len(sequence.shifts[0]) - 1
-        rows = [block.new_zeros(0, len(block)) for block in self.blocks()]
-        for queries in batches:
-            ahead = len(rows[0])
-            rows = [torch.cat(pair) for pair in zip(rows, self.distances(queries), strict=True)]
-            yield sums.scores(rows, ahead)
-            rows = [row[max(0, len(row) - kept) :] for row in rows]
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
         """Make parameters of the templates, of the weights, or of both, until `freeze`.
