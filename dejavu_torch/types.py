@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -198,45 +199,56 @@ class FrequencyLayer:
 Plan = tuple[FrequencyLayer, ...]
 
 
-class _Reported(NamedTuple):
+class _Columns(NamedTuple):
     index: Tensor  # type: ignore[assignment]  # the field shadows tuple.index
     score: Tensor
     accepted: Tensor
 
 
-class Match(_Reported):
+class Match(_Columns):
     """Where each query was found (eq. 5) and whether to believe it (eq. 6): index, score, accepted.
 
-    index: (Q,) int64, the reported place, -1 where no place has a finite score.
-    score: (Q,) float, the lowest S; lower is better, +inf where nothing covers.
-    accepted: (Q,) bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
-    probability: (Q,) float64, of being right, where the map is calibrated; else None. It goes along with the
-        three, but is none of the tuple's.
+    index: (Q,) int64, the reported place, -1 where no place has a finite score; (Q,k) candidates, best first.
+    score: float, the lowest S; lower is better, +inf where nothing covers.
+    accepted: bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
+    probability: float64, of being right, where the map is calibrated, else None; of candidates only the first
+        has one, the others NaN. sequences: by T, the matches (Q,) by sequences of T queries, where wanted.
+        Both are outside the tuple.
     """
 
     probability: Tensor | None = None
+    sequences: Mapping[int, Match] = MappingProxyType({})
 
-    def with_probability(self, probability: Tensor | None) -> Match:
-        """The same with other probabilities."""
+    def with_probability(
+        self, probability: Tensor | None, sequences: Mapping[int, Match] | None = None
+    ) -> Match:
+        """The same with another probability, and other sequences unless None."""
         match = Match(*self)
         match.probability = probability
+        match.sequences = self.sequences if sequences is None else sequences
         return match
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
-        """The same of every column."""
-        sure = None if self.probability is None else change(self.probability)
-        return Match(*map(change, self)).with_probability(sure)
+        """The same change of every column; `sequences` stay."""
+        probability = None if self.probability is None else change(self.probability)
+        return Match(*map(change, self)).with_probability(probability, self.sequences)
+
+    def renumbered(self, place: Callable[[Tensor], Tensor]) -> Match:
+        """Places by other numbers, in `sequences` too; -1 must stay."""
+        sequences = {T: match.renumbered(place) for T, match in self.sequences.items()}
+        return self._replace(index=place(self.index)).with_probability(self.probability, sequences)
 
     @staticmethod
     def joined(parts: Iterable[Match]) -> Match:
-        """Matches of queries one behind the other as one."""
+        """Concatenate matches of consecutive queries."""
         parts = list(parts)
-        sure = [part.probability for part in parts if part.probability is not None]
-        match = Match(*map(torch.cat, zip(*parts, strict=True)))
-        return match.with_probability(torch.cat(sure) if len(sure) == len(parts) else None)
+        known = [part.probability for part in parts if part.probability is not None]
+        probability = torch.cat(known) if len(known) == len(parts) else None
+        sequences = {T: Match.joined(part.sequences[T] for part in parts) for T in parts[0].sequences}
+        return Match(*map(torch.cat, zip(*parts, strict=True))).with_probability(probability, sequences)
 
     def _replace(self, **changes: Tensor) -> Match:
-        return Match(*super()._replace(**changes)).with_probability(self.probability)
+        return Match(*super()._replace(**changes)).with_probability(self.probability, self.sequences)
 
 
 class Training(NamedTuple):
@@ -262,53 +274,38 @@ class GroundTruth(NamedTuple):
     ignored: Tensor
 
 
-class Scorer(Protocol):
-    """The part of a map that a `SequenceModel` uses."""
-
-    places: int
-
-    def scores(self, queries: Tensor) -> Tensor:
-        """Scores of all places: (Q,D) -> (Q,N), lower is better."""
-
-    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
-        """Scores of the places [start, stop): (Q,D) -> (Q,stop - start)."""
-
-
 class SequenceModel(nn.Module, ABC):
     """Scores of places from consecutive queries, not from one: what `sequence` of `DejaVu.localize` takes.
 
-    Convention: causal; the score of a query tells of the place of that query. Memory does not grow with the
+    Convention: causal; the score of a query is for the place of that query. Memory does not grow with the
     queries.
     """
 
-    likely: float | None = None  # a score below it is more likely right than not, where scores tell that
-
-    @property
-    def shifts(self) -> tuple[tuple[int, ...], ...]:
-        """The trajectories, of a model whose score is the best mean along some: a map may add them up itself.
-
-        Of each trajectory, how many places it lies behind its end 0, 1, .., T - 1 queries before the latest.
-        () for a model that scores otherwise.
-        """
-        return ()
+    likely: float | None = None  # a score below it is more likely right than not, where scores say that
 
     @abstractmethod
+    def start(self, places: int, fixed: bool = False) -> Tensor:
+        """The state before the first query.
+
+        Args:
+            fixed: of the shape that it keeps, as an exported graph needs.
+        """
+
+    @abstractmethod
+    def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+        """Scores (B,N) of the next queries, one or more, and the state -> scores (B,N) and the next state.
+
+        Args:
+            firsts: the first place of each route of the map.
+        """
+
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Scores of batches (B,N) that come one behind the other, from those of single queries."""
-
-    def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
-        """Scores of batches of descriptors (B,D) that come one behind the other: (B,N) each.
-
-        A subclass that needs no scores of most places does not ask for them.
-        """
-        return self.stream(map(route.scores, batches))
-
-    def best(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[tuple[Tensor, Tensor]] | None:
-        """What is best by the scores of `follow`, where that takes less than scores of all places, else None.
-
-        Shape: batches (B,D) -> (B,) scores and (B,) int64 places, -1 for none, each.
-        """
-        return None
+        """`step` over consecutive batches (B,N); no gradient passes from one to the next."""
+        state = None
+        for scores in batches:
+            state = self.start(scores.shape[1]).to(scores) if state is None else state
+            found, state = self.step(scores, state.detach())
+            yield found
 
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:

@@ -322,13 +322,28 @@ class SpectralMap(PlaceMap):
         names = [one.name for one in self._routes]
         if name not in names:
             raise InputError(f"there is no route {name!r}; expected one of {', '.join(names)}")
-        r, chunks, frames, places = names.index(name), 0, 0, 0
-        for one, route in zip(self._routes[:r], self.routes[:r], strict=True):
-            chunks, frames, places = chunks + one.chunks, frames + one.frames, places + route.places
-        made = SpectralMap(self.means[r : r + 1], **self.settings())
-        made.extend(self.coded()[chunks : chunks + self._routes[r].chunks])
-        made.positions = self.positions[frames : frames + self._routes[r].frames]
-        made.count_visits(self.visit_counts[places : places + made.places])
+        r = names.index(name)
+        first = sum(one.chunks for one in self._routes[:r])
+        made = self.between(first, first + self._routes[r].chunks)
+        start, frame = self.chunks[first][0], sum(one.frames for one in self._routes[:r])
+        made._routes = ()
+        made.positions = self.positions[frame : frame + self._routes[r].frames]
+        made.count_visits(self.visit_counts[start : start + made.places])
+        made._check_norms()
+        return made
+
+    def between(self, first: int, last: int) -> SpectralMap:
+        """The chunks [first, last) as a map, whose places score as in this one."""
+        ends = [0, *torch.tensor([one.chunks for one in self._routes]).cumsum(0).tolist()]
+        kept = {
+            r: min(stop, last) - max(start, first)
+            for r, (start, stop) in enumerate(pairwise(ends))
+            if start < last and stop > first
+        }
+        made = SpectralMap(self.means[[*kept] or [0]], **self.settings())
+        made._routes = tuple(RouteState(self._routes[r].name, count, 0) for r, count in kept.items())
+        made.extend(self.coded()[first:last])
+        made.min_norm = self.min_norm
         return made
 
     @property
