@@ -15,11 +15,11 @@ from dejavu_torch.data.names import names_of
 from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.features.extract import feature_batches
 from dejavu_torch.features.views import Views
-from dejavu_torch.maps.mapfile import checksums, digests
+from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.merged import MergedMap, MergedMapper
-from dejavu_torch.maps.recipe import difference, recipe_of
 from dejavu_torch.maps.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
-from dejavu_torch.model import REGISTRY, DejaVu, check_sizes, shown_by
+from dejavu_torch.model import DejaVu, check_sizes, shown_by
+from dejavu_torch.model_file import difference, recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.streaming.coder import Made, code_here, with_visits
 from dejavu_torch.streaming.work import WorkFolder, all_chunks
@@ -335,7 +335,7 @@ def _unlike(first: DejaVu, other: DejaVu) -> str:
             return f"the one {has[0]}, the other {has[1]}; expected the same"
         if one is None:
             continue
-        stored, given = recipe_of(one, REGISTRY), recipe_of(two, REGISTRY)
+        stored, given = recipe_of(one), recipe_of(two)
         if stored != given:
             return f"their {what} differ: {difference(stored, given)}"
         if not _same_tensors(one, two):

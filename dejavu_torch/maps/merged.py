@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.files import LARGEST
+from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.place_map import EXTRA, Mapper, PlaceMap, Route
-from dejavu_torch.maps.schema import checked
 from dejavu_torch.maps.spectral import SpectralMap, SpectralState
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError, SequenceModel

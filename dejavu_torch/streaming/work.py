@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.data.output import PREFIX, make_output_folder, remove_empty_folders, whole_file
 from dejavu_torch.maps.codec import Stream
-from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.spectral import CodedChunk
 from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here
 from dejavu_torch.types import InputError, Traverse

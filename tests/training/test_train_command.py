@@ -24,7 +24,7 @@ from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.maps.mapfile import read_map
+from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral import SpectralMap
 from dejavu_torch.maps.summary import describe
 
