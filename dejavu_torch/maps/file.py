@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import blake2b
+from inspect import formatannotation
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
@@ -25,13 +26,6 @@ ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
 HEADER = "header"  # the digest that is of no tensor
 SHOWN = 60  # characters of a value in a message
-SCALARS = {
-    int: "a whole number below 2^53",
-    float: "a finite number",
-    str: "a text",
-    bool: "true or false",
-    type(None): "null",
-}
 
 
 class Contents(NamedTuple):
@@ -162,8 +156,10 @@ def checked(value: Any, kind: Any, where: str) -> Any:
 
     Args:
         kind: int, float, str, bool, None, Any, a Literal, a union, a sequence or mapping of these, or a
-            NamedTuple, for a mapping with exactly its fields. A module is a mapping, a callable a text.
+            NamedTuple, for a mapping with exactly its fields. A module is a mapping.
         where: names the value in messages.
+
+    Convention: numbers are finite, whole ones below 2^53.
 
     Raises:
         InputError: naming what is of another type.
@@ -173,7 +169,7 @@ def checked(value: Any, kind: Any, where: str) -> Any:
         (4, 4)
         >>> checked("4", int | None, "block")
         Traceback (most recent call last):
-        dejavu_torch.types.InputError: block is '4'; expected a whole number below 2^53 or null
+        dejavu_torch.types.InputError: block is '4'; expected int | None
     """
     origin, inner = get_origin(kind) or kind, get_args(kind)
     if hasattr(kind, "_fields"):
@@ -196,39 +192,21 @@ def checked(value: Any, kind: Any, where: str) -> Any:
             return items if origin is list else tuple(items)
     elif _fits(value, origin, inner):
         return value
-    raise InputError(f"{where} is {repr(value)[:SHOWN]}; expected {_name(kind)}")
+    limit = ", finite and below 2^53" if isinstance(value, int | float) else ""
+    raise InputError(f"{where} is {repr(value)[:SHOWN]}; expected {formatannotation(kind)}{limit}")
 
 
 def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
     """Whether a value is of a type other than a union, a sequence or a NamedTuple."""
-    if origin is Any:
-        return True
     if origin is Literal:
         return any(type(value) is type(one) and value == one for one in inner)
-    if origin in (int, float):
-        numbers = (int,) if origin is int else (int, float)
-        return type(value) in numbers and math.isfinite(value) and (origin is float or abs(value) < LARGEST)
-    if origin is Callable:
-        return isinstance(value, str)
-    if origin in SCALARS or origin is None:
+    if origin is int:
+        return type(value) is int and abs(value) < LARGEST
+    if origin is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    if origin in (str, bool, None, type(None)):
         return type(value) is (origin or type(None))
-    return isinstance(value, dict)
-
-
-def _name(kind: Any) -> str:
-    """A type in words."""
-    inner = get_args(kind)
-    if get_origin(kind) is Literal:
-        return " or ".join(map(repr, inner))
-    if get_origin(kind) in (Union, types.UnionType):
-        return " or ".join(map(_name, inner))
-    if get_origin(kind) in (tuple, list, Sequence):
-        return (
-            f"a list of {len(inner)}"
-            if len(inner) > 1 and ... not in inner
-            else f"a list of {_name(inner[0])}"
-        )
-    return SCALARS.get(kind, "a mapping")
+    return origin is Any or isinstance(value, dict)
 
 
 def checked_fields(value: Any, kinds: Mapping[str, Any], where: str) -> dict[str, Any]:
