@@ -25,11 +25,11 @@ from dejavu_torch.learning import (
     positions_of,
     with_visits,
 )
-from dejavu_torch.maps.mapfile import checksums, digests
-from dejavu_torch.maps.recipe import difference, recipe_of
+from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
-from dejavu_torch.model import REGISTRY, DejaVu
+from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import difference, recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.types import InputError, Traverse
 
@@ -381,7 +381,7 @@ def _unlike(first: DejaVu, other: DejaVu) -> str:
             return f"the one {has[0]}, the other {has[1]}; expected the same"
         if one is None:
             continue
-        stored, given = recipe_of(one, REGISTRY), recipe_of(two, REGISTRY)
+        stored, given = recipe_of(one), recipe_of(two)
         if stored != given:
             return f"their {what} differ: {difference(stored, given)}"
         if not _same_tensors(one, two):

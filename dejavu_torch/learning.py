@@ -19,7 +19,7 @@ from dejavu_torch.features.extract import check_alone, feature_batches, warn_of_
 from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
-from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap

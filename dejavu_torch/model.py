@@ -6,9 +6,8 @@ import inspect
 import logging
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_type_hints
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -17,36 +16,36 @@ from torch.nn.parameter import is_lazy
 from dejavu_torch import learning
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import at_size
-from dejavu_torch.data.names import decode_names, encode_names, names_of
-from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.data.names import names_of
 from dejavu_torch.features.extract import check_queries, features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
-from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
 from dejavu_torch.learning import Checkpoint, Code, Describer, code_here
-from dejavu_torch.maps.mapfile import HEADER, checksums, digests, map_size, read_map, write_map
+from dejavu_torch.maps.file import HEADER, checksums, digests
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
-from dejavu_torch.maps.recipe import Recipe, Registry, build, difference, recipe_of, with_parts
-from dejavu_torch.maps.schema import checked, checked_fields
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.maps.weights import BITS, is_rounded, packed, round_weights, unpacked
+from dejavu_torch.maps.weights import BITS, round_weights
+from dejavu_torch.model_file import (
+    CLASSES,
+    model_state,
+    read_model,
+    recipes_of,
+    summary_of,
+    take_state,
+    weights_of,
+    write_model,
+)
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
-from dejavu_torch.periods.finder import ForeignPeriods
-from dejavu_torch.periods.imposed import ImposedPeriods
-from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.recognition.localizer import Localizer, Matcher, Matching
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Best, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
-from dejavu_torch.text import one_line
 from dejavu_torch.types import (
     BATCH_NUMBERS,
     FRAME_NUMBERS,
@@ -62,32 +61,6 @@ log = logging.getLogger("dejavu_torch")
 
 ROWS = 4096  # descriptors on the device at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
-
-NO_MAP = "a descriptor without a map; expected a map, as `dejavu learn SOURCE --descriptor FILE` makes of it"
-
-# the classes that a map file may name; any other has to be given by the caller
-CLASSES: tuple[type[nn.Module], ...] = (
-    Preprocess,
-    HOG,
-    PatchPixels,
-    SmallCNN,
-    Embedding,
-    Whitening,
-    SpectrogramAnalysis,
-    ImposedPeriods,
-    TemplateMapper,
-    SpectralMapper,
-    GroundOdometry,
-)
-REGISTRY: Registry = {cls.__name__: cls for cls in CLASSES}
-KINDS = [cls.kind for cls in CLASSES if issubclass(cls, Mapper)]
-PARTS: dict[str, type[nn.Module]] = {
-    "preprocess": Preprocess,
-    "features": nn.Module,
-    "whitening": Whitening,
-    "mapper": Mapper,
-    "velocity": GroundOdometry,
-}
 
 
 class DejaVu(nn.Module):
@@ -276,13 +249,13 @@ class DejaVu(nn.Module):
         self, traverse: Traverse, second: Views | None = None, visits: Views | None = None
     ) -> dict[str, str]:
         """What the chunks of a traverse are made of, as digests: see `Checkpoint`."""
-        parts = {name: getattr(self, name) for name in PARTS}
-        header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
+        header = recipes_of(self)
         header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in self.modules()})))
         header |= {"batch_size": self.describer.batch_size, "sample": learning.SAMPLE}
         header |= {"version": __version__, "torch": torch.__version__}
         fixed = self.whitening is not None and self.whitening.fixed
-        sums = checksums(self._weights("features") | (self._weights("whitening") if fixed else {}), header)
+        weights = weights_of(self, "features") | (weights_of(self, "whitening") if fixed else {})
+        sums = checksums(weights, header)
         sources = {
             name: views and [views.traverse.identity(), views.places.tolist()]
             for name, views in (("second", second), ("visits", visits))
@@ -677,13 +650,7 @@ class DejaVu(nn.Module):
         """
         if self.trained is None:
             self._require_map()
-        self._check_rounded()
-        if callable(getattr(self.mapper, "metric", None)):
-            raise InputError("a map with a callable metric cannot be saved; expected a metric by name")
-        tensors, header = self._file()
-        checked(header, Header, "the model")  # what is written can be read
-        checked(header["map"], self.map.state, "the map")
-        write_map(Path(path), tensors, header)
+        write_model(Path(path), self)
 
     @classmethod
     def load(cls, path: str | Path, features: nn.Module | None = None) -> DejaVu:
@@ -696,29 +663,7 @@ class DejaVu(nn.Module):
         Raises:
             InputError: missing, truncated, foreign or newer file, or other features than the map's.
         """
-        with opened(Path(path)) as (tensors, header):
-            parts, weights = _build_parts(header, features, tensors), unpacked(tensors, "features.")
-            settings = {name: getattr(header, name) for name in ("threshold", "precision", "batch_size")}
-            model = cls(**parts, **settings)
-            for name in ("frame_shape", "step", "trained", "calibration"):
-                setattr(model, name, getattr(header, name))
-            own = {name: weights.pop(name) for name in tensors if name.startswith("map.")}
-            if own or header.map.get("places") != 0:
-                _load_map(model.map, own, header)
-            else:
-                checked(header.map, model.map.state, "its map")
-                model.map.set_extra_state(header.map)
-            check_types(weights, model.features)
-            loaded = model.load_state_dict(weights, strict=False)
-            missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
-            if missing or loaded.unexpected_keys:
-                raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
-            model.weight_bits = 8 if len(weights) + len(own) < len(tensors) else 32
-            model._check_rounded()
-            if header.names is not None:
-                model.frame_names = decode_names(header.names, len(model.map.positions) or model.map.places)
-            model.check()
-        return model.eval()
+        return read_model(cls, Path(path), features).eval()
 
     def check(self) -> None:
         """Refuse parts of a model that do not fit together.
@@ -741,56 +686,13 @@ class DejaVu(nn.Module):
         ):
             raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 
-    def _check_rounded(self) -> None:
-        if self.weight_bits == 8 and not is_rounded(self.features):
-            raise InputError(
-                f"weights of {type(self.features).__name__} are not rounded to 8 bits; expected all of them, "
-                "and none changed since: a DejaVu that is made of them with weight_bits=8"
-            )
-
-    def _file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        parts = {name: getattr(self, name) for name in PARTS}
-        header = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
-        header |= {name: getattr(self, name) for name in ("threshold", "precision", "batch_size")}
-        header |= self.get_extra_state()
-        header["map"] = self.map.get_extra_state()
-        packed = self.map.packed() if self.map.places else {}
-        tensors = {f"map.{name}": tensor for name, tensor in packed.items()}
-        return tensors | self._weights("features") | self._weights("whitening"), header
-
-    def _weights(self, part: str) -> dict[str, Tensor]:
-        module = getattr(self, part)
-        weights = {} if module is None else module.state_dict()
-        if part == "features" and self.weight_bits == 8:
-            weights = packed(module)
-        return {f"{part}.{name}": tensor for name, tensor in weights.items() if isinstance(tensor, Tensor)}
-
     def summary(self) -> MapSummary:
         """What the map can tell apart, and the bytes of its file by part."""
-        tensors, header = self._file()
-        fixed = {
-            name: sum(tensor.nbytes for tensor in self._weights(part).values())
-            for name, part in (("backbone", "features"), ("whitening", "whitening"))
-        }
-        fixed["names"] = len(encode_names(self.frame_names)) if self.frame_names else 0
-        summary = self.map.summary()
-        rest = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
-        return summary.with_parts(fixed=fixed | {"header": rest})
+        return summary_of(self)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the state_dict holds beside the tensors and the map's own state."""
-        trained = self.trained and self.trained._asdict()
-        names = encode_names(self.frame_names) if self.frame_names else None
-        calibration = self.calibration and {
-            name: platt and platt._asdict() for name, platt in self.calibration._asdict().items()
-        }
-        return {
-            "frame_shape": self.frame_shape,
-            "step": self.step,
-            "trained": trained,
-            "names": names,
-            "calibration": calibration,
-        }
+        return model_state(self)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` gave.
@@ -798,10 +700,7 @@ class DejaVu(nn.Module):
         Raises:
             InputError: a state of other entries, or of other types.
         """
-        told = checked_fields(state, STATE_TYPES, "the model's state")
-        for name in ("frame_shape", "step", "trained", "calibration"):
-            setattr(self, name, told[name])
-        self.frame_names = [] if told["names"] is None else decode_names(told["names"])
+        take_state(self, state)
 
     def _require_map(self) -> None:
         if not self.map.places and self.trained is not None:
@@ -836,136 +735,3 @@ def _code_of(cls: type[nn.Module]) -> str:
         return inspect.getsource(cls)
     except (OSError, TypeError):
         return ""
-
-
-class Header(NamedTuple):
-    """What the header of a map file says: the arguments of DejaVu, each part as a recipe, and its state.
-
-    map: the state of the map, by whose `kind` it is checked further; see `PlaceMap.state`.
-    """
-
-    preprocess: Recipe
-    features: Recipe
-    whitening: Recipe | None
-    mapper: Recipe
-    velocity: Recipe | None
-    threshold: float | None
-    precision: float | None
-    batch_size: int
-    frame_shape: tuple[int, ...] | None
-    step: float | None
-    trained: Training | None
-    names: str | None
-    calibration: Calibration | None
-    map: dict[str, Any]
-
-
-HEADER_TYPES = get_type_hints(Header)
-STATE = ("frame_shape", "step", "trained", "names", "calibration")
-STATE_TYPES = {name: HEADER_TYPES[name] for name in STATE}
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], Header]]:
-    """Tensors and header of a map file; what is refused of them within the block names the file.
-
-    Raises:
-        InputError: as `DejaVu.load`.
-    """
-    tensors, values = read_map(path)
-    try:
-        header = checked(values, Header, "its header")
-        if header.map.get("kind") not in KINDS:
-            known = ", ".join(KINDS)
-            raise InputError(f"a map of kind {header.map.get('kind')!r:.40}; this version knows {known}")
-        yield tensors, header
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except (RuntimeError, RecursionError) as error:  # what torch does not fit in, or nested without end
-        problem = one_line(error)
-        raise InputError(f"{path} does not fit its modules: {problem}") from error
-
-
-def read_place_map(path: Path) -> PlaceMap:
-    """The map of a file alone, without what made its features.
-
-    Raises:
-        InputError: as `DejaVu.load`.
-    """
-    with opened(path) as (tensors, header):
-        mapper = _build(header, "mapper", None)
-        assert isinstance(mapper, Mapper)
-        if header.map.get("places") == 0:
-            raise InputError(NO_MAP)
-        route = mapper.empty()
-        own = {name: tensor for name, tensor in tensors.items() if name.startswith("map.")}
-        _load_map(route, own, header)
-    return route
-
-
-def _load_map(route: PlaceMap, tensors: dict[str, Tensor], header: Header) -> None:
-    """Fill a map with what a file holds of it."""
-    checked(header.map, route.state, "its map")
-    route.load_packed({name.removeprefix("map."): tensor for name, tensor in tensors.items()}, header.map)
-
-
-def _check_weights(header: Header, tensors: dict[str, Tensor], given: nn.Module | None) -> None:
-    """Refuse, before they are made, features of other sizes than the file's weights.
-
-    A network that is given is there already.
-    """
-    if given is not None:
-        return
-    with torch.device("meta"):
-        probe = _build(header, "features", None)
-    assert probe is not None
-    for name, own in probe.state_dict().items():
-        stored = tensors.get(f"features.{name}")
-        if isinstance(own, Tensor) and (stored is None or stored.shape != own.shape):
-            seen = "missing" if stored is None else tuple(stored.shape)
-            raise InputError(f"it does not fit: features.{name} is {seen}; expected {tuple(own.shape)}")
-
-
-def check_types(tensors: dict[str, Tensor], features: nn.Module) -> None:
-    """Refuse whole numbers for weights that are none, such as those of 8 bits without their scales."""
-    for name, own in features.state_dict().items():
-        stored = tensors.get(f"features.{name}")
-        is_float = isinstance(own, Tensor) and own.dtype.is_floating_point
-        if is_float and stored is not None and not stored.dtype.is_floating_point:
-            kind = str(stored.dtype).removeprefix("torch.")
-            raise InputError(f"it does not fit: features.{name} is of {kind}; expected float numbers")
-
-
-def _build_parts(header: Header, features: nn.Module | None, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """The modules that a map's header names, by the names of `PARTS`.
-
-    Args:
-        features: the module that made the map's features, needed where it is not one of this package.
-        tensors: of the file, which hold its weights.
-
-    Raises:
-        InputError: modules that cannot be built, or other features than the map's.
-    """
-    if features is not None:
-        own = recipe_of(features, REGISTRY)
-        if own not in with_parts(header.features):
-            raise InputError(f"it was learned with {difference(header.features, own)}")
-    _check_weights(header, tensors, features)
-    parts = {name: _build(header, name, features) for name in PARTS}
-    return parts | {"whitening": parts["whitening"] or "none"}
-
-
-def _build(header: Header, name: str, features: nn.Module | None) -> nn.Module | None:
-    recipe: Recipe | None = getattr(header, name)
-    if recipe is None:
-        return None
-    # only learning needs what found the periods: one from elsewhere need not be built
-    periods = recipe.init_args.get("periods")
-    if name == "mapper" and periods is not None:
-        finder = checked(periods, Recipe, "its periods")
-        if finder.class_path not in REGISTRY:
-            plain = recipe._replace(init_args=recipe.init_args | {"periods": None})
-            mapper = build(plain, TemplateMapper, REGISTRY)
-            mapper.periods = ForeignPeriods(*finder)
-            return mapper
-    return build(recipe, PARTS[name], REGISTRY, features)

@@ -23,7 +23,7 @@ from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features import views
-from dejavu_torch.maps.mapfile import read_map
+from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral import SpectralMap
 
 ROUTE = "sim:aerial?frames=96"

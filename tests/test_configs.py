@@ -20,8 +20,7 @@ from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import check_config, find_config, preset_names, with_configs
 from dejavu_torch.experiments.reproduce import paper_model
-from dejavu_torch.maps.recipe import recipe_of
-from dejavu_torch.model import PARTS, REGISTRY
+from dejavu_torch.model_file import PARTS, recipe_of
 
 ROOT = Path(__file__).parents[1]
 PRESETS = ["default", "local_maxima", "paper"]
@@ -35,7 +34,7 @@ def model_of(name: str) -> DejaVu:
 
 def settings(model: DejaVu) -> dict[str, Any]:
     parts = {name: getattr(model, name) for name in PARTS}
-    recipes = {name: part and recipe_of(part, REGISTRY)._asdict() for name, part in parts.items()}
+    recipes = {name: part and recipe_of(part)._asdict() for name, part in parts.items()}
     rest = {name: value for name, value in model.settings().items() if name not in PARTS}
     return recipes | rest | {"whitening": recipes["whitening"] or "none"}
 

@@ -30,7 +30,7 @@ from dejavu_torch.data.positions import count_places, positions_behind, shown_fr
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import append, average, learn_mean, merge, shown_on_map
-from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.spectral import code_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap

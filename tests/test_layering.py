@@ -22,6 +22,7 @@ ORDER = [
     {"recognition"},
     {"motion"},
     {"streaming"},
+    {"model_file"},
     {"model"},
     {"growth"},
     {"cluster"},
@@ -45,16 +46,18 @@ ARROWS = {
     "recognition": "types maps",
     "motion": "data memory types",
     "streaming": "types data features maps",
-    "model": "types text version resize data features periods maps recognition motion streaming",
-    "growth": "types data features maps streaming model motion",
+    "model_file": "types text data features periods maps recognition motion",
+    "model": "types version resize data features maps recognition motion streaming model_file",
+    "growth": "types data features maps streaming model_file model motion",
     "cluster": "types text data maps recognition streaming",
     "live": "types data features recognition model",
     "evaluation": "types resize text data features periods maps recognition motion model",
-    "training": "types text memory resize data features periods maps recognition motion model evaluation",
-    "experiments": "types text data features periods maps recognition motion streaming model cluster "
-    "live evaluation training",
-    "cli": "types text data features periods maps recognition motion streaming model growth cluster live "
-    "evaluation training experiments",
+    "training": "types text memory resize data features periods maps recognition motion model_file model "
+    "evaluation",
+    "experiments": "types text data features periods maps recognition motion streaming model_file model "
+    "cluster live evaluation training",
+    "cli": "types text data features periods maps recognition motion streaming model_file model growth "
+    "cluster live evaluation training experiments",
 }
 
 

@@ -11,15 +11,15 @@ import torch
 from helpers import refused, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, best_match, evaluate
-from dejavu_torch import model as model_module
+from dejavu_torch import HOG, best_match, evaluate, model_file
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
-from dejavu_torch.model import DejaVu, read_place_map
+from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import read_place_map
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.types import FrequencyLayer
 
@@ -69,11 +69,8 @@ class StoredMapper(Mapper):
 
 @pytest.fixture
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The one line: the class in `CLASSES`, from which these two follow."""
-    monkeypatch.setattr(
-        model_module, "REGISTRY", {**model_module.REGISTRY, StoredMapper.__name__: StoredMapper}
-    )
-    monkeypatch.setattr(model_module, "KINDS", [*model_module.KINDS, StoredMapper.kind])
+    """The one line: the class in `CLASSES`."""
+    monkeypatch.setattr(model_file, "REGISTRY", {**model_file.REGISTRY, "StoredMapper": StoredMapper})
 
 
 def test_learn_localize_save_load(registered: None, tmp_path: Path) -> None:
@@ -90,8 +87,7 @@ def test_learn_localize_save_load(registered: None, tmp_path: Path) -> None:
 
 def test_a_kind_that_is_not_registered_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(model_module, "REGISTRY", {"StoredMapper": StoredMapper} | dict(model_module.REGISTRY))
-        patch.setattr(model_module, "KINDS", ["stored"])
+        patch.setattr(model_file, "REGISTRY", {**model_file.REGISTRY, "StoredMapper": StoredMapper})
         DejaVu(mapper=StoredMapper()).learn(torch.rand(9, 2)).save(tmp_path / "m.safetensors")
     with refused("'stored'", "templates"):
         DejaVu.load(tmp_path / "m.safetensors")

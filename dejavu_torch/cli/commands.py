@@ -29,10 +29,10 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
 from dejavu_torch.learning import Checkpoint, Code, code_here
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.recipe import recipe_of, with_parts
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.model import NO_MAP, REGISTRY, DejaVu, check_precision
+from dejavu_torch.model import DejaVu, check_precision
+from dejavu_torch.model_file import NO_MAP, REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.recognition.calibration import NEVER
@@ -73,7 +73,7 @@ def run_demo(
     print(f"learning {reference.name}, then finding {query.name} on it")
     reference, views = _with_second(model, reference, second, None, query)
     paper = paper_model()
-    named = [recipe_of(one.mapper, REGISTRY) for one in (model, paper)]
+    named = [recipe_of(one.mapper) for one in (model, paper)]
     others = {"paper": ("the paper to the letter", paper)} if named[0] != named[1] else {}
     result = compare(reference, query, model=model, seed=seed, second=views, others=others, progress=True)
     _publish(result, out, "dejavu demo: the built-in route", command)
@@ -752,8 +752,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         map: map file
         features: class of the map's features, if not ours
     """
+    from dejavu_torch.maps.file import FORMAT
     from dejavu_torch.maps.l1 import l1_backend
-    from dejavu_torch.maps.mapfile import FORMAT
     from dejavu_torch.periods.stft import BACKEND
 
     model = DejaVu.load(map, features)
@@ -841,7 +841,7 @@ def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
         given: what the options say; of its features only what a file cannot bring counts.
         places: whether places are to be appended, not only visits averaged in.
     """
-    default = recipe_of(given.features, REGISTRY) == recipe_of(HOG(), REGISTRY)
+    default = recipe_of(given.features) == recipe_of(HOG())
     model = _load_map(path, None if default else given.features)
     try:
         growth.one_route(model, "append to" if places else "average visits into")
@@ -870,7 +870,7 @@ def features_words(model: DejaVu, words: Sequence[str], option: str) -> list[str
     Args:
         words: of this command, in which `option` says what the features are.
     """
-    foreign = [one.class_path for one in with_parts(recipe_of(model.features, REGISTRY))]
+    foreign = [one.class_path for one in with_parts(recipe_of(model.features))]
     foreign = [name for name in foreign if name not in REGISTRY]
     if not foreign:
         return []

@@ -38,11 +38,11 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.maps.l1 import l1_backend
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.recipe import recipe_of
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.model import REGISTRY, DejaVu
+from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -339,7 +339,7 @@ def _at_other_sizes(
 def _is_plain_hog(model: DejaVu) -> bool:
     """Whether the uncompressed baseline is HOG with its defaults, by L1."""
     pairs = (model.preprocess, Preprocess()), (model.features, HOG())
-    same = all(recipe_of(own, REGISTRY) == recipe_of(plain, REGISTRY) for own, plain in pairs)
+    same = all(recipe_of(own) == recipe_of(plain) for own, plain in pairs)
     return same and model.whitening is None and getattr(model.map, "metric", "l1") == "l1"
 
 

@@ -33,7 +33,7 @@ from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.model import read_place_map
+from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import printable
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 

@@ -1,4 +1,4 @@
-"""What a map can tell apart and what it costs."""
+"""Capacity and storage of a map."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ LARGE = 10**9  # a common period beyond it is no figure that a person compares
 
 
 class ChunkSummary(NamedTuple):
-    """One chunk [start, stop): its periods, how many places they can tell apart, and what they share.
+    """One chunk [start, stop), and what repeats in it.
 
+    periods: of its layers; of a spectral map, of the ten strongest lines.
+    features: number of features of each layer; () in a spectral map.
     common_period: the least common multiple of the periods, in places; the capacity.
     shared_factors: greatest common divisor of each pair of periods, in the order of
         itertools.combinations(periods, 2).
-    features: number of features of each layer; () in a spectral map, whose periods are those of its ten
-        strongest lines.
     """
 
     start: int
@@ -36,16 +36,13 @@ class ChunkSummary(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class MapSummary:
-    """Capacity and storage of a map; printed, it is a few lines for a person.
+    """Capacity and storage of a map; prints as a few lines for a person.
 
     Attributes:
         kind: of the map. places: N. covered: places that at least one layer covers.
-        templates: sum of phases. template_numbers: sum of phases x features.
-        chunks: what repeats in each.
-        fixed: bytes beside the map, by part, such as the backbone: but for the names of frames they do not
-            grow with the route.
-        route: bytes of the map itself, by part, such as the templates.
-        lines: of a spectral map, those that are not 0.
+        templates: sum of phases. template_numbers: sum of phases x features. lines: nonzero ones.
+        route: bytes of the map by part, such as the templates.
+        fixed: other bytes by part, such as the backbone; of these only the names grow with the route.
     """
 
     kind: str
@@ -78,19 +75,41 @@ class MapSummary:
         """`map_bytes` over the number of places."""
         return self.map_bytes / max(self.places, 1)
 
-    def with_parts(
-        self, route: Mapping[str, int] | None = None, fixed: Mapping[str, int] | None = None
-    ) -> MapSummary:
-        """The summary with further parts, those of 0 bytes left out."""
-        more = [{name: size for name, size in (parts or {}).items() if size} for parts in (route, fixed)]
-        return replace(self, route={**self.route, **more[0]}, fixed={**self.fixed, **more[1]})
+    def with_parts(self, fixed: Mapping[str, int]) -> MapSummary:
+        """The summary with further fixed parts, without those of 0 bytes."""
+        return replace(self, fixed={**self.fixed, **{name: size for name, size in fixed.items() if size}})
 
     def __repr__(self) -> str:
-        return describe(self)
+        if not self.places:
+            return f"{self.fixed_bytes} bytes without a map ({_parts(self.fixed)})"
+        lines = [_chunk_line(chunk) for chunk in self.chunks[:CHUNKS_SHOWN]]
+        if len(self.chunks) > CHUNKS_SHOWN:
+            lines.append(f"and {len(self.chunks) - CHUNKS_SHOWN} more chunks")
+        stored = f"{self.templates} templates, {self.template_numbers} numbers"
+        if self.kind != "templates":
+            stored = f"{self.lines} lines of their spectra"
+        lines.append(f"{self.covered} of {self.places} places covered; {stored}")
+        stored = (
+            f"{self.map_bytes} bytes, {self.bytes_per_place:.1f} per place: {self.route_bytes} of the route, "
+        )
+        stored += f"{self.route_bytes / self.places:.2f} per place ({_parts(self.route)})"
+        if self.fixed:
+            names = ", with the names of its frames" * ("names" in self.fixed)
+            stored += f", and {self.fixed_bytes} fixed{names} ({_parts(self.fixed)})"
+        return "\n".join([*lines, stored])
 
 
 def summarise(plan: Plan, places: int, route: Mapping[str, int]) -> MapSummary:
-    """The summary of a plan over `places` places, whose parts take these bytes."""
+    """The summary of a plan over `places` places, whose parts take these bytes.
+
+    Example:
+        >>> from dejavu_torch.types import FrequencyLayer
+        >>> layers = [FrequencyLayer(Fraction(p), p, 0, 1024, (0, 1)) for p in (93, 171)]
+        >>> summarise(tuple(layers), places=1024, route={"templates": 2112, "layers": 1984})
+        places 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); together 5301 places
+        1024 of 1024 places covered; 264 templates, 528 numbers
+        4096 bytes, 4.0 per place: 4096 of the route, 4.00 per place (templates 2112, layers 1984)
+    """
     chunks = []
     covered = end = 0
     for start, stop in sorted({(layer.start, layer.stop) for layer in plan}):
@@ -103,36 +122,6 @@ def summarise(plan: Plan, places: int, route: Mapping[str, int]) -> MapSummary:
     templates = sum(layer.phases for layer in plan)
     numbers = sum(layer.phases * len(layer.features) for layer in plan)
     return MapSummary("templates", places, covered, templates, numbers, tuple(chunks), route, {})
-
-
-def describe(summary: MapSummary) -> str:
-    """The chunks with their periods, and what is stored, in lines for a person.
-
-    Example:
-        >>> from dejavu_torch.types import FrequencyLayer
-        >>> layers = [FrequencyLayer(Fraction(p), p, 0, 1024, (0, 1)) for p in (93, 171)]
-        >>> print(summarise(tuple(layers), places=1024, route={"templates": 2112, "layers": 1984}))
-        places 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); together 5301 places
-        1024 of 1024 places covered; 264 templates, 528 numbers
-        4096 bytes, 4.0 per place: 4096 of the route, 4.00 per place (templates 2112, layers 1984)
-    """
-    if not summary.places:
-        return f"{summary.fixed_bytes} bytes without a map ({_parts(summary.fixed)})"
-    lines = [_chunk_line(chunk) for chunk in summary.chunks[:CHUNKS_SHOWN]]
-    if len(summary.chunks) > CHUNKS_SHOWN:
-        lines.append(f"and {len(summary.chunks) - CHUNKS_SHOWN} more chunks")
-    stored = f"{summary.templates} templates, {summary.template_numbers} numbers"
-    if summary.kind != "templates":
-        stored = f"{summary.lines} lines of their spectra"
-    lines.append(f"{summary.covered} of {summary.places} places covered; {stored}")
-    growing = summary.route_bytes / max(summary.places, 1)
-    stored = f"{summary.map_bytes} bytes, {summary.bytes_per_place:.1f} per place: "
-    stored += f"{summary.route_bytes} of the route, {growing:.2f} per place ({_parts(summary.route)})"
-    if summary.fixed:
-        names = ", with the names of its frames" * ("names" in summary.fixed)
-        stored += f", and {summary.fixed_bytes} fixed{names} ({_parts(summary.fixed)})"
-    lines.append(stored)
-    return "\n".join(lines)
 
 
 def _parts(parts: Mapping[str, int]) -> str:

@@ -1,7 +1,6 @@
-"""Weights of a network in 8 bits each, with one scale for every output channel.
+"""Weights of a network in 8 bits each, with one scale per output channel, in a map file.
 
-torch.quantize_per_channel did this, but torch gives its quantised tensors up, deprecated in 2.13. torchao is
-a dependency for networks that compute in whole numbers; here only the file holds them.
+torch's own quantised tensors are deprecated, and torchao computes in whole numbers; here only the file does.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from dejavu_torch.types import InputError
 
 BITS = (8, 32)
 LARGEST = 127  # of the whole numbers
-HUGE = 1e38  # weights from here on stay in 32 bits: they could round to infinity
-LEAST = torch.finfo(torch.bfloat16).smallest_normal  # of a scale: a channel of less is 0
-SCALE = ".scale"  # behind the name of a weight; torch lets no other tensor have that name
+HUGE = 1e38  # larger weights, which could round to infinity, keep 32 bits
+LEAST = torch.finfo(torch.bfloat16).smallest_normal  # scale; a channel below it is 0
+SCALE = ".scale"  # follows the name of a weight; torch allows no dot in the name of a tensor
 
 
 def quantised(weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -31,8 +30,8 @@ def quantised(weight: Tensor) -> tuple[Tensor, Tensor]:
     Shape: (O,...) -> int8 (O,...), bfloat16 (O,).
 
     Convention: the largest number of a channel is 127, unless all are 0. So the product, which is exact,
-        gives the same numbers and scales again: the 8 bits of a bfloat16 are off by at most 1 in 257, which
-        moves 127 steps by less than half a step.
+        gives the same numbers and scales again: a bfloat16 is off by at most 1 in 257, which moves 127 steps
+        by less than half a step.
 
     Example:
         >>> whole, scale = quantised(torch.tensor([[2.54, -1.0], [0.0, 0.0]]))
@@ -41,37 +40,31 @@ def quantised(weight: Tensor) -> tuple[Tensor, Tensor]:
     """
     scale = (weight.abs().flatten(1).amax(1) / LARGEST).bfloat16()
     scale = scale.where(scale >= LEAST, 0.0)
-    steps = _over(scale, weight)
-    return (weight / steps.where(steps > 0, torch.inf)).round().to(torch.int8), scale
+    steps = scale.where(scale > 0, torch.inf)
+    return (weight / _over(steps, weight)).round().to(torch.int8), scale
 
 
 def _over(scale: Tensor, weight: Tensor) -> Tensor:
-    """Scales of channels, float32, beside their weights."""
+    """Scales as float32, shaped to broadcast over weights."""
     return scale.float().view(-1, *[1] * (weight.ndim - 1))
 
 
 def fits(weight: Tensor) -> bool:
-    """Whether a weight can be in 8 bits: float32, of 2 or more dimensions, finite, and not empty.
-
-    What has fewer dimensions is little, and what is 16 bits wide, or a mask of infinities, stays as it is.
-    """
+    """Whether a weight can be in 8 bits: float32, of 2 or more dimensions, not empty, below 1e38."""
     if is_lazy(weight) or weight.dtype != torch.float32 or weight.ndim < 2 or not weight.numel():
         return False
     return bool(weight.detach().abs().max() < HUGE)
 
 
 def rounded(weight: Tensor) -> Tensor:
-    """What 8 bits give back of a weight."""
+    """A weight after rounding to 8 bits."""
     whole, scale = quantised(weight.detach())
     return whole * _over(scale, whole)
 
 
 @torch.no_grad()
 def round_weights(module: nn.Module) -> bool:
-    """Round all parameters that fit to 8 bits, in place; whether there are any.
-
-    Buffers, such as the running statistics of BatchNorm, stay as they are.
-    """
+    """Round in place all parameters that fit into 8 bits, but no buffers; whether there are any."""
     weights = [weight for weight in module.parameters() if fits(weight)]
     for weight in weights:
         weight.copy_(rounded(weight))
@@ -85,7 +78,7 @@ def is_rounded(module: nn.Module) -> bool:
 
 @contextmanager
 def in_bits(module: nn.Module, bits: int) -> Iterator[None]:
-    """The module with weights of so many bits; afterwards they are what they were."""
+    """Within the block the module has weights of so many bits."""
     kept = [(weight, weight.detach().clone()) for weight in module.parameters() if bits == 8 and fits(weight)]
     if kept:
         round_weights(module)
@@ -98,7 +91,7 @@ def in_bits(module: nn.Module, bits: int) -> Iterator[None]:
 
 
 def packed(module: nn.Module) -> dict[str, Tensor]:
-    """The tensors of a module's state, each parameter that fits as whole numbers, its scales beside it."""
+    """The tensors of a module's state; each parameter that fits as whole numbers and scales."""
     found: dict[str, Tensor] = {}
     weights = {name for name, _ in module.named_parameters(remove_duplicate=False)}
     for name, tensor in module.state_dict().items():
@@ -110,28 +103,24 @@ def packed(module: nn.Module) -> dict[str, Tensor]:
 
 
 def unpacked(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors of a file, the whole numbers and scales below a prefix as the weights that they are.
+    """The tensors of a file; below a prefix, products in place of whole numbers and scales.
 
     Raises:
-        InputError: such as `quantised` does not make.
+        InputError: numbers that `quantised` does not return.
     """
     found = dict(tensors)
-    for name, scale in tensors.items():
-        of = name.removesuffix(SCALE)
-        if name.startswith(prefix) and of != name and of in tensors:
-            found[of] = _restored(tensors[of], scale, of)
-            del found[name]
+    for scales in [name for name in tensors if name.startswith(prefix) and name.endswith(SCALE)]:
+        name = scales.removesuffix(SCALE)
+        if name in tensors:
+            found[name] = _product(name, tensors[name], found.pop(scales))
     return found
 
 
-def _restored(whole: Tensor, scale: Tensor, name: str) -> Tensor:
-    alike = whole.dtype == torch.int8 and whole.ndim > 1 and scale.shape == whole.shape[:1]
-    if alike and scale.dtype == torch.bfloat16:
+def _product(name: str, whole: Tensor, scale: Tensor) -> Tensor:
+    if (whole.dtype, scale.dtype) == (torch.int8, torch.bfloat16) and scale.shape == whole.shape[:1]:
         weight = whole * _over(scale, whole)
-        if fits(weight):
-            again = quantised(weight)
-            if torch.equal(again[0], whole) and torch.equal(again[1], scale):
-                return weight
+        if fits(weight) and all(map(torch.equal, quantised(weight), (whole, scale))):
+            return weight
     seen = " and ".join(f"{one.dtype} {tuple(one.shape)}".removeprefix("torch.") for one in (whole, scale))
     raise InputError(
         f"{name} and its scale are {seen}; expected int8 (O,...) and bfloat16 (O,), finite, the largest of "

@@ -20,9 +20,9 @@ from torch.optim import Optimizer
 
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import make_output_folder, whole_file
+from dejavu_torch.maps.file import checked_fields
 from dejavu_torch.maps.place_map import EXTRA
-from dejavu_torch.maps.schema import checked_fields
-from dejavu_torch.model import STATE_TYPES
+from dejavu_torch.model_file import STATE
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
@@ -143,7 +143,7 @@ def check_content(checkpoint: Any, size: int) -> None:
         if ours and name.endswith(EXTRA) and not is_plain(value):
             raise InputError(f"{name[:80]} is not of plain numbers and text")
         if name == f"dejavu.{EXTRA}":
-            checked_fields(value, STATE_TYPES, name)
+            checked_fields(value, STATE, name)
     for tensor in tensors_in(checkpoint):
         dense = tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized
         held = min(size, tensor.untyped_storage().nbytes()) if dense else 0

@@ -26,7 +26,8 @@ from dejavu_torch.features.whitening import STRENGTHS, Whitening
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper, log_posterior
 from dejavu_torch.maps.weights import BITS, in_bits, round_weights, unpacked
-from dejavu_torch.model import DejaVu, check_types, opened
+from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.chance import LastLosses
@@ -744,7 +745,7 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
         backbone.load_state_dict(weights)
     except RuntimeError as error:
         raise InputError(
-            f"{path} holds weights of {header.features._asdict()}; expected those of the same "
+            f"{path} holds weights of {header['features']._asdict()}; expected those of the same "
             f"{type(backbone).__name__}"
         ) from error
 

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from dejavu_torch import HOG, hog
 from dejavu_torch.features.hog import cell_histograms, gradients
-from dejavu_torch.maps.recipe import recipe_of
-from dejavu_torch.model import REGISTRY
+from dejavu_torch.model_file import recipe_of
 from dejavu_torch.resize import resize_frames
 
 SIZES = [(16, 16), (64, 64), (37, 45), (64, 41), (33, 100), (21, 16)]
@@ -164,7 +163,7 @@ def test_module_equals_function() -> None:
         arguments |= {"bins": bins}
         module = HOG(**arguments)
         assert torch.equal(module(frames), hog(frames, **arguments))
-        assert torch.equal(HOG(**recipe_of(module, REGISTRY).init_args)(frames), module(frames))
+        assert torch.equal(HOG(**recipe_of(module).init_args)(frames), module(frames))
 
 
 def test_double_follows_the_input() -> None:

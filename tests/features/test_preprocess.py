@@ -12,8 +12,7 @@ from kornia.enhance import equalize_clahe
 from torch import Tensor
 
 from dejavu_torch.features.preprocess import Preprocess, equalise, normalise_patches, select_channel
-from dejavu_torch.maps.recipe import recipe_of
-from dejavu_torch.model import REGISTRY
+from dejavu_torch.model_file import recipe_of
 
 
 def patch_oracle(image: np.ndarray, patch: int) -> np.ndarray:
@@ -252,7 +251,7 @@ def test_a_large_batch_is_worked_off_in_parts(choice: dict) -> None:
 @pytest.mark.parametrize("choice", CHOICES)
 def test_a_recipe_builds_the_same_module(choice: dict) -> None:
     module = Preprocess(**choice)
-    again = Preprocess(**recipe_of(module, REGISTRY).init_args)
+    again = Preprocess(**recipe_of(module).init_args)
     assert repr(again) == repr(module)
     assert again.grid == module.grid
     assert isinstance(again.grid, tuple)

@@ -44,10 +44,12 @@ from dejavu_torch.experiments import bench, compare, frontier, reproduce
 from dejavu_torch.experiments import evaluate as evaluating
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.live.localizer import LiveLocalizer
-from dejavu_torch.maps import mapfile
+from dejavu_torch.maps import file as map_file
 from dejavu_torch.maps.codec import Stream, decode, encode
 from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.model import DejaVu, read_place_map
+from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import contents as contents_of
+from dejavu_torch.model_file import read_place_map
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -164,7 +166,7 @@ def localize(model: DejaVu, queries: Traverse, random: Random) -> None:
 
 def same_model(first: DejaVu, second: DejaVu) -> bool:
     """Whether two maps hold the same tensors and settings."""
-    (tensors, header), (others, other) = first._file(), second._file()
+    (tensors, header), (others, other) = contents_of(first), contents_of(second)
     if (
         json.dumps(header, sort_keys=True) != json.dumps(other, sort_keys=True)
         or tensors.keys() != others.keys()
@@ -190,7 +192,7 @@ def pick_map(case: Case) -> Path:
 
 def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and header of a valid map."""
-    tensors, header = mapfile.read_map(path)
+    tensors, header = map_file.read_map(path)
     return tensors, header
 
 
@@ -198,11 +200,11 @@ def sealed(tensors: dict[str, Tensor], header: str) -> bytes:
     """A map file of any tensors and the JSON of any header, with the checksums of just these."""
     plain = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
     try:
-        sums = mapfile.checksums(plain, json.loads(header))
+        sums = map_file.checksums(plain, json.loads(header))
     except (ValueError, RecursionError):  # no JSON that could have a checksum
         sums = {}
-    text = f'{{"version": {mapfile.FORMAT}, "checksums": {json.dumps(sums)}, "{mapfile.HEADER}": {header}}}'
-    return safetensors.torch.save(plain, {mapfile.NAME: text})
+    text = f'{{"version": {map_file.FORMAT}, "checksums": {json.dumps(sums)}, "{map_file.HEADER}": {header}}}'
+    return safetensors.torch.save(plain, {map_file.NAME: text})
 
 
 def crafted(random: Random, path: Path) -> bytes:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.weights import fits, in_bits, is_rounded, packed, quantised, round_weights, rounded
 from dejavu_torch.model import DejaVu
 

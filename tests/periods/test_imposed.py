@@ -13,9 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.maps.recipe import build, recipe_of
 from dejavu_torch.maps.template_map import Reduction, TemplateMap, TemplateMapper
-from dejavu_torch.model import REGISTRY
+from dejavu_torch.model_file import build, recipe_of
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.support import support_of, supportive_periods
@@ -132,10 +131,10 @@ def test_staggered_layers_place_a_frame_finer_than_their_bins() -> None:
 
 @pytest.mark.parametrize("finder", [ImposedPeriods(), ImposedPeriods([4, 9], 3, True)])
 def test_it_is_rebuilt_from_its_recipe(finder: ImposedPeriods) -> None:
-    recipe = recipe_of(finder, REGISTRY)
-    again = build(recipe, PeriodFinder, REGISTRY)
+    recipe = recipe_of(finder)
+    again = build(recipe, PeriodFinder)
     assert repr(again) == repr(finder)
-    assert recipe_of(again, REGISTRY) == recipe
+    assert recipe_of(again) == recipe
 
 
 @pytest.mark.parametrize("periods", [[], [1, 4], [4, 4], [4.0, 5], ["4"]])

@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from dejavu_torch.maps.coefficients import coefficients_of
-from dejavu_torch.maps.merged import MergedMap
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st

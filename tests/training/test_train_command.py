@@ -24,9 +24,8 @@ from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.maps.mapfile import read_map
+from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral import SpectralMap
-from dejavu_torch.maps.summary import describe
 
 
 def figures(path: Path) -> dict[str, list[float]]:
@@ -335,7 +334,7 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
         said = capfd.readouterr()
         assert said.err == ""
         plan, *rest = said.out.split("written to ")
-        assert plan.endswith(f"{describe(DejaVu.load(tmp_path / 'map.safetensors').summary())}\n")
+        assert plan.endswith(f"{DejaVu.load(tmp_path / 'map.safetensors').summary()!s}\n")
         assert "only a second traverse" in rest[0]
         command = (
             f"next: dejavu compare one.npy SECOND --map {tmp_path}/map.safetensors --tolerance 2 --out report"

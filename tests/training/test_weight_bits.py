@@ -13,7 +13,7 @@ from small_training import assert_same_scores, backbone, data_of, footage, new_t
 
 from dejavu_torch import HOG, DejaVu, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.maps.mapfile import read_map, write_map
+from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.weights import is_rounded
 from dejavu_torch.training.task import PlaceRecognitionTask, start_from
 

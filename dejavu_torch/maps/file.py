@@ -1,0 +1,217 @@
+"""A map file: one safetensors archive of tensors, a JSON header, and digests of both. No pickle, no code."""
+
+from __future__ import annotations
+
+import json
+import math
+import types
+from collections.abc import Mapping, Sequence
+from hashlib import blake2b
+from inspect import formatannotation
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from dejavu_torch.data.files import LARGEST, check_regular
+from dejavu_torch.data.output import whole_file
+from dejavu_torch.types import InputError
+
+FORMAT = 9
+NAME = "dejavu_torch-map"
+ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
+EXPECTED = "a map file, as DejaVu.save writes"
+HEADER = "header"  # the digest that is of no tensor
+SHOWN = 60  # characters of a value in a message
+
+
+class Contents(NamedTuple):
+    """tensors: by name, which begins with its part and a dot. header: JSON values."""
+
+    tensors: dict[str, Tensor]
+    header: dict[str, Any]
+
+
+def checksums(tensors: Mapping[str, Tensor], header: Any) -> dict[str, str]:
+    """A digest of the header, and of each part's names, types, shapes and bytes."""
+    sums = {HEADER: blake2b(json.dumps(header).encode(), digest_size=8)}
+    for name, tensor in sorted(tensors.items()):
+        part = sums.setdefault(name.partition(".")[0], blake2b(digest_size=8))
+        part.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        part.update(tensor.cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
+    return {part: digest.hexdigest() for part, digest in sums.items()}
+
+
+def digests(**values: Any) -> dict[str, str]:
+    """A digest of each of these JSON values."""
+    return {name: checksums({}, {name: value})[HEADER] for name, value in values.items()}
+
+
+def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
+    """Bytes of the file that `write_map` writes."""
+    return len(safetensors.torch.save(*_sealed(tensors, header)))
+
+
+def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
+    """Write the file whole or not at all; the same tensors and header give the same bytes.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    plain, metadata = _sealed(tensors, header)
+    with whole_file(path) as temporary:
+        try:
+            safetensors.torch.save_file(plain, temporary, metadata)
+        except SafetensorError as error:
+            raise InputError(f"{path} was not written: {error}") from error
+
+
+def _sealed(
+    tensors: Mapping[str, Tensor], header: dict[str, Any]
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors with memory of their own, as safetensors needs, and the metadata.
+
+    The metadata are one entry, since safetensors writes several in any order.
+    """
+    plain: dict[str, Tensor] = {}
+    owners: set[int] = set()
+    for name, tensor in tensors.items():
+        tensor = tensor.detach().cpu().contiguous()
+        memory = tensor.untyped_storage()
+        if memory.data_ptr() in owners or memory.nbytes() != tensor.nbytes:
+            tensor = tensor.clone()
+        owners.add(tensor.untyped_storage().data_ptr())
+        plain[name] = tensor
+    sealed = {"version": FORMAT, "checksums": checksums(plain, header), HEADER: header}
+    return plain, {NAME: json.dumps(sealed, allow_nan=False)}
+
+
+def read_map(path: Path) -> Contents:
+    """Tensors and header of a map file, as they were written.
+
+    Raises:
+        InputError: missing, truncated, foreign, damaged, or of another format.
+    """
+    check_regular(path, EXPECTED)
+    try:
+        with path.open("rb") as file:
+            if file.read(len(ZIP)) == ZIP:
+                raise InputError(
+                    f"{path} is a checkpoint or another archive; expected a map, as `dejavu train export` "
+                    "makes of a checkpoint"
+                )
+        with safe_open(path, framework="pt") as archive:
+            metadata = archive.metadata() or {}
+            if NAME not in metadata:
+                raise InputError(
+                    f"{path} is no map of dejavu_torch, or an old one; expected {EXPECTED}; of an old one, "
+                    "learn the route anew"
+                )
+            sealed = json_values(metadata[NAME])
+            version = sealed["version"]
+            if version != FORMAT:
+                newer = isinstance(version, int) and version > FORMAT
+                cure = "a newer dejavu_torch is needed" if newer else "learn the route anew"
+                raise InputError(
+                    f"{path} has map format {version!r:.40}; this version reads {FORMAT}: {cure}"
+                )
+            tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
+        header, sums = sealed[HEADER], sealed["checksums"]
+        seen = checksums(tensors, header)
+    except InputError:
+        raise
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
+    if seen != sums:
+        known = sums if isinstance(sums, dict) else {}
+        damaged = sorted(part for part in {*seen, *known} if seen.get(part) != known.get(part))
+        raise InputError(
+            f"{path} is damaged: its {' and '.join(damaged)}; expected the file as it was written"
+        )
+    return Contents(tensors, header)
+
+
+def json_values(text: str) -> Any:
+    """JSON values, of finite numbers, whole ones below 2^53; else ValueError."""
+    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(float(text)):
+        raise ValueError(f"{text} is no finite number")
+    return float(text)
+
+
+def _whole(text: str) -> int:
+    if abs(int(text)) >= LARGEST:
+        raise ValueError(f"{text:.40} is no whole number below 2^53")
+    return int(text)
+
+
+def checked(value: Any, kind: Any, where: str) -> Any:
+    """A JSON value by a type annotation.
+
+    Args:
+        kind: int, float, str, bool, None, Any, a Literal, a union, a sequence or mapping of these, or a
+            NamedTuple, for a mapping with exactly its fields. A module is a mapping.
+        where: names the value in messages.
+
+    Convention: numbers are finite, whole ones below 2^53.
+
+    Raises:
+        InputError: naming what is of another type.
+
+    Example:
+        >>> checked([4, 4], tuple[int, int], "block")
+        (4, 4)
+        >>> checked("4", int | None, "block")
+        Traceback (most recent call last):
+        dejavu_torch.types.InputError: block is '4'; expected int | None
+    """
+    origin, inner = get_origin(kind) or kind, get_args(kind)
+    if hasattr(kind, "_fields"):
+        return kind(**checked_fields(value, get_type_hints(kind), where))
+    if origin in (Union, types.UnionType):
+        mappings = [one for one in inner if hasattr(one, "_fields") and isinstance(value, dict)]
+        for one in mappings or inner:
+            try:
+                return checked(value, one, where)
+            except InputError:
+                if mappings:
+                    raise
+    elif origin in (tuple, list, Sequence) and isinstance(value, list | tuple):
+        kinds = inner if origin is tuple and ... not in inner else inner[:1] * len(value)
+        if len(kinds) == len(value):
+            items = [
+                checked(one, of, f"{where}[{i}]")
+                for i, (one, of) in enumerate(zip(value, kinds, strict=True))
+            ]
+            return items if origin is list else tuple(items)
+    elif _fits(value, origin, inner):
+        return value
+    limit = ", finite and below 2^53" if isinstance(value, int | float) else ""
+    raise InputError(f"{where} is {repr(value)[:SHOWN]}; expected {formatannotation(kind)}{limit}")
+
+
+def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
+    """Whether a value is of a type other than a union, a sequence or a NamedTuple."""
+    if origin is Literal:
+        return any(type(value) is type(one) and value == one for one in inner)
+    if origin is int:
+        return type(value) is int and abs(value) < LARGEST
+    if origin is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    if origin in (str, bool, None, type(None)):
+        return type(value) is (origin or type(None))
+    return origin is Any or isinstance(value, dict)
+
+
+def checked_fields(value: Any, kinds: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A mapping with exactly these keys, whose values are `checked` by these types."""
+    if not isinstance(value, dict) or value.keys() != kinds.keys():
+        seen = ", ".join(sorted(map(str, value))) if isinstance(value, dict) else repr(value)
+        raise InputError(f"{where} is of {seen[:SHOWN] or 'nothing'}; expected {', '.join(kinds)}")
+    return {name: checked(value[name], kind, f"{where}.{name}") for name, kind in kinds.items()}

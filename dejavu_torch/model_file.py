@@ -1,0 +1,345 @@
+"""How a model is written to a map file and read: its parts as recipes, its weights and its map.
+
+A recipe is the name of a class and its constructor arguments. Only classes in `REGISTRY` are built from a
+file; any other module has to be given by the caller. Nothing is imported by name.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, get_type_hints
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.data.names import decode_names, encode_names
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.file import checked, checked_fields, json_values, map_size, read_map, write_map
+from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.summary import MapSummary
+from dejavu_torch.maps.template_map import TemplateMapper
+from dejavu_torch.maps.weights import is_rounded, packed, unpacked
+from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.periods.finder import ForeignPeriods
+from dejavu_torch.periods.imposed import ImposedPeriods
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.recognition.calibration import Calibration
+from dejavu_torch.text import one_line
+from dejavu_torch.types import InputError, Training
+
+M = TypeVar("M", bound=nn.Module)
+MOST_PARTS = 16  # of a recipe
+NO_MAP = "a descriptor without a map; expected a map, as `dejavu learn SOURCE --descriptor FILE` makes of it"
+
+# the classes that a map file may name
+CLASSES: tuple[type[nn.Module], ...] = (
+    Preprocess,
+    HOG,
+    PatchPixels,
+    SmallCNN,
+    Embedding,
+    Whitening,
+    SpectrogramAnalysis,
+    ImposedPeriods,
+    TemplateMapper,
+    SpectralMapper,
+    GroundOdometry,
+)
+REGISTRY = {cls.__name__: cls for cls in CLASSES}
+
+
+class Recipe(NamedTuple):
+    """How to build a module: the name of its class and its constructor arguments."""
+
+    class_path: str
+    init_args: dict[str, Any]
+
+
+# the header of a map file: the parts and settings of a model, its state, and that of its map
+PARTS: dict[str, tuple[type[nn.Module], Any]] = {
+    "preprocess": (Preprocess, Recipe),
+    "features": (nn.Module, Recipe),
+    "whitening": (Whitening, Recipe | None),
+    "mapper": (Mapper, Recipe),
+    "velocity": (GroundOdometry, Recipe | None),
+}
+SETTINGS = {"threshold": float | None, "precision": float | None, "batch_size": int}
+STATE = {
+    "frame_shape": tuple[int, ...] | None,
+    "step": float | None,
+    "trained": Training | None,
+    "names": str | None,
+    "calibration": Calibration | None,
+}
+HEADER = {name: kind for name, (_, kind) in PARTS.items()} | SETTINGS | STATE | {"map": dict[str, Any]}
+
+
+def recipe_of(module: nn.Module) -> Recipe:
+    """Recipe of a module, without arguments if it is not of this package."""
+    if isinstance(module, ForeignPeriods):
+        return Recipe(module.class_path, module.init_args)
+    cls = type(module)
+    if REGISTRY.get(cls.__name__) is not cls:
+        return Recipe(f"{cls.__module__}.{cls.__qualname__}", {})
+    arguments = {name: getattr(module, name) for name in inspect.signature(cls).parameters}
+    for name, value in arguments.items():
+        if isinstance(value, nn.Module):
+            arguments[name] = recipe_of(value)._asdict()
+    return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # equal to that read from a file
+
+
+def recipes_of(model: Any) -> dict[str, Any]:
+    """The recipe of each part of a model, as JSON takes it."""
+    parts = {name: getattr(model, name) for name in PARTS}
+    return {name: None if part is None else recipe_of(part)._asdict() for name, part in parts.items()}
+
+
+def with_parts(recipe: Recipe) -> list[Recipe]:
+    """A recipe, and those of all its parts."""
+    return [recipe, *(inner for part in _parts(recipe).values() for inner in with_parts(part))]
+
+
+def _parts(recipe: Recipe) -> dict[str, Recipe]:
+    named = {
+        name: one for name, one in recipe.init_args.items() if isinstance(one, dict) and "class_path" in one
+    }
+    return {name: checked(one, Recipe, name) for name, one in named.items()}
+
+
+def difference(stored: Recipe, given: Recipe) -> str:
+    """Where two recipes differ, in words."""
+    if stored.class_path != given.class_path:
+        return f"{stored.class_path}; got {given.class_path}"
+    names = [name for name, value in stored.init_args.items() if given.init_args.get(name) != value]
+    expected, got = (
+        ", ".join(f"{name}={one.init_args.get(name)}" for name in names) for one in (stored, given)
+    )
+    return f"{stored.class_path} of {expected}; got {got}"
+
+
+def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
+    """A module by its recipe.
+
+    Args:
+        kind: its base class. given: a module for the recipe, or for the part of it, that equals its own.
+
+    Raises:
+        InputError: a class outside the registry, or one that is no `kind`, other arguments than it has, or
+            more than `MOST_PARTS` parts.
+    """
+    name = recipe.class_path
+    if isinstance(given, kind) and recipe_of(given) == recipe:
+        return given
+    if name not in REGISTRY:
+        raise InputError(
+            f"the map's features come from {name}, which only the caller can load; expected it as "
+            "`features`, with the arguments it was made with"
+        )
+    cls = REGISTRY[name]
+    if not issubclass(cls, kind):
+        raise InputError(f"the map names {name}, which is no {kind.__name__}")
+    hints = get_type_hints(cls.__init__)
+    kinds = {  # an argument that is newer than the file has its default
+        key: hints[key]
+        for key, parameter in inspect.signature(cls).parameters.items()
+        if key in recipe.init_args or parameter.default is parameter.empty
+    }
+    arguments = checked_fields(recipe.init_args, kinds, f"the map's {name}")
+    count = len(with_parts(recipe))
+    if count > MOST_PARTS:
+        raise InputError(f"the map's {name} is made of {count} parts; expected at most {MOST_PARTS}")
+    for key, part in _parts(recipe).items():
+        foreign = key == "periods" and part.class_path not in REGISTRY  # which only learning needs
+        arguments[key] = ForeignPeriods(*part) if foreign else build(part, nn.Module, given)
+    return cls(**arguments)
+
+
+def weights_of(model: Any, part: str) -> dict[str, Tensor]:
+    """The tensors that a file holds of a part of a model, such as "features"."""
+    module = getattr(model, part)
+    state = {} if module is None else module.state_dict()
+    weights = packed(module) if part == "features" and model.weight_bits == 8 else state
+    return {f"{part}.{name}": tensor for name, tensor in weights.items() if isinstance(tensor, Tensor)}
+
+
+def model_state(model: Any) -> dict[str, Any]:
+    """What a model's state holds beside tensors and the map's own state, as JSON takes it."""
+    names = encode_names(model.frame_names) if model.frame_names else None
+    return {name: _plain(names if name == "names" else getattr(model, name)) for name in STATE}
+
+
+def _plain(value: Any) -> Any:
+    return {key: _plain(one) for key, one in value._asdict().items()} if hasattr(value, "_asdict") else value
+
+
+def take_state(model: Any, state: Any) -> None:
+    """Give a model what `model_state` returned.
+
+    Raises:
+        InputError: a state of other entries, or of other types.
+    """
+    _set_state(model, checked_fields(state, STATE, "the model's state"))
+
+
+def _set_state(model: Any, state: Mapping[str, Any], frames: int | None = None) -> None:
+    for name in STATE.keys() - {"names"}:
+        setattr(model, name, state[name])
+    names = state["names"]
+    model.frame_names = [] if names is None else decode_names(names, frames)
+
+
+def contents(model: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors and the header of a model's map file."""
+    header = recipes_of(model) | {name: getattr(model, name) for name in SETTINGS} | model_state(model)
+    header["map"] = model.map.get_extra_state()
+    route = model.map.packed() if model.map.places else {}
+    tensors = {f"map.{name}": tensor for name, tensor in route.items()}
+    return tensors | weights_of(model, "features") | weights_of(model, "whitening"), header
+
+
+def summary_of(model: Any) -> MapSummary:
+    """What a model's map can tell apart, and the bytes of its file by part."""
+    tensors, header = contents(model)
+    fixed = {
+        name: sum(tensor.nbytes for tensor in weights_of(model, part).values())
+        for name, part in (("backbone", "features"), ("whitening", "whitening"))
+    }
+    fixed["names"] = len(header["names"] or "")
+    summary: MapSummary = model.map.summary()
+    rest = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
+    return summary.with_parts(fixed=fixed | {"header": rest})
+
+
+def write_model(path: Path, model: Any) -> None:
+    """Write a model that has learned a map or a descriptor.
+
+    Raises:
+        InputError: weights that were changed since they were rounded, values that no file may hold, or the
+            file cannot be written.
+    """
+    _check_rounded(model)
+    tensors, header = contents(model)
+    checked_fields(header, HEADER, "the model")  # what is written can be read
+    checked(header["map"], model.map.state, "the map")
+    try:
+        json_values(json.dumps(header))
+    except ValueError as error:
+        raise InputError(f"the model cannot be written: {error}") from error
+    write_map(path, tensors, header)
+
+
+def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -> M:
+    """The model of a map file.
+
+    Args:
+        make: `DejaVu`. features: see `DejaVu.load`.
+
+    Raises:
+        InputError: as `DejaVu.load`.
+    """
+    with opened(path) as (tensors, header):
+        if features is not None and recipe_of(features) not in with_parts(header["features"]):
+            raise InputError(f"it was learned with {difference(header['features'], recipe_of(features))}")
+        weights = unpacked(tensors, "features.")
+        if features is None:
+            with torch.device("meta"):  # a claim of large layers allocates nothing
+                probe = nn.ModuleDict({"features": _part(header, "features", None)})
+                own = {name: one for name, one in weights.items() if name.startswith("features.")}
+                probe.load_state_dict(own, assign=True)
+        parts = {name: _part(header, name, features) for name in PARTS}
+        parts["whitening"] = parts["whitening"] or "none"
+        model: Any = make(**parts, **{name: header[name] for name in SETTINGS})
+        _fill(model.map, tensors, header["map"])
+        check_types(weights, model.features)
+        rest = {name: weight for name, weight in weights.items() if not name.startswith("map.")}
+        loaded = model.load_state_dict(rest, strict=False)
+        missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
+        if missing or loaded.unexpected_keys:
+            raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
+        model.weight_bits = 8 if len(weights) < len(tensors) else 32
+        _check_rounded(model)
+        _set_state(model, header, len(model.map.positions) or model.map.places)
+        model.check()
+        return model  # type: ignore[no-any-return]
+
+
+def read_place_map(path: Path) -> PlaceMap:
+    """The map of a file alone, without what made its features.
+
+    Raises:
+        InputError: as `DejaVu.load`.
+    """
+    with opened(path) as (tensors, header):
+        route: PlaceMap = _part(header, "mapper", None).empty()
+        if header["map"].get("places") == 0:
+            raise InputError(NO_MAP)
+        _fill(route, tensors, header["map"])
+    return route
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
+    """Tensors and header of a map file; what is refused of them within the block names the file.
+
+    Raises:
+        InputError: as `DejaVu.load`.
+    """
+    tensors, values = read_map(path)
+    try:
+        header = checked_fields(values, HEADER, "its header")
+        known = [cls.kind for cls in REGISTRY.values() if issubclass(cls, Mapper)]
+        if header["map"].get("kind") not in known:
+            seen = f"a map of kind {header['map'].get('kind')!r:.40}"
+            raise InputError(f"{seen}; this version knows {', '.join(known)}")
+        yield tensors, header
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (RuntimeError, RecursionError) as error:  # tensors that torch does not load, or endless nesting
+        raise InputError(f"{path} does not fit its modules: {one_line(error)}") from error
+
+
+def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> Any:
+    kind, _ = PARTS[name]
+    return None if header[name] is None else build(header[name], kind, features)
+
+
+def _fill(route: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
+    """Give an empty map what a file holds of it; nothing if there is only a descriptor."""
+    checked(state, route.state, "its map")
+    own = _below(tensors, "map.")
+    if own or state["places"]:
+        route.load_packed(own, state)
+    else:
+        route.set_extra_state(state)
+
+
+def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
+
+
+def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:
+    """Refuse whole numbers for weights that are none, such as those of 8 bits without their scales."""
+    for name, own in features.state_dict().items():
+        stored = tensors.get(f"features.{name}")
+        is_float = isinstance(own, Tensor) and own.dtype.is_floating_point
+        if is_float and stored is not None and not stored.dtype.is_floating_point:
+            kind = str(stored.dtype).removeprefix("torch.")
+            raise InputError(f"it does not fit: features.{name} is of {kind}; expected float numbers")
+
+
+def _check_rounded(model: Any) -> None:
+    if model.weight_bits == 8 and not is_rounded(model.features):
+        raise InputError(
+            f"weights of {type(model.features).__name__} are not rounded to 8 bits; expected all of them, "
+            "and none changed since: a DejaVu that is made of them with weight_bits=8"
+        )
