@@ -48,7 +48,6 @@ from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.maps.weights import BITS, is_rounded, packed, round_weights, unpacked
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
-from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
@@ -1420,13 +1419,12 @@ def _build(header: Header, name: str, features: nn.Module | None) -> nn.Module |
     recipe: Recipe | None = getattr(header, name)
     if recipe is None:
         return None
-    # only learning needs what found the periods: one from elsewhere need not be built
-    periods = recipe.init_args.get("periods")
-    if name == "mapper" and periods is not None:
-        finder = checked(periods, Recipe, "its periods")
-        if finder.class_path not in REGISTRY:
+    # only learning needs what found the periods: without one of this package the mapper has none
+    if name == "mapper" and "periods" in recipe.init_args:
+        periods = recipe.init_args["periods"]
+        if periods is None or checked(periods, Recipe, "its periods").class_path not in REGISTRY:
             plain = recipe._replace(init_args=recipe.init_args | {"periods": None})
             mapper = build(plain, TemplateMapper, REGISTRY)
-            mapper.periods = ForeignPeriods(*finder)
+            mapper.periods = None
             return mapper
     return build(recipe, PARTS[name], REGISTRY, features)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 from torch import nn
 
 from dejavu_torch.maps.schema import checked, checked_fields
-from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.types import InputError
 
 M = TypeVar("M", bound=nn.Module)
@@ -32,8 +31,6 @@ def recipe_of(module: nn.Module, registry: Registry) -> Recipe:
         registry: the classes that a map may name, which keep each constructor argument under its own name.
             Of any other module only the class path is recorded, and the caller gives the object when loading.
     """
-    if isinstance(module, ForeignPeriods):
-        return Recipe(module.class_path, module.init_args)
     cls = type(module)
     known = registry.get(cls.__name__) is cls
     arguments = {name: getattr(module, name) for name in inspect.signature(cls).parameters} if known else {}
