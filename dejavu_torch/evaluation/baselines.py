@@ -16,10 +16,9 @@ from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.maps.template_map import TemplateMap
+from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.recognition.localizer import SINGLE, Matcher, Matching
 from dejavu_torch.types import InputError, Match, Traverse
 
@@ -152,7 +151,7 @@ def baselines_of(
         control, order = null_model(model, reference, seed, same_plan)
         return Baseline(f"null: {name}", control.found(query, matching, order))
 
-    foreign = isinstance(getattr(model.mapper, "periods", None), ForeignPeriods)
+    foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
         log.warning("no null control learned anew: what found the map's periods is not of this package")
     if isinstance(model.map, SpectralMap):

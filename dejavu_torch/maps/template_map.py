@@ -449,12 +449,16 @@ class TemplateMapper(Mapper):
                 f"periods is a {type(periods).__name__}; expected a PeriodFinder such as SpectrogramAnalysis"
             )
         self.trainable = trainable
-        self.periods = SpectrogramAnalysis() if periods is None else periods
+        self.periods: PeriodFinder | None = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
         self.templates = PhaseTemplates()
         self.empty()  # refuses what a map would
 
     def forward(self, features: Tensor) -> TemplateMap:
+        if self.periods is None:  # of a map file
+            raise InputError(
+                "what found the map's periods is not of this package; expected a mapper with it to learn anew"
+            )
         plan = self.periods.plan(features)
         return self._map(plan, self.templates(features, plan), *features.shape).to(features.device)
 
