@@ -27,26 +27,18 @@ class Coder(nn.Module):
     one. Training therefore adds noise to the whitened descriptor, in place of the days that it does not see.
 
     Args:
-        inputs: K, of a descriptor.
-        dimension: D, number of features, not standardised yet.
+        inputs: K, of a descriptor. dimension: D, of the code, not standardised yet.
         hidden: width of the hidden layer.
         noise: its standard deviation beside components of about 1, in training mode.
         kept: number of components that whitening keeps; fewer if K is smaller.
 
     Shape: (B,K) -> (B,D).
 
-    Convention: before `whiten` the components are the first numbers of the descriptor. They are scaled to
-        length sqrt(components) before the noise, and after it.
+    Convention: components are the first numbers of the descriptor until `whiten`. They are scaled to length
+        sqrt(components) before the noise, and after it.
 
     Raises:
         InputError: settings out of range.
-
-    Example:
-        >>> coder = Coder(inputs=8, dimension=4, hidden=16).eval()
-        >>> views, places = torch.randn(2, 32, 8)
-        >>> coder.whiten(views, places)
-        >>> coder(views).shape
-        torch.Size([32, 4])
     """
 
     mean: Tensor
@@ -100,8 +92,8 @@ class Embedding(nn.Module):
 
     Args:
         network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K), which are averaged, or vectors
-            (B,K), such as `kornia.feature.HardNet()` with 1 channel of 32 x 32. Of a tuple, list or dict the
-            first vectors count, or its only tensor.
+            (B,K), such as `kornia.feature.HardNet()` with 1 channel of 32 x 32. Of several outputs the first
+            vectors count.
         dimension: D, number of features; None gives the pooled output itself.
         channels: of the network's input, 3 or 1; grey frames are repeated, colours become luminance.
         resize: (height, width) in pixels that frames are resized to, antialiased.
@@ -111,13 +103,11 @@ class Embedding(nn.Module):
         noise, kept: of the `Coder`.
         layer: name of the submodule, as in `named_modules`, that the network ends at, see `up_to`.
         mean, std: of each channel, or one number for all, subtracted from the frames in [0, 1] and divided
-            out last before the network; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet
-            trained. None is 0, and 1.
-        output: index of the member of a tuple, list or dict that counts instead, negative from its end.
+            out last; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet trained. None is 0, and
+            1.
+        output: index of the member of a tuple, list or dict that counts instead.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
-
-    Convention: the network's output shape is found by running it once on a frame, in eval mode.
 
     Raises:
         InputError: settings out of range, a network that cannot take such frames, or has no such layer or
@@ -127,8 +117,6 @@ class Embedding(nn.Module):
         >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
         >>> Embedding(blocks, dimension=8, grid=2)(torch.rand(2, 3, 32, 32)).shape
         torch.Size([2, 8])
-        >>> Embedding(blocks, dimension=None, layer="0", mean=0.5, std=0.5)(torch.rand(2, 1, 32, 32)).shape
-        torch.Size([2, 4])
     """
 
     offset: Tensor

@@ -100,10 +100,7 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
 
 
 def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
-    """Refuse a network whose features of a frame depend on the other frames of the batch.
-
-    Args:
-        module: in eval mode. features: (B,D) that it made of the frames, unless these are ready features.
+    """Refuse a network, in eval mode, whose features of a frame depend on the other frames of the batch.
 
     Raises:
         InputError: those of the first frame differ by over 1e-3 of their length, or what its numbers round

@@ -21,19 +21,14 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: boo
 
     Args:
         batches: each (B,D), one number type.
-        in_memory: about how many bytes to keep in memory. More spill to a temporary file, which the tensor
-            then maps: rows are read when they are used. It has no name and goes with the tensor or the
-            process.
+        in_memory: about how many bytes to keep in memory. More spill to a temporary file without a name,
+            which the tensor then maps: rows are read when they are used.
         half: whether the file holds float16.
 
     Shape: (B,D), ... -> (N,D); on the CPU if it spilled.
 
     Raises:
         InputError: batches of different D or number type, none at all, or no room for the file.
-
-    Example:
-        >>> concatenate(torch.arange(6.0).view(3, 2).split(2)).tolist()
-        [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]
     """
     parts: list[Tensor] = []
     file: IO[bytes] | None = None

@@ -50,14 +50,6 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
     """One channel of colour frames, see `Preprocess`; grey frames pass unchanged as "grey".
 
     Shape: (B,C,H,W) -> (B,1,H,W); a difference lies in [-1, 1].
-
-    Raises:
-        InputError: not (B,C,H,W) float, an unknown channel, or frames that do not have it.
-
-    Example:
-        >>> sky = torch.tensor([0.25, 0.5, 1.0]).view(1, 3, 1, 1)
-        >>> select_channel(sky, "R-B").item()
-        -0.75
     """
     check_frames(frames, "preprocess")
     name, count = channel_name(channel), frames.shape[1]
@@ -92,15 +84,12 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
 
     Shape: (B,C,H,W) -> (B,C,H,W), mean about 0, unbounded.
 
-    Convention: the patch slides with the pixel, so that there are no edges between patches; at the border
-        only pixels inside the frame count. The standard deviation divides by the number of pixels, and is at
-        least 1/255, so that noise in a flat sky is not amplified. Above that floor a gain and an offset of
-        brightness change nothing. Gradients are finite everywhere.
+    Convention: the patch slides with the pixel; at the border only pixels inside the frame count. The
+        standard deviation divides by their number, and is at least 1/255, so that noise in a flat sky is not
+        amplified; above that a gain and an offset of brightness change nothing. Gradients are finite
+        everywhere.
 
     Source: Milford and Wyeth, SeqSLAM, ICRA 2012; there in patches side by side.
-
-    Raises:
-        InputError: not (B,C,H,W) float, a bad patch, or a frame smaller than it.
 
     Example:
         >>> checks = (torch.arange(8)[:, None] + torch.arange(8)).remainder(2)[None, None]
@@ -131,17 +120,8 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
 
     Shape: (B,C,H,W) in [0, 1] -> the same.
 
-    Convention: a table of 256 grey levels has no gradient: it is passed straight through, as if the output
-        followed the input one to one. Kornia's differentiable form gives other values (up to 0.3 away).
-
-    Raises:
-        InputError: not (B,C,H,W) float, a bad clip limit or grid, values outside [0, 1], or no more pixels
-            than tiles along one side.
-
-    Example:
-        >>> dull = 0.4 + 0.2 * torch.rand(1, 1, 64, 64)
-        >>> bool(equalise(dull, grid=(2, 2)).std() > dull.std())
-        True
+    Convention: a table of 256 grey levels has no gradient: it passes as if the output followed the input one
+        to one. Kornia's differentiable form gives other values (up to 0.3 away).
     """
     check_frames(frames, "preprocess")
     check_clahe(clip_limit, grid)
@@ -176,13 +156,13 @@ class Preprocess(nn.Module):
             and at least once, as all do in tiles under 256 / clip_limit pixels; 0 is no limit.
         grid: (rows, columns) of tiles for "clahe"; they need not divide the frame.
         size: pixels that the longer side of a traverse's frames is reduced to if it has more, but no further
-            than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so as frames are
-            read; forward does not.
+            than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so, forward does
+            not.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
     Convention: without channel and contrast the input itself is returned, whatever it is. Before "clahe"
-        a difference of channels d in [-1, 1] becomes (d + 1) / 2, in [0, 1].
+        a difference of channels d in [-1, 1] becomes (d + 1) / 2.
 
     Raises:
         InputError: settings out of range; forward: frames that do not fit them.

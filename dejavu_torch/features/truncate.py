@@ -44,14 +44,10 @@ def _traced_calls() -> OrderedDict[str, Any]:
 
 
 def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
-    """A copy of a network that `run` ends at a layer.
-
-    Args:
-        layer: name of a submodule, as in `named_modules`; the first of its runs counts.
-        frames: that the network is tried with.
+    """A copy of a network that `run` ends at a layer, the name of a submodule; the first of its runs counts.
 
     Convention: modules that have not run when the layer is done are left out of the copy, unless it gives
-        something else without them. The names of the others stay.
+        something else without them on `frames`. The names of the others stay.
 
     Raises:
         InputError: no such layer, or one that the network does not run.

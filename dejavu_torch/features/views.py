@@ -31,11 +31,7 @@ class Views(NamedTuple):
 
 
 class _Augmented(Traverse):
-    """Blocks of frames of a traverse, each augmented several times.
-
-    Raises:
-        InputError: ready features, or strengths that `Augmentation` refuses.
-    """
+    """Blocks of frames of a traverse, each augmented several times."""
 
     def __init__(
         self,
@@ -84,11 +80,8 @@ class AugmentedTraverse(_Augmented):
     """Augmented copies of a traverse's frames: one of each frame of a block, another of each, and so on.
 
     Args:
-        traverse: frames (B,C,H,W).
-        frames: their number N.
+        traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
         copies: of each frame. most: in all; frames are drawn evenly if there would be more.
-        strengths: arguments of `Augmentation`.
-        seed: of the copies.
 
     Raises:
         InputError: ready features, or strengths that `Augmentation` refuses.
@@ -121,17 +114,14 @@ class AugmentedTraverse(_Augmented):
 class Stretches(_Augmented):
     """Stretches of a traverse, each frame as it may look on another visit, by which a map is calibrated.
 
-    Every 10th stretch of 20 frames is used, shorter ones of a short traverse; several times if that is
-    little, and fewer of a long one: 1200 frames of one of 10^5, down to 240 of longer ones. Each frame is
-    changed separately, 1.5 times as much as by `strengths`.
+    Every 10th stretch of 20 frames, shorter ones of a short traverse; several times if that is little, and
+    fewer of a long one: 1200 frames of one of 10^5, down to 240 of longer ones. Each frame changes
+    separately.
 
     Args:
-        traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
-        seed: of the changes. places: of the map, among which they are searched; None is N.
+        traverse, frames, strengths: see `AugmentedTraverse`; changes are 1.5 times as strong.
+        places: of the map, among which they are searched; None is N.
         starts: of stretches of 20 frames, increasing, in place of every 10th.
-
-    Raises:
-        InputError: ready features, or strengths that `Augmentation` refuses.
     """
 
     def __init__(

@@ -45,24 +45,15 @@ def learned_whitening(
 
     With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m] and
     W = (1 - a) C + a tr(C) / K I, the columns of P are the `kept` directions with the largest
-    p^T B p / p^T W p, the largest first, scaled to p^T W p = 1 (learned whitening of Mikolajczyk and Matas,
-    ICCV 2007; a linear discriminant analysis of pairs).
+    p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
 
     Args:
-        kept: K', at most K.
         shrinkage: a, above 0 and at most 1; None is `oracle_shrinkage`, and at least 0.03.
 
-    Shape: (n,K), (n,K) -> mean (K,), P (K,K'), float32.
+    Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
 
     Raises:
         InputError: shapes that do not fit, or views that equal their places but for rounding, or not finite.
-
-    Example:
-        >>> places = torch.tensor([[0.0, 3.0], [0.0, -3.0]])
-        >>> views = places + torch.tensor([[4.0, 0.0], [4.0, 0.0]])  # the first number is the weather's
-        >>> mean, projection = learned_whitening(views, places, 1)
-        >>> bool(projection[0].abs() < projection[1].abs())
-        True
     """
     if views.ndim != 2 or views.shape != places.shape or not 1 <= kept <= views.shape[1]:
         seen = f"{tuple(views.shape)}, {tuple(places.shape)} and {kept} to keep"
@@ -79,7 +70,8 @@ def learned_whitening(
     if not scale.isfinite() or not scale > 1e-10 * size:
         raise InputError(
             f"the descriptors of {n} views differ from those of their places by {scale.item():.2g} in the "
-            "mean square; expected a finite number, and more than rounding: an augmentation or a second traverse"
+            "mean square; expected a finite number, and more than rounding: an augmentation, or a second "
+            "traverse"
         )
     if shrinkage is None:
         shrinkage = max(SHRINKAGE, oracle_shrinkage(within, n))
@@ -94,8 +86,7 @@ def learned_whitening(
 def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
     """How much of a covariance (K,K) of Gaussian samples to replace by a multiple of the identity, 0 to 1.
 
-    Source: oracle approximating shrinkage: Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal
-        Processing 58 (2010), eq. 23.
+    Source: Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal Processing 58 (2010), eq. 23.
     """
     size, trace = len(covariance), float(covariance.trace())
     square = float(covariance.square().sum())
@@ -111,7 +102,7 @@ class Whitening(nn.Module):
     copies of its frames, or frames of a second traverse.
 
     Args:
-        numbers: K. None is 128, on a short route a quarter of its places; without views 256; at most the
+        numbers: K. None is 128, on a short route a quarter of its places, without views 256; at most the
             rank.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, and more if there are few views.
@@ -125,18 +116,16 @@ class Whitening(nn.Module):
 
     Shape: (B,D) -> (B,K).
 
-    Convention: descriptors have length 1. Without views, as for ready features, they are the principal
-        components with their variances, and a constant number, the root mean square of these, by which a
-            cosine
-        tells long from short. Before `learn` descriptors pass unchanged.
+    Convention: descriptors have length 1. Without views they are the principal components, with their
+        variances, and a constant number, the root mean square of these. Before `learn` descriptors pass
+        unchanged.
 
     Raises:
         InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
             more `numbers` than the rank; forward: descriptors of another dimension.
 
     Example:
-        >>> route = torch.randn(400, 16)
-        >>> whitening = Whitening(numbers=4)
+        >>> route, whitening = torch.randn(400, 16), Whitening(numbers=4)
         >>> whitening.learn(route, [(route + 0.1 * torch.randn(400, 16), torch.arange(400))])
         >>> whitening(route).shape
         torch.Size([400, 4])
@@ -168,9 +157,9 @@ class Whitening(nn.Module):
         counts = 1 <= least <= components and (views or 0) >= 0 and most_views >= 1
         if not counts or bits not in BITS or not all(0 < share <= 1 for share in shares):
             raise InputError(
-                f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected at least 1 number and "
-                "view in all, numbers up to components, 0 views or more, a shrinkage and a power above 0 and at "
-                "most 1, and 4, 8, 16 bits"
+                f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected numbers of at least 1 and "
+                "at most components, 0 views or more, at least 1 in all, a shrinkage and a power above 0 "
+                "and at most 1, bits of 4, 8, 16"
             )
         self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # learned elsewhere: it serves this route unchanged
@@ -202,7 +191,7 @@ class Whitening(nn.Module):
         return len(self.scale) + len(self.length)
 
     def forward(self, descriptors: Tensor, unpacked: Tensor | None = None) -> Tensor:
-        """Descriptors (B,D) -> (B,K); `unpacked`: the result of the method of that name, if it is kept."""
+        """Descriptors (B,D) -> (B,K); `unpacked`: the result of that method, if it is kept."""
         if not self.learned:
             return descriptors
         if descriptors.ndim != 2 or descriptors.shape[1] != len(self.projection):
@@ -238,7 +227,7 @@ class Whitening(nn.Module):
 
         Args:
             places: (N,D), the descriptors of the route; they may lie in a file.
-            views: batches of descriptors (B,D) and the places (B,) that they show; None whitens nothing.
+            views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
         """
         kept = self.kept(len(places), places.shape[1], views is not None)
         found = principal_components(places, kept if views is None else self.components, self.seed)
@@ -264,7 +253,8 @@ class Whitening(nn.Module):
             pairs.append(torch.stack([view - mean, own - mean]) @ basis)
         if not pairs:
             raise InputError("there are no views to whiten with; expected some, or None for none")
-        centre, projection = learned_whitening(*torch.cat(pairs, 1), kept, self.shrinkage)
+        shown, own = torch.cat(pairs, 1)
+        centre, projection = learned_whitening(shown, own, kept, self.shrinkage)
         self.take(mean + basis @ centre, basis @ projection, None)
 
     def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
@@ -289,8 +279,7 @@ class Whitening(nn.Module):
 
 
 def _packed(whole: Tensor, bits: int) -> Tensor:
-    """Whole numbers (D,K) as int8 or int16; of 4 bits as (D,ceil(K/2)) uint8, 8 added to each, the first half
-    of the columns in the low bits."""
+    """Whole numbers (D,K) as int8 or int16; of 4 bits two to a byte, the first half of the columns lower."""
     if bits > 4:
         return whole.to(torch.int8 if bits == 8 else torch.int16)
     low, high = nn.functional.pad(whole + 8, (0, whole.shape[1] % 2)).to(torch.uint8).chunk(2, 1)
@@ -311,7 +300,7 @@ def _check_buffers(projection: Tensor, scale: Tensor, offset: Tensor, length: Te
 
 
 def principal_components(rows: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """The directions in which descriptors vary most, by subspace iteration on SAMPLED of them, drawn evenly.
+    """The directions in which SAMPLED of the descriptors, drawn evenly, vary most, by subspace iteration.
 
     Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first; C is `count` at most.
 
