@@ -89,9 +89,9 @@ class Augmentation(nn.Module):
     def stronger(self, factor: float) -> Augmentation:
         """The same with every strength times a factor, as far as it may go."""
         other = Augmentation()
-        for name, strength in self.strengths.items():
-            scaled = (min(factor * one, most) for one, most in zip(strength, LARGEST[name], strict=True))
-            other.strengths[name] = tuple(scaled)
+        for name, most in LARGEST.items():
+            scaled = (factor * one for one in self.strengths[name])
+            other.strengths[name] = tuple(map(min, scaled, most))
         return other
 
     @torch.no_grad()
@@ -100,14 +100,11 @@ class Augmentation(nn.Module):
             return frames
         (blur,) = self.strengths["blur"]
         radius = max(1, round(blur)) if blur else 0
-        shape = tuple(frames.shape)
-        if frames.ndim not in (4, 5) or frames.dtype != torch.float32:
+        shape, kind = tuple(frames.shape), frames.dtype
+        if len(shape) not in (4, 5) or kind != torch.float32 or min(shape) < 1 or min(shape[-2:]) <= radius:
             raise InputError(
-                f"the frames are {shape} {frames.dtype}; expected float32 (B,C,H,W) or clips (B,T,C,H,W)"
-            )
-        if min(shape) < 1 or min(shape[-2:]) <= radius:
-            raise InputError(
-                f"the frames are {shape}; expected some, of more than {radius} pixels a side to blur"
+                f"the frames are {shape} {kind}; expected some, float32 (B,C,H,W) or clips (B,T,C,H,W), of "
+                f"more than {radius} pixels a side to blur"
             )
         clips = frames if frames.ndim == 5 else frames[:, None]
         clips = self._lit(self._warped(self._coloured(clips)))
@@ -217,11 +214,10 @@ def _homography(angle: Tensor, zoom: Tensor, shift: Tensor, tilt: Tensor) -> Ten
     one, zero = torch.ones_like(angle), torch.zeros_like(angle)
     cos, sin = angle.cos() / zoom, angle.sin() / zoom
     (cos_u, cos_v), (sin_u, sin_v) = tilt.cos(), tilt.sin()
-    turned = [cos, -sin, zero, sin, cos, zero, zero, zero, one]
-    moved = [one, zero, -shift[0], zero, one, -shift[1], zero, zero, one]
+    x, y = -shift
+    turned = [cos, -sin, cos * x - sin * y, sin, cos, sin * x + cos * y, zero, zero, one]
     seen = [cos_u, sin_v * sin_u, zero, zero, cos_v, zero, -sin_u, sin_v * cos_u, one]
-    turn, move, see = (torch.stack(entries, 1).view(-1, 3, 3) for entries in (turned, moved, seen))
-    return turn @ move @ see
+    return torch.stack(turned, 1).view(-1, 3, 3) @ torch.stack(seen, 1).view(-1, 3, 3)
 
 
 def _blurred(clips: Tensor, most: float, radius: int) -> Tensor:
@@ -230,6 +226,5 @@ def _blurred(clips: Tensor, most: float, radius: int) -> Tensor:
     sigma = _uniform(clips, min(0.1, most), most)
     sigma = torch.where(_happens(clips, BLURRED), sigma, NO_BLUR).view(-1, 1).expand(-1, 2)
     size = (2 * radius + 1, 2 * radius + 1)
-    images = gaussian_blur2d(clips.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
-    blurred: Tensor = images.view(clips.shape)
-    return blurred
+    blurred: Tensor = gaussian_blur2d(clips.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
+    return blurred.view(clips.shape)

@@ -142,15 +142,13 @@ class Embedding(nn.Module):
         if not isinstance(network, nn.Module):
             raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
         check_size(resize, 1, "Embedding got resize")
-        least = min(grid, 1 if dimension is None else dimension)
-        if least < 1 or grid > WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
+        coded = hidden == 0 if dimension is None else dimension >= 1
+        if not coded or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
             raise InputError(
                 f"Embedding got dimension={dimension}, channels={channels}, grid={grid}, cell={cell}, "
-                f"hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 or more, a grid of 1 to "
-                f"{WIDEST}, a dimension of at least 1"
+                f"hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 or more (with no dimension "
+                f"hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
             )
-        if dimension is None and hidden:
-            raise InputError(f"Embedding got hidden={hidden}, but no dimension; expected both, or neither")
         self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell
         self.resize = (int(resize[0]), int(resize[1]))  # a map gives a list
         self.hidden, self.noise, self.kept = hidden, noise, kept

@@ -30,22 +30,6 @@ def channel_name(channel: str) -> str:
     return name
 
 
-def check_patch(patch: int) -> None:
-    """Refuse a patch without a middle pixel, or without neighbours."""
-    if patch < 3 or patch % 2 == 0:
-        raise InputError(f"patch is {patch}; expected an odd number of pixels, at least 3")
-
-
-def check_clahe(clip_limit: float, grid: tuple[int, int]) -> None:
-    """Refuse a limit or a grid that makes no sense."""
-    if not 0 <= clip_limit <= MOST_CLIP:
-        raise InputError(
-            f"clip_limit is {clip_limit}; expected a number of at least 0 (no limit), at most {MOST_CLIP:g}"
-        )
-    if len(grid) != 2 or any(tiles < 1 or tiles != int(tiles) for tiles in grid):
-        raise InputError(f"grid is {tuple(grid)}; expected (rows, columns), whole numbers of at least 1")
-
-
 def select_channel(frames: Tensor, channel: str) -> Tensor:
     """One channel of colour frames, see `Preprocess`; grey frames pass unchanged as "grey".
 
@@ -98,7 +82,6 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
         (-1.0, 1.0)
     """
     check_frames(frames, "preprocess")
-    check_patch(patch)
     height, width = frames.shape[-2:]
     if min(height, width) < patch:
         raise InputError(
@@ -124,13 +107,11 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
         to one. Kornia's differentiable form gives other values (up to 0.3 away).
     """
     check_frames(frames, "preprocess")
-    check_clahe(clip_limit, grid)
     if torch.compiler.is_exporting():
         raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")
     from kornia.enhance import equalize_clahe
 
-    rows, columns = int(grid[0]), int(grid[1])
-    height, width = frames.shape[-2:]
+    (height, width), (rows, columns) = frames.shape[-2:], grid
     if height <= rows or width <= columns:
         raise InputError(
             f"clahe got frames of {height} x {width} pixels for a grid of {rows} x {columns} tiles; "
@@ -140,7 +121,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     if not ((fixed >= 0) & (fixed <= 1)).all():
         low, high = fixed.min().item(), fixed.max().item()
         raise InputError(f"clahe got values from {low:g} to {high:g}; expected values in [0, 1]")
-    even = in_parts(lambda part: equalize_clahe(part, float(clip_limit), (rows, columns)), fixed)
+    even = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), fixed)
     return frames + (even - fixed) if frames.requires_grad else even
 
 
@@ -186,8 +167,14 @@ class Preprocess(nn.Module):
             raise InputError(f"size is {size!r}; expected pixels of the longer side, at least 1, or null")
         if contrast is not None and contrast not in get_args(Contrast):
             raise InputError(f"contrast {contrast!r} is unknown; expected 'patch', 'clahe' or None")
-        check_patch(patch)
-        check_clahe(clip_limit, grid)
+        if patch < 3 or patch % 2 == 0:
+            raise InputError(f"patch is {patch}; expected an odd number of pixels, at least 3")
+        if not 0 <= clip_limit <= MOST_CLIP:
+            raise InputError(
+                f"clip_limit is {clip_limit}; expected at least 0 (no limit), at most {MOST_CLIP:g}"
+            )
+        if len(grid) != 2 or any(tiles < 1 or tiles != int(tiles) for tiles in grid):
+            raise InputError(f"grid is {tuple(grid)}; expected (rows, columns), whole numbers of at least 1")
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size

@@ -41,11 +41,13 @@ class _Augmented(Traverse):
         strengths: Mapping[str, Any],
         seed: int,
     ) -> None:
+        if len(traverse.frame_shape) != 3:
+            raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
         try:
             self.augmentation = Augmentation(**strengths)
         except TypeError as error:
-            expected = ", ".join(LARGEST)
-            raise InputError(f"the strengths of whitening are {strengths}; expected {expected}") from error
+            names = ", ".join(LARGEST)
+            raise InputError(f"the strengths of whitening are {strengths}; expected {names}") from error
         self.traverse, self.copies, self.seed = traverse, copies, seed
         self.places = torch.cat([block.repeat(copies) for block in blocks])
         self.length = len(self.places)
@@ -96,7 +98,6 @@ class AugmentedTraverse(_Augmented):
         strengths: Mapping[str, Any],
         seed: int = 0,
     ) -> None:
-        _require_frames(traverse)
         self.shown = range(0, frames, max(1, -(-frames * copies // most)))
         self.block = traverse.batch_size(BLOCK)  # whatever the batch size: the same copies
         super().__init__(traverse, torch.tensor(self.shown).split(self.block), copies, strengths, seed)
@@ -133,7 +134,6 @@ class Stretches(_Augmented):
         places: int | None = None,
         starts: Sequence[int] | None = None,
     ) -> None:
-        _require_frames(traverse)
         length = min(STRETCH, max(1, frames // EVERY)) if starts is None else STRETCH
         starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
         most = min(MOST, max(LEAST, SCORES // (places or frames)))
@@ -154,8 +154,3 @@ class Stretches(_Augmented):
         for start in self.starts:
             yield torch.stack(list(islice(frames, start - at, start - at + self.stretch)))
             at = start + self.stretch
-
-
-def _require_frames(traverse: Traverse) -> None:
-    if len(traverse.frame_shape) != 3:
-        raise InputError(f"{traverse.name} holds ready features; expected frames to augment")

@@ -34,7 +34,6 @@ STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
     if max(strength)
 }
 LEAST = 1e-12  # absolute value that a power is applied to
-BITS = (4, 8, 16)  # of a number of the projection
 ROUNDING = 1e-7  # of the largest variance: below it there is none
 
 
@@ -53,11 +52,8 @@ def learned_whitening(
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
 
     Raises:
-        InputError: shapes that do not fit, or views that equal their places but for rounding, or not finite.
+        InputError: views that equal their places but for rounding, or not finite.
     """
-    if views.ndim != 2 or views.shape != places.shape or not 1 <= kept <= views.shape[1]:
-        seen = f"{tuple(views.shape)}, {tuple(places.shape)} and {kept} to keep"
-        raise InputError(f"learned_whitening got {seen}; expected (n,K) twice, and 1 to K to keep")
     n, k = views.shape
     within, second = views.new_zeros(2, k, k, dtype=torch.float64)
     mean = views.new_zeros(k, dtype=torch.float64)
@@ -155,7 +151,7 @@ class Whitening(nn.Module):
         self.most_views, self.seed, self.bits, self.power = most_views, seed, bits, power
         least, shares = 1 if numbers is None else numbers, (power, 1 if shrinkage is None else shrinkage)
         counts = 1 <= least <= components and (views or 0) >= 0 and most_views >= 1
-        if not counts or bits not in BITS or not all(0 < share <= 1 for share in shares):
+        if not counts or bits not in (4, 8, 16) or not all(0 < share <= 1 for share in shares):
             raise InputError(
                 f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected numbers of at least 1 and "
                 "at most components, 0 views or more, at least 1 in all, a shrinkage and a power above 0 "
