@@ -162,9 +162,9 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
     arguments |= {key: build(part, nn.Module, given) for key, part in parts.items()}
     if "periods" not in recipe.init_args or "periods" in parts:
         return cls(**arguments)
-    module = cls(**arguments | {"periods": None})
+    module: Any = cls(**arguments | {"periods": None})
     module.periods = None
-    return module
+    return module  # type: ignore[no-any-return]
 
 
 def weights_of(model: Any, part: str) -> dict[str, Tensor]:

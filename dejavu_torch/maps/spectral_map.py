@@ -305,7 +305,7 @@ class SpectralMap(PlaceMap):
         return route
 
     @property
-    def routes(self) -> tuple[Route, ...]:
+    def routes(self) -> tuple[Route, ...]:  # type: ignore[override]
         """See `PlaceMap`."""
         ends = [0, *torch.tensor([one.chunks for one in self._routes]).cumsum(0).tolist()]
         return tuple(
@@ -485,7 +485,7 @@ class SpectralMap(PlaceMap):
 
     def _save_to_state_dict(self, *args: Any) -> None:
         self._encode()
-        super()._save_to_state_dict(*args)  # type: ignore[no-untyped-call]
+        super()._save_to_state_dict(*args)
 
     def disagreement(self) -> str:
         """See `PlaceMap`."""
