@@ -29,7 +29,7 @@ from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.model_file import difference, recipe_of
+from dejavu_torch.model_file import difference, recipe_of, run_key
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.types import InputError, Traverse
 
@@ -91,7 +91,7 @@ def append(
     part, found = SpectralMap(route.means, **route.settings(), step=route.step), None
     if checkpoint is not None:
         sums = checksums(route.packed(), route.get_extra_state())
-        found = checkpoint.open(model.run_key(added, visits=visits) | digests(map=sums))
+        found = checkpoint.open(run_key(model, added, visits=visits) | digests(map=sums))
     if found is not None:
         part.load_packed({name[4:]: t for name, t in found[0].items() if name[:4] == "map."}, found[1]["map"])
     visits = visits and model.describer.read_anywhere(visits, text)
@@ -239,7 +239,7 @@ def second_traverse(model: DejaVu, reference: Traverse, second: Traverse, truth:
     Raises:
         InputError: no whitening that could learn from it, or as of `associate`.
     """
-    model.require_learning_whitening(second.name)
+    model.describer.require_learning(second.name)
     return associate(model, reference, second, truth)
 
 

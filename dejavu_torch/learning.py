@@ -76,6 +76,16 @@ class Describer(NamedTuple):
         """Descriptors of features, (B,D) -> (B,K); the features themselves without whitening."""
         return features if self.whitening is None else self.whitening(features)
 
+    def require_learning(self, name: str) -> None:
+        """Refuse a second traverse that no whitening learns from.
+
+        Raises:
+            InputError: naming it.
+        """
+        if self.whitening is None or self.whitening.fixed:
+            seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
+            raise InputError(f"{seen} to learn from {name}; expected one that is learned")
+
     def warn_of_bright(self, frames: Tensor, name: str) -> None:
         """Once for each traverse, see `warn_of_bright`."""
         if name not in self.bright and warn_of_bright(frames, name):
@@ -95,6 +105,9 @@ class Describer(NamedTuple):
                 `concatenate`'s share of the memory then whiten by a sample, and many descriptors lie in a
                 temporary file, whitened ones as float16, which is finer than any step.
         """
+
+        if second is not None:
+            self.require_learning(second.traverse.name)
 
         def check_first(frames: Tensor, features: Tensor) -> None:
             self.warn_of_bright(frames, traverse.name)
@@ -444,7 +457,7 @@ def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     }
 
 
-def learn(
+def learn_map(
     describer: Describer,
     mapper: Mapper,
     traverse: Traverse,
@@ -636,7 +649,7 @@ def _with_places(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Te
         done += len(batch)
 
 
-def calibrate(
+def calibration_of(
     describer: Describer,
     route: PlaceMap,
     reference: Traverse | None,

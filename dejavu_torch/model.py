@@ -13,9 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from dejavu_torch import learning
 from dejavu_torch.data.arrays import as_traverse
-from dejavu_torch.data.fitted import at_size
+from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
 from dejavu_torch.features.extract import check_queries, features_of
 from dejavu_torch.features.hog import HOG
@@ -23,8 +22,17 @@ from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
-from dejavu_torch.learning import Checkpoint, Code, Describer, code_here
-from dejavu_torch.maps.file import HEADER, checksums, digests
+from dejavu_torch.learning import (
+    Checkpoint,
+    Code,
+    Describer,
+    calibration_of,
+    code_here,
+    is_ready,
+    learn_descriptors,
+    learn_map,
+    positions_of,
+)
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
@@ -33,29 +41,26 @@ from dejavu_torch.model_file import (
     CLASSES,
     model_state,
     read_model,
-    recipes_of,
+    run_key,
     summary_of,
     take_state,
-    weights_of,
     write_model,
 )
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
-from dejavu_torch.recognition.calibration import Calibration, Platt
+from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.localizer import Localizer, Matcher, Matching
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Best, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
-from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
+from dejavu_torch.resize import reduced_size
 from dejavu_torch.types import (
     BATCH_NUMBERS,
-    FRAME_NUMBERS,
     InputError,
     Match,
     SequenceModel,
     Training,
     Traverse,
 )
-from dejavu_torch.version import __version__
 
 log = logging.getLogger("dejavu_torch")
 
@@ -154,7 +159,9 @@ class DejaVu(nn.Module):
         self.frame_names: list[str] = []  # of the reference's frames; empty where they have none
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
-        self._find: Callable[[Tensor, int], Best] | None = None  # finds places in place of `search`
+        self.find: Callable[[Tensor, int], Best] | None = (
+            None  # finds places in place of `search`, as a cluster
+        )
         self._reduces = False  # whether `_reduce` has set the whitening
         self._told: set[tuple[str, str]] = set()  # lines that are said once
         self._bright: set[str] = set()  # traverses that were said to be bright
@@ -200,10 +207,10 @@ class DejaVu(nn.Module):
         traverse = self.resample(as_traverse(traverse), progress=progress)
         before = None if self.whitening is None else self.whitening.state_dict()
         self._reduce(traverse)
-        run = None if checkpoint is None else (checkpoint, lambda: self.run_key(traverse, second, visits))
+        run = None if checkpoint is None else (checkpoint, lambda: run_key(self, traverse, second, visits))
         text = "learning" if progress else None
         try:
-            route = learning.learn(self.describer, self.mapper, traverse, second, visits, text, run, code)
+            route = learn_map(self.describer, self.mapper, traverse, second, visits, text, run, code)
         except InputError:  # the map that there was is of its own whitening
             if self.whitening is not None and before is not None:
                 self.whitening.load_state_dict(before)
@@ -218,9 +225,9 @@ class DejaVu(nn.Module):
             traverse: what they come from, where known: the map then knows what frames to expect, and,
                 where they were resampled, which frame each place shows.
         """
-        overhead = learning.positions_of(traverse).nbytes
-        mapper = self.mapper.with_overhead(overhead, learning.is_ready(traverse))
-        return self._take(learning.learn_descriptors(mapper, features), traverse)
+        overhead = positions_of(traverse).nbytes
+        mapper = self.mapper.with_overhead(overhead, is_ready(traverse))
+        return self._take(learn_descriptors(mapper, features), traverse)
 
     def describe_reference(
         self, traverse: Traverse, second: Views | None = None, progress: str | None = None
@@ -233,54 +240,25 @@ class DejaVu(nn.Module):
         Raises:
             InputError: as `learn`, or a second traverse that no whitening learns from.
         """
-        if second is not None:
-            self.require_learning_whitening(second.traverse.name)
         self._reduce(traverse)
         return self.describer.reference(traverse, second, progress, isinstance(self.mapper, SpectralMapper))
 
     @property
     def describer(self) -> Describer:
         """How the model describes frames now."""
-        pixels = math.prod(self._resize or (1,))  # fewer frames at a time if they are brought to a large size
+        pixels = math.prod(own_size(self.features) or (1,))  # fewer frames at a time if these become large
         batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
-        return Describer(self.pipeline, self.whitening, batch, self.map.positions.device, self._bright)
-
-    def run_key(
-        self, traverse: Traverse, second: Views | None = None, visits: Views | None = None
-    ) -> dict[str, str]:
-        """What the chunks of a traverse are made of, as digests: see `Checkpoint`."""
-        header = recipes_of(self)
-        header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in self.modules()})))
-        header |= {"batch_size": self.describer.batch_size, "sample": learning.SAMPLE}
-        header |= {"version": __version__, "torch": torch.__version__}
-        fixed = self.whitening is not None and self.whitening.fixed
-        weights = weights_of(self, "features") | (weights_of(self, "whitening") if fixed else {})
-        sums = checksums(weights, header)
-        sources = {
-            name: views and [views.traverse.identity(), views.places.tolist()]
-            for name, views in (("second", second), ("visits", visits))
-        }
-        source = [traverse.identity(), traverse.count()]
-        return digests(source=source, **sources) | {"settings": sums.pop(HEADER), **sums}
+        pipeline = nn.Sequential(self.preprocess, self.features)
+        return Describer(pipeline, self.whitening, batch, self.map.positions.device, self._bright)
 
     def _reduce(self, traverse: Traverse) -> None:
         """Ready features too wide for a spectral map become principal components without whitening, too."""
-        ready = learning.is_ready(traverse) and isinstance(self.mapper, SpectralMapper)
+        ready = is_ready(traverse) and isinstance(self.mapper, SpectralMapper)
         wide = ready and traverse.frame_shape[0] > WIDEST
         if wide and self.whitening is None:
             self.whitening, self._reduces = Whitening(views=0).to(self.map.positions.device), True
         elif self._reduces and not wide:  # of a route that was learned before
             self.whitening, self._reduces = None, False
-
-    def require_learning_whitening(self, name: str) -> None:
-        """Refuse a second traverse that no whitening learns from.
-
-        Raises:
-            InputError: naming it.
-        """
-        if self.whitening is None or self.whitening.fixed:
-            seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
-            raise InputError(f"{seen} to learn from {name}; expected one that is learned")
 
     def take_whitening(self, other: DejaVu) -> None:
         """Describe as another model does: its whitening as it is, and what is ahead of it.
@@ -306,10 +284,6 @@ class DejaVu(nn.Module):
         """
         self.preprocess, self.features = other.preprocess, other.features
         self.weight_bits = other.weight_bits
-
-    def without_map(self) -> DejaVu:
-        """What makes the descriptors, by itself: it serves any route, at its own steps."""
-        return DejaVu(**(self.settings() | {"velocity": None})).train(self.training)
 
     def resample(
         self,
@@ -337,28 +311,21 @@ class DejaVu(nn.Module):
         Returns:
             The traverse itself where its frames, or ready features, have that size.
         """
-        own = traverse.frame_shape
-        if len(own) != 3 or isinstance(traverse, ResampledTraverse):
+        own = traverse.frame_shape[1:]
+        if len(own) != 2 or isinstance(traverse, ResampledTraverse):
             return traverse
-        height, width = own[1:]
         if shape is None:
             longest = None if traverse.sized else self.preprocess.size
-            size, why = reduced_size((height, width), longest, self._least), "see preprocess.size"
+            size, why = reduced_size(own, longest, least_size(self.features)), "see preprocess.size"
         else:
-            size, why = _size_like((height, width), shape), "the size of the map's frames"
-        if size == (height, width):
+            size, why = size_like(own, shape), "the size of the map's frames"
+        if size == own:
             return traverse
-        line = f"frames of {height} x {width} pixels are brought to {size[0]} x {size[1]}, {why}"
+        line = f"frames of {own[0]} x {own[1]} pixels are brought to {size[0]} x {size[1]}, {why}"
         if (traverse.name, line) not in self._told:
             log.warning("%s: %s", traverse.name, line)
             self._told.add((traverse.name, line))
         return at_size(traverse, size)
-
-    def fit_frames(self, frames: Tensor) -> Tensor:
-        """As `fit`, of a batch of queries: frames (B,C,H,W) at the size of the map's."""
-        if frames.ndim != 4 or self.frame_shape is None:
-            return frames
-        return resize_frames(frames, _size_like((frames.shape[2], frames.shape[3]), self.frame_shape))
 
     def _take(self, route: PlaceMap, traverse: Traverse | None) -> DejaVu:
         """The map that was learned from a traverse, in eval mode."""
@@ -369,7 +336,7 @@ class DejaVu(nn.Module):
             )
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast are left as they are")
-        device, positions = self.map.positions.device, learning.positions_of(traverse)
+        device, positions = self.map.positions.device, positions_of(traverse)
         route = route.to(device)  # many descriptors lie in a file, on the CPU
         if len(positions):
             route.positions = positions.to(device)
@@ -377,7 +344,7 @@ class DejaVu(nn.Module):
         self.step = traverse.step if isinstance(traverse, ResampledTraverse) else None
         frames = len(positions) or route.places
         self.frame_names = [] if traverse is None else names_of(source_of(traverse), frames)
-        self.map, self._find, self.frame_shape = route, None, shape or None
+        self.map, self.find, self.frame_shape = route, None, shape or None
         self.trained = self.calibration = None
         return self.eval()
 
@@ -417,7 +384,7 @@ class DejaVu(nn.Module):
         own = None
         if reference is not None and views is None:
             own = self.fit(as_traverse(reference), self.frame_shape or ())
-        self.calibration = learning.calibrate(self.describer, self.map, own, views, places)
+        self.calibration = calibration_of(self.describer, self.map, own, views, places)
         return self
 
     def describe(self, frames: Tensor) -> Tensor:
@@ -432,7 +399,8 @@ class DejaVu(nn.Module):
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
         self._require_map()
-        queries = self.fit_frames(queries) if isinstance(queries, Tensor) else queries
+        if isinstance(queries, Tensor):
+            queries = resize_like(queries, self.frame_shape)
         features = features_of(queries, self.describe, "the query")
         self.check_queries(tuple(queries.shape[1:]), features.shape[1], "the query")
         return self.map.scores(self.whitened(features))
@@ -493,7 +461,7 @@ class DejaVu(nn.Module):
         check_search(matching.search)
         if matching.sequence is not None:
             matching.sequence.check(None, self.map.places)
-        return Localizer(self.map, matching, self._find)
+        return Localizer(self.map, matching, self.find)
 
     def matches(
         self,
@@ -509,9 +477,19 @@ class DejaVu(nn.Module):
         self._require_map()
         if k is not None:
             check_candidates(k, apart, self.map.places)
-        self.check_precision(sequence)
         localizer = self.localizer(self.matching(sequence, search)._replace(k=k, radius=apart))
-        yield from map(localizer, self._checked(queries, progress, sequence))
+        queries = self.fit(as_traverse(queries), self.frame_shape or ())
+        if sequence is not None:
+            sequence.check(queries.length, self.map.places)
+        if self.step is not None:
+            queries = self.resample(queries, self.step, progress is not None, self.frame_shape)
+        shape, name = queries.frame_shape, queries.name
+
+        def on_first(frames: Tensor, features: Tensor) -> None:
+            self.check_queries(shape, features.shape[1], name)
+            self.describer.warn_of_bright(frames, name)
+
+        yield from map(localizer, self.describer.descriptors(queries, progress, on_first))
 
     def candidates(
         self,
@@ -540,47 +518,20 @@ class DejaVu(nn.Module):
         """
         return Match.joined(self.matches(queries, None, sequence, search, k, apart))
 
-    def _checked(
-        self, queries: Traverse | Tensor, progress: str | None, sequence: SequenceModel | None
-    ) -> Iterator[Tensor]:
-        """Descriptors of queries that fit the map, in batches; resampled as the map's places are."""
-        queries = self.fit(as_traverse(queries), self.frame_shape or ())
-        if sequence is not None:
-            sequence.check(queries.length, self.map.places)
-        if self.step is not None:
-            queries = self.resample(queries, self.step, progress is not None, self.frame_shape)
-        shape = queries.frame_shape
-
-        def look(frames: Tensor, features: Tensor) -> None:
-            self.check_queries(shape, features.shape[1], queries.name)
-            self.describer.warn_of_bright(frames, queries.name)
-
-        yield from self.describer.descriptors(queries, progress, look)
-
-    def matching(self, sequence: SequenceModel | None, search: Search = "auto") -> Matching:
-        """A way to match queries, with probabilities where the map is calibrated for it."""
-        return Matching(sequence, rule=self.acceptance(sequence), platt=self._platt(sequence), search=search)
-
-    def _platt(self, sequence: SequenceModel | None) -> Platt | None:
-        return None if self.calibration is None else self.calibration.of(sequence)
-
-    def check_precision(self, sequence: SequenceModel | None) -> None:
-        """Refuse a precision that nothing tells of.
+    def matching(self, sequence: SequenceModel | None = None, search: Search = "auto") -> Matching:
+        """A way to match queries, with probabilities if the map is calibrated for it.
 
         Raises:
-            InputError: the map is not calibrated, or not for this way of matching.
+            InputError: a precision, but the map is not calibrated, or not for this way of matching.
         """
-        if self.precision is None or self._platt(sequence) is not None:
-            return
-        if self.calibration is None:
+        platt = self.calibration and self.calibration.of(sequence)
+        if self.precision is not None and platt is None:
             seen = "the map is not calibrated"
-        else:
-            seen = "the map is calibrated for single queries and for a filter that always searches"
-        raise InputError(f"the precision is {self.precision}, but {seen}; expected a threshold in its place")
-
-    def threshold_of(self, sequence: SequenceModel | None) -> float | None:
-        """What the score of a query, or of a sequence, has to be below; None where nobody said."""
-        return self.threshold if sequence is None else sequence.threshold_of(self.threshold)
+            if self.calibration is not None:
+                seen = "the map is calibrated for single queries and for a filter that always searches"
+            problem = f"the precision is {self.precision}, but {seen}"
+            raise InputError(f"{problem}; expected a threshold in its place")
+        return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search)
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, of single queries or of a sequence (convention 4).
@@ -589,39 +540,16 @@ class DejaVu(nn.Module):
         calibrated for this way of matching, where the probability is at least .5. Else what a filter by
         itself takes for more likely than not, and of other ways every finite score.
         """
-        threshold = self.threshold_of(sequence)
-        if threshold is not None:
-            return Acceptance(threshold)
-        if self.precision is not None:
-            return Acceptance(precision=self.precision)
-        if self._platt(sequence) is not None:
+        threshold = self.threshold if sequence is None else sequence.threshold_of(self.threshold)
+        if threshold is not None or self.precision is not None:
+            return Acceptance(threshold, None if threshold is not None else self.precision)
+        if self.calibration is not None and self.calibration.of(sequence) is not None:
             return Acceptance(precision=PROBABLE, given=False)
         return Acceptance(None if sequence is None else sequence.likely, given=False)
-
-    def search_by(self, find: Callable[[Tensor, int], Best] | None) -> None:
-        """Find the lowest scores by another way than `search`, such as one of a cluster."""
-        self._find = find
-
-    @property
-    def _resize(self) -> tuple[int, int] | None:
-        """The size (height, width) that the features resize frames to, where one of this package's does."""
-        return getattr(self.features, "resize", None) if type(self.features) in CLASSES else None
-
-    @property
-    def _least(self) -> tuple[int, int] | None:
-        """The least size that features can be made of, where that is known."""
-        if self._resize is None and type(self.features) is HOG:
-            return (self.features.cell * self.features.block,) * 2
-        return self._resize
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
         """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""
         return concatenate(self.describer.descriptors(traverse, progress))
-
-    @property
-    def pipeline(self) -> nn.Sequential:
-        """What makes features of frames: preprocess, then features."""
-        return nn.Sequential(self.preprocess, self.features)
 
     def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
         """Refuse queries that do not fit the map, and warn of frames of another size that do.
@@ -665,27 +593,6 @@ class DejaVu(nn.Module):
         """
         return read_model(cls, Path(path), features).eval()
 
-    def check(self) -> None:
-        """Refuse parts of a model that do not fit together.
-
-        Raises:
-            InputError: naming them.
-        """
-        positions, step, shape = self.map.positions, self.step, self.frame_shape
-        resampled = self.velocity is not None and step is not None and step > 0
-        if (len(positions) > 0) != resampled or (step is not None) != resampled:
-            raise InputError(f"it has step {step} and {len(positions)} frame positions")
-        whitening = self.whitening
-        other = self.map.places and whitening is not None and whitening.dimension != self.map.dimension
-        if whitening is not None and whitening.learned and other:
-            raise InputError(
-                f"its whitening makes {whitening.dimension} numbers; expected the map's {self.map.dimension}"
-            )
-        if shape is not None and (
-            len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > FRAME_NUMBERS
-        ):
-            raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
-
     def summary(self) -> MapSummary:
         """What the map can tell apart, and the bytes of its file by part."""
         return summary_of(self)
@@ -711,10 +618,18 @@ class DejaVu(nn.Module):
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
 
 
-def _size_like(own: tuple[int, int], shape: tuple[int, ...]) -> tuple[int, int]:
-    """The size of frames of a shape (C,H,W), for frames of one aspect ratio with it; else their own."""
-    same = len(shape) == 3 and not is_stretched(own, (shape[1], shape[2]))
-    return (shape[1], shape[2]) if same else own
+def own_size(features: nn.Module) -> tuple[int, int] | None:
+    """The size (height, width) that features resize frames to, if a class of this package does."""
+    return getattr(features, "resize", None) if type(features) in CLASSES else None
+
+
+def least_size(features: nn.Module) -> tuple[int, int] | None:
+    """The least size that features can be made of, where that is known."""
+    return (
+        (features.cell * features.block,) * 2
+        if type(features) is HOG and not features.resize
+        else own_size(features)
+    )
 
 
 def check_precision(precision: float | None) -> None:
@@ -725,13 +640,3 @@ def check_precision(precision: float | None) -> None:
     """
     if precision is not None and not 0 < precision < 1:
         raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
-
-
-def _code_of(cls: type[nn.Module]) -> str:
-    """The source of a class of the user's own; "" where there is none, or where a version tells of it."""
-    if cls.__module__.partition(".")[0] in ("dejavu_torch", "torch"):
-        return ""
-    try:
-        return inspect.getsource(cls)
-    except (OSError, TypeError):
-        return ""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,8 +23,20 @@ from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.maps.file import checked, checked_fields, json_values, map_size, read_map, write_map
+from dejavu_torch.learning import SAMPLE
+from dejavu_torch.maps.file import HEADER as FILE_HEADER
+from dejavu_torch.maps.file import (
+    checked,
+    checked_fields,
+    checksums,
+    digests,
+    json_values,
+    map_size,
+    read_map,
+    write_map,
+)
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
@@ -34,7 +47,8 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, Training
+from dejavu_torch.types import FRAME_NUMBERS, InputError, Training, Traverse
+from dejavu_torch.version import __version__
 
 M = TypeVar("M", bound=nn.Module)
 MOST_PARTS = 16  # of a recipe
@@ -272,7 +286,7 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
         model.weight_bits = 8 if len(weights) < len(tensors) else 32
         _check_rounded(model)
         _set_state(model, header, len(model.map.positions) or model.map.places)
-        model.check()
+        _check(model)
         return model  # type: ignore[no-any-return]
 
 
@@ -346,3 +360,50 @@ def _check_rounded(model: Any) -> None:
             f"weights of {type(model.features).__name__} are not rounded to 8 bits; expected all of them, "
             "and none changed since: a DejaVu that is made of them with weight_bits=8"
         )
+
+
+def _check(model: Any) -> None:
+    """Refuse parts of a model that do not fit together."""
+    positions, step, shape, whitening = model.map.positions, model.step, model.frame_shape, model.whitening
+    resampled = model.velocity is not None and step is not None and step > 0
+    if (len(positions) > 0) != resampled or (step is not None) != resampled:
+        raise InputError(f"it has step {step} and {len(positions)} frame positions")
+    if (
+        whitening is not None
+        and whitening.learned
+        and whitening.dimension != (model.map.dimension or whitening.dimension)
+    ):
+        raise InputError(
+            f"its whitening makes {whitening.dimension} numbers; expected the map's {model.map.dimension}"
+        )
+    if shape is not None and (len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > FRAME_NUMBERS):
+        raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
+
+
+def run_key(
+    model: Any, traverse: Traverse, second: Views | None = None, visits: Views | None = None
+) -> dict[str, str]:
+    """What the chunks of a traverse are made of, as digests: see `learning.Checkpoint`."""
+    header = recipes_of(model)
+    header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in model.modules()})))
+    header |= {"batch_size": model.describer.batch_size, "sample": SAMPLE}
+    header |= {"version": __version__, "torch": torch.__version__}
+    fixed = model.whitening is not None and model.whitening.fixed
+    weights = weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {})
+    sums = checksums(weights, header)
+    sources = {
+        name: views and [views.traverse.identity(), views.places.tolist()]
+        for name, views in (("second", second), ("visits", visits))
+    }
+    source = [traverse.identity(), traverse.count()]
+    return digests(source=source, **sources) | {"settings": sums.pop(FILE_HEADER), **sums}
+
+
+def _code_of(cls: type[nn.Module]) -> str:
+    """The source of a class of the user's own; "" if there is none, or if a version identifies it."""
+    if cls.__module__.partition(".")[0] in ("dejavu_torch", "torch"):
+        return ""
+    try:
+        return inspect.getsource(cls)
+    except (OSError, TypeError):
+        return ""

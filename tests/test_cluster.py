@@ -180,7 +180,7 @@ def test_chunks_made_together_before_a_bad_frame_are_kept(cluster: Cluster, tmp_
 
 def found_by(model: DejaVu, queries: Tensor, search: ClusterSearch | None = None) -> list[Tensor]:
     if search is not None:
-        model.search_by(search)
+        model.find = search
     match, best = model.localize(queries), model.candidates(queries, 4, apart=3)
     return [match.index, match.score, *best, match.accepted]
 
@@ -223,7 +223,7 @@ def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(c
     queries = route()[::5] + 0.4 * torch.randn(PLACES // 5, 8)
     whole = model.localize(queries)
     search = ClusterSearch(cluster, model.map)
-    model.search_by(search)
+    model.find = search
     assert whole.probability is not None
     for _ in range(2):
         found = model.localize(queries)

@@ -21,7 +21,7 @@ ORDER = [
     {"maps"},
     {"recognition"},
     {"motion"},
-    {"streaming"},
+    {"learning"},
     {"model_file"},
     {"model"},
     {"growth"},
@@ -39,25 +39,25 @@ ARROWS = {
     "types": "text",
     "memory": "types",
     "resize": "types",
-    "data": "types text memory resize",
+    "data": "text types memory resize",
     "features": "types resize",
     "periods": "types memory",
     "maps": "types memory data periods",
     "recognition": "types maps",
-    "motion": "data memory types",
-    "streaming": "types data features maps",
-    "model_file": "types text data features periods maps recognition motion",
-    "model": "types version resize data features maps recognition motion streaming model_file",
-    "growth": "types data features maps streaming model_file model motion",
-    "cluster": "types text data maps recognition streaming",
+    "motion": "types memory data",
+    "learning": "types data features maps recognition motion",
+    "model_file": "text version types data features periods maps recognition motion learning",
+    "model": "types resize data features maps recognition motion learning model_file",
+    "growth": "types data features maps motion learning model_file model",
+    "cluster": "text types data maps recognition learning",
     "live": "types data features recognition model",
-    "evaluation": "types resize text data features periods maps recognition motion model",
-    "training": "types text memory resize data features periods maps recognition motion model_file model "
-    "evaluation",
-    "experiments": "types text data features periods maps recognition motion streaming model_file model "
-    "cluster live evaluation training",
-    "cli": "types text data features periods maps recognition motion streaming model_file model growth "
-    "cluster live evaluation training experiments",
+    "evaluation": "text types resize data features periods maps recognition motion model",
+    "training": "text types memory resize data features periods maps recognition "
+    "motion model_file model growth evaluation",
+    "experiments": "text types data features periods maps recognition motion learning model_file "
+    "model growth cluster live evaluation training",
+    "cli": "text types data features periods maps recognition motion learning model_file model "
+    "growth cluster live evaluation training experiments",
 }
 
 

@@ -27,6 +27,7 @@ from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample, code_here
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk
 from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import run_key
 from dejavu_torch.types import Traverse
 
 CHUNK, PLACES = 50, 1030
@@ -257,12 +258,12 @@ def test_other_code_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             f"        return {factor} * x.flatten(1)\n"
         )
         own = importlib.import_module("own_features").Own()
-        return DejaVu(own).run_key(ArrayTraverse(route()))
+        return run_key(DejaVu(own), ArrayTraverse(route()))
 
     first = key(2)
     assert key(2) == first
     assert key(30) != first
-    monkeypatch.setattr("dejavu_torch.model.__version__", "0.0.7")
+    monkeypatch.setattr("dejavu_torch.model_file.__version__", "0.0.7")
     assert key(2) != first
 
 

@@ -196,7 +196,7 @@ def run_learn(
                 print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
     if calibration != NO_CALIBRATION:
         growth.calibrate_if_possible(model, traverse, known, places)
-    model.check_precision(None)
+    model.matching()
     model.save(map)
     checkpoint.remove()
     print_map(model)
@@ -285,7 +285,7 @@ def run_localize(
         _print_steps(query)
     if matcher is not None:
         matcher.check(None, model.map.places)
-    model.check_precision(matcher)
+    model.matching(matcher)
     rule = model.acceptance(matcher)
     matches = model.matches(query, "localizing", matcher, search, top, APART)
     if top is not None:
@@ -368,7 +368,7 @@ def run_live(
     if as_is:
         model.velocity = None
     _accept_by(model, threshold, precision)
-    model.check_precision(matcher)
+    model.matching(matcher)
     follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
 
 
@@ -824,7 +824,7 @@ def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
     from dejavu_torch.cluster import Cluster, ClusterSearch
 
     with Cluster(cluster) as workers:
-        model.search_by(ClusterSearch(workers, model.map))
+        model.find = ClusterSearch(workers, model.map)
         yield
 
 

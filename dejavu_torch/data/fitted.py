@@ -11,7 +11,7 @@ from dejavu_torch.data.chain import Chain
 from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.video import Video
-from dejavu_torch.resize import resize_frames
+from dejavu_torch.resize import is_stretched, resize_frames
 from dejavu_torch.types import InputError, Traverse
 
 
@@ -90,3 +90,19 @@ def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
     else:
         return Fitted(traverse, (traverse.frame_shape[0], *size))
     return other
+
+
+def size_like(own: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, int]:
+    """The size of frames of a shape (C,H,W), for frames of the same aspect ratio; else their own."""
+    height, width = own
+    same = len(shape) == 3 and not is_stretched((height, width), (shape[1], shape[2]))
+    return (shape[1], shape[2]) if same else (height, width)
+
+
+def resize_like(frames: Tensor, shape: tuple[int, ...] | None) -> Tensor:
+    """Frames (B,C,H,W) at the size of frames of a shape (C,H,W); others, and ready features, as they are."""
+    return (
+        frames
+        if frames.ndim != 4 or shape is None
+        else resize_frames(frames, size_like(frames.shape[2:], shape))
+    )

@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch import growth
 from dejavu_torch.data.arrays import UNNAMED, as_traverse
 from dejavu_torch.data.fitted import Fitted
 from dejavu_torch.data.ground_truth import (
@@ -36,6 +35,7 @@ from dejavu_torch.experiments.storage import noise_over_map, storage_curve
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
+from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.l1 import l1_backend
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -151,8 +151,8 @@ def compare(
     with timed(seconds, work):
         places = _described(model, reference, second, tolerance, progress)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
-            growth.calibrate_if_possible(model, reference, calibration)
-        model.check_precision(sequence)
+            calibrate_if_possible(model, reference, calibration)
+        model.matching(sequence)
     with timed(seconds, "localize"):
         model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)

@@ -257,7 +257,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
         facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
         precision = model.acceptance().precision
         facts |= {} if precision is None else {"precision": precision}
-    threshold = model.threshold_of(sequence)
+    threshold = model.threshold if sequence is None else sequence.threshold_of(model.threshold)
     if threshold is None and sequence is not None:
         threshold = sequence.likely  # of sequences the file has no calibration
     facts |= {} if threshold is None else {"threshold": threshold}

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.fitted import resize_like
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -87,8 +88,8 @@ class LiveLocalizer:
             )
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self.device = model.map.positions.device
-        model.check_precision(self.sequence)
-        self._pipeline = model.pipeline
+        model.matching(self.sequence)
+        self._pipeline = model.describer.pipeline
         self._shape: tuple[int, ...] | None = None  # of the latest frame that fitted
         whitening = model.whitening
         self._projection = whitening.unpacked() if whitening is not None and whitening.learned else None
@@ -132,7 +133,7 @@ class LiveLocalizer:
 
     def _describe(self, batch: Tensor) -> Tensor:
         """The descriptor of a frame that fits the map, (1,K)."""
-        batch = self.model.fit_frames(batch)
+        batch = resize_like(batch, self.model.frame_shape)
         with in_mode(self._pipeline, False):
             features = features_of(batch, self._pipeline, "the frame")
         if batch.shape[1:] != self._shape:

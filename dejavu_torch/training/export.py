@@ -9,12 +9,12 @@ from typing import Any
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
-from dejavu_torch import growth
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import STRENGTHS
+from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.training.datamodule import FEW, RouteData
@@ -135,7 +135,7 @@ def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
     if validated and len(frames.frame_shape) == 3:
         frames = fitted(frames, model.frame_shape or ())
     try:
-        growth.calibrate_if_possible(model, data.reference, Views(frames, truth.positives[:, 0]))
+        calibrate_if_possible(model, data.reference, Views(frames, truth.positives[:, 0]))
     except InputError as error:
         log.warning("the map is not calibrated: %s", error)
 

@@ -353,7 +353,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         if self.weight_bits == 8 and round_weights(model.features):
             model.weight_bits = 8
         if self.made and len(self.data.routes) > 1:
-            model = model.without_map()
+            model = DejaVu(**(model.settings() | {"velocity": None})).train(model.training)
         if not self.made:
             route, mapper = cast(TemplateMap, model.map), cast(TemplateMapper, model.mapper)
             route.freeze()

@@ -253,7 +253,7 @@ def test_the_frame_under_the_features_is_what_hog_sees() -> None:
     model, frame = DejaVu(hog, preprocess=Preprocess(channel="R-B", contrast="patch")), torch.rand(3, 50, 60)
     seen = as_hog_sees(model, frame)
     assert seen.shape == (1, 17, 41)
-    assert torch.equal(HOG(cell=4)(seen[None]), model.pipeline(frame[None]))
+    assert torch.equal(HOG(cell=4)(seen[None]), model.describe(frame[None]))
 
 
 def test_features_are_drawn_on_the_frame_as_hog_resizes_it() -> None:
