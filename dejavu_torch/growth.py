@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from itertools import count
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import as_traverse
-from dejavu_torch.data.ground_truth import find_ground_truth
+from dejavu_torch.data.ground_truth import find_ground_truth, ground_truth_in_places
 from dejavu_torch.data.names import names_of
-from dejavu_torch.data.positions import positions_behind
-from dejavu_torch.features.extract import feature_batches
+from dejavu_torch.data.positions import place_of, positions_behind
 from dejavu_torch.features.views import Views
+from dejavu_torch.learning import (
+    Checkpoint,
+    ChunkCoder,
+    Code,
+    code_here,
+    extend,
+    observation_counts,
+    positions_of,
+    with_visits,
+)
 from dejavu_torch.maps.file import checksums, digests
-from dejavu_torch.maps.merged import MergedMap, MergedMapper
-from dejavu_torch.maps.spectral import CodedChunk, SpectralMap, SpectralMapper, code_chunk
-from dejavu_torch.model import DejaVu, check_sizes, shown_by
+from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
+from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import difference, recipe_of
-from dejavu_torch.motion.resampling import ResampledTraverse, source_of
-from dejavu_torch.streaming.coder import Made, code_here, with_visits
-from dejavu_torch.streaming.work import WorkFolder, all_chunks
+from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-MOST = 2**31 - 1  # places of a map, whose lines are numbered in 32 bits
 EXACT = 2**24  # places whose positions float32 tells apart
 
 
@@ -36,22 +43,22 @@ def append(
     model: DejaVu,
     traverse: Traverse | Tensor,
     progress: bool = False,
-    work: WorkFolder | None = None,
-    make: Callable[..., Made] = code_here,
+    checkpoint: Checkpoint | None = None,
+    code: Code = code_here,
     visits: Views | None = None,
 ) -> DejaVu:
-    """Add the places of a traverse behind those of a model's map, which stay as they are.
+    """Add the places of a traverse after those of a model's map, which stay as they are.
 
     Whitening, mean and step of the lines stay; the new places are coded in chunks of their own. Nothing is
-    forgotten but the calibration, which is of fewer places: see `DejaVu.calibrate` and its `places`.
+    lost but the calibration, which is for fewer places: see `DejaVu.calibrate` and its `places`.
 
     Args:
-        model: its map is spectral, learned with a `chunk` of so many places.
+        model: its map is spectral, and of one route.
         traverse: as of `DejaVu.learn`, of frames like the map's. Where the map's places are even steps along
             the ground it is resampled likewise, and its first frame is the next place.
         progress: show a progress bar on a terminal.
-        work, make: as of `DejaVu.learn`.
-        visits: frames of another traverse of its places, averaged in ahead of the coding, see `learn_mean`.
+        checkpoint, code: as of `DejaVu.learn`.
+        visits: frames of another traverse of its places, averaged in before the coding, see `learn_mean`.
 
     Returns:
         The model, in eval mode. What is refused leaves it as it was.
@@ -70,33 +77,35 @@ def append(
         >>> append(model, wave[400:]).localize(wave[[50, 450]]).index
         tensor([ 50, 450])
     """
-    route = growing(model)
+    route = one_route(model, "append to")
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_alike(model, added)
-    before, places = route.coded(), added.count()
-    frames = len(added.positions) if isinstance(added, ResampledTraverse) else places
+    places = added.count()
+    positions = positions_of(added).to(route.positions.device)
     _check_count(route.places + places, model.step is not None)
     counts = torch.ones(places, dtype=torch.int64)
     if visits is not None:
         _check_alike(model, visits.traverse)
-        counts += shown_by(visits, places)
-    if work is not None:
+        counts += observation_counts(visits, places)
+    text = "learning" if progress else None
+    part, found = SpectralMap(route.means, **route.settings(), step=route.step), None
+    if checkpoint is not None:
         sums = checksums(route.packed(), route.get_extra_state())
-        work.open(model.run_key(added, places, visits=visits) | digests(map=sums))
-    visits = visits and model.read_once(visits, "averaging" if progress else None)
-    coder = model.chunk_coder(places, route, route.mean, before[-1].step, visits)
-    chunks = all_chunks(coder, added, work, make, "learning" if progress else None)
-    grown = with_chunks(route, [*before, *chunks])
+        found = checkpoint.open(model.run_key(added, visits=visits) | digests(map=sums))
+    if found is not None:
+        part.load_packed({name[4:]: t for name, t in found[0].items() if name[:4] == "map."}, found[1]["map"])
+    visits = visits and model.describer.read_anywhere(visits, text)
+    coder = ChunkCoder.like(route, model.describer, places, visits)
+    extend(part, coder, added, text, checkpoint, code)
+    grown = route.of_chunks([*route.coded(), *part.coded()])
     grown.count_visits(torch.cat([route.visit_counts, counts.to(route.visits.device)]))
-    if isinstance(added, ResampledTraverse):
-        behind = positions_behind(added.positions, route.places).to(route.positions.device)
-        grown.positions = torch.cat([route.positions, behind])
-        grown.check()
-    names = joined_names(
-        [model.frame_names, names_of(source_of(added), frames)],
-        [len(route.positions) or route.places, frames],
-    )
-    model.map, model.frame_names, model.calibration = grown, names, None
+    if len(positions):
+        grown.positions = torch.cat([route.positions, positions_behind(positions, route.places)])
+    grown.check()
+    frames = len(positions) or places
+    names = [model.frame_names, names_of(source_of(added), frames)]
+    model.frame_names = _joined_names(names, [route.table.frames, frames])
+    model.map, model.calibration = grown, None
     return model.eval()
 
 
@@ -106,16 +115,16 @@ def learn_mean(
     visits: Views,
     progress: bool = False,
     second: Views | None = None,
-    work: WorkFolder | None = None,
-    make: Callable[..., Made] = code_here,
+    checkpoint: Checkpoint | None = None,
+    code: Code = code_here,
 ) -> DejaVu:
     """As `DejaVu.learn`, of the mean of several visits to each place: what changes between them cancels out.
 
     Args:
-        visits: frames of another traverse and the places that they show, as `DejaVu.places_shown` finds them.
-            A place that k of them show is the mean of k + 1 descriptors.
-        traverse, progress, second, work, make: as of `DejaVu.learn`. Whitening learns from these, not from
-            `visits`.
+        visits: frames of another traverse and the places that they show, as `associate` finds them. A place
+            that k of them show is the mean of k + 1 descriptors.
+        traverse, progress, second, checkpoint, code: as of `DejaVu.learn`. Whitening learns from these, not
+            from `visits`.
 
     Returns:
         The model; `map.visit_counts` says how many visits each place is the mean of.
@@ -135,8 +144,8 @@ def learn_mean(
         seen = f"{type(model.mapper).__name__} makes templates, which are means of many places already"
         raise InputError(f"{seen}; expected a SpectralMapper to average visits for")
     reference = model.resample(as_traverse(traverse), progress=progress)
-    check_sizes(model, reference, visits.traverse)
-    return model.learn(reference, progress, second, work, make, visits)
+    model.describer.check_sizes(reference, visits.traverse)
+    return model.learn(reference, progress, second, checkpoint, code, visits)
 
 
 @torch.no_grad()
@@ -157,22 +166,21 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     Raises:
         InputError: no spectral map of one route, or visits that do not fit.
     """
-    route = one_route(model)
+    route = one_route(model, "average visits into")
     _check_alike(model, visits.traverse)
-    before, chunks, counts = route.coded(), [], route.visit_counts.cpu()
-    seen = shown_by(visits, route.places)
-    described, shown = model.describe_visits(visits, route.dimension, progress)
-    for g, (start, stop) in enumerate(route.chunks):
+    counts, seen = route.visit_counts.cpu(), observation_counts(visits, route.places)
+    described, shown = model.describer.visits(visits, route.dimension, "averaging" if progress else None)
+
+    def averaged(g: int, chunk: Chunk) -> Chunk:
+        start, stop = route.chunks[g]
         inside = ((shown >= start) & (shown < stop)).nonzero()[:, 0]
         if not len(inside):
-            chunks.append(before[g])
-            continue
-        places = shown[inside] - start
-        rows = described[inside].to(route.mean.device)
-        means = with_visits(route.rebuilt(g), counts[start:stop], rows, places)
-        coding = route.mean, before[g].step, route.transform, route.resolution
-        chunks.append(code_chunk(means, *coding))
-    made = with_chunks(route, chunks)
+            return chunk
+        rows = described[inside].to(route.means.device)
+        means = with_visits(route.decode(g), counts[start:stop], rows, shown[inside] - start)
+        return code_chunk(means, route.means[0], chunk.step, route.transform, route.resolution)
+
+    made = route.of_chunks(averaged(g, chunk) for g, chunk in enumerate(route.coded()))
     made.positions = route.positions
     made.count_visits((counts + seen).to(route.visits.device))
     made.check()
@@ -181,8 +189,62 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     return int((seen > 0).sum())
 
 
+def associate(model: DejaVu, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
+    """Which places of a reference another traverse shows; resampled where the reference is.
+
+    Args:
+        reference: as `DejaVu.resample` gives it.
+        truth: which frames of the reference it shows, see `find_ground_truth`; None, of one that is as
+            long: frame i is place i. Of several for one frame the first counts; frames that show none are
+            left out.
+
+    Raises:
+        InputError: nothing says which places it shows, or it shows none.
+    """
+    shape = model.fit(reference, model.frame_shape if model.map.places else None).frame_shape
+    second = model.resample(second, getattr(reference, "step", None), shape=shape)
+    frames, shown = reference.count(), second.count()
+    found = ground_truth_of(truth, reference, second, frames, shown, aligned=True)
+    if found is None:
+        steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
+        raise InputError(
+            f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
+            "many, frame i being place i, or a truth that says which places it shows"
+        )
+    if isinstance(reference, ResampledTraverse):
+        found = ground_truth_in_places(found, partial(place_of, reference.positions))
+    places = found.positives[:, 0]
+    if not (places >= 0).any():
+        raise InputError(f"no frame of {second.name} shows a place of {reference.name}; expected some")
+    return Views(second, places)
+
+
+def calibrate_if_possible(
+    model: DejaVu, reference: Traverse, views: Views | None = None, places: Tensor | None = None
+) -> None:
+    """As `DejaVu.calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
+    reference."""
+    if views is not None:
+        model.calibrate(reference, views)
+    elif model.calibration is None and len(reference.frame_shape) == 3 and model.map.summary().covered:
+        try:
+            model.calibrate(reference, places=places)
+        except InputError as error:
+            log.warning("the map is not calibrated: %s", error)
+
+
+def second_traverse(model: DejaVu, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
+    """As `associate`, for the whitening to learn from.
+
+    Raises:
+        InputError: no whitening that could learn from it, or as of `associate`.
+    """
+    model.require_learning_whitening(second.name)
+    return associate(model, reference, second, truth)
+
+
 def shown_on_map(model: DejaVu, traverse: Traverse, truth: str | None = None) -> Views:
-    """As `DejaVu.places_shown`, of a map whose reference is not at hand.
+    """As `associate`, for a map whose reference is not at hand.
 
     Args:
         truth: None is frame i at place i, where there are as many and places are frames.
@@ -190,9 +252,9 @@ def shown_on_map(model: DejaVu, traverse: Traverse, truth: str | None = None) ->
     Raises:
         InputError: nothing says which places the frames show, or they show none.
     """
-    route = one_route(model)
+    route = one_route(model, "average visits into")
     traverse = model.resample(traverse, model.step, shape=model.frame_shape)
-    frames, shown = len(route.positions) or route.places, traverse.count()
+    frames, shown = route.table.frames, traverse.count()
     resampled = model.step is not None
     numbers = traverse.frame if isinstance(traverse, ResampledTraverse) else shown
     if truth is not None:
@@ -210,41 +272,29 @@ def shown_on_map(model: DejaVu, traverse: Traverse, truth: str | None = None) ->
     return Views(traverse, torch.arange(shown))
 
 
-def one_route(model: DejaVu) -> SpectralMap:
-    """The map of a model, which visits can be averaged into."""
-    route = model.map
-    if not isinstance(route, SpectralMap) or not route.places:
-        seen = f"a map of kind {route.kind!r}" if route.places else "no map"
-        raise InputError(f"there is {seen}; expected one of kind {SpectralMap.kind!r} to average visits into")
-    return route
-
-
-def growing(model: DejaVu) -> SpectralMap:
-    """The map of a model, which can grow.
+def one_route(model: DejaVu, verb: str) -> SpectralMap:
+    """The map of a model, which can change.
 
     Raises:
-        InputError: no map, one of another kind, or one whose chunk is the route.
+        InputError: no map, one of another kind, or one of several routes.
     """
     route = model.map
     if not route.places:
-        raise InputError("there is no map to append to; expected learn(...) or load(...) first")
+        raise InputError(f"there is no map to {verb}; expected learn(...) or load(...) first")
     if route.routes:
         names = ", ".join(one.name for one in route.routes)
-        seen = f"the map is merged of the routes {names}, and places behind the last would be on none"
-        raise InputError(f"{seen}; expected to append to the map of a route, and to merge it")
+        seen = f"the map is merged of the routes {names}"
+        raise InputError(f"{seen}; expected to {verb} the map of a route, and to merge it")
     if not isinstance(route, SpectralMap):
-        seen = f"a map of kind {route.kind!r} cannot be appended to"
-        raise InputError(f"{seen}; expected one of kind {SpectralMap.kind!r}, or to learn the route anew")
-    if route.chunk == "route":
-        seen = "the map's chunk is the whole route, which cannot be appended to"
+        seen = f"there is a map of kind {route.kind!r}"
         raise InputError(
-            f"{seen}; expected a map learned with a chunk of so many places: --mapper.chunk 1024"
+            f"{seen}; expected one of kind {SpectralMap.kind!r} to {verb}, or to learn the route anew"
         )
     return route
 
 
 def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
-    """Join the maps of several routes that describe frames alike: the places of all, one behind the other.
+    """Join the maps of several routes that describe frames alike: the places of all, route after route.
 
     Args:
         models: with spectral maps, or merged ones, whose routes count one by one. They stay as they are; the
@@ -253,9 +303,9 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
             number: "route", "route-2".
 
     Returns:
-        A model whose `map.routes` are the routes. Scores of a route's places are, to the bit, those of its
-        own map. A threshold is kept where all have it. Calibration and precision hold for one route and
-        are not kept; a line says so.
+        A model whose `map.routes` are the routes. Scores of a route's places are those of its own map. A
+        threshold is kept where all have it. Calibration and precision hold for one route and are not kept;
+        a line says so.
 
     Raises:
         InputError: fewer than two models, one without a map or of another kind, or models that differ in what
@@ -272,30 +322,28 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         raise InputError(f"{seen}; expected at least two maps, and a name for each")
     first = models[0]
     parts: list[SpectralMap] = []
-    told: list[str] = []
+    taken: list[str] = []
     for name, model in zip(names, models, strict=True):
         own = _routes_of(model, name)
         problem = "" if model is first else _unlike(first, model)
         if problem:
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
         for wanted, part in own:
-            told.append(_another(wanted, told))
+            taken.append(_another(wanted, taken))
             parts.append(part)
     _check_count(sum(part.places for part in parts), first.step is not None)
     thresholds = {model.threshold for model in models}
     merged = DejaVu(
         **first.settings()
-        | {"mapper": MergedMapper(), "weight_bits": 32, "precision": None}
+        | {"weight_bits": 32, "precision": None}
         | {"threshold": first.threshold if len(thresholds) == 1 else None}
     )
     merged.weight_bits = first.weight_bits
-    merged.map = MergedMap(parts, told)
-    for name in ("frame_shape", "step"):
-        setattr(merged, name, getattr(first, name))
+    merged.map = SpectralMap.merged(parts, taken)
+    merged.frame_shape, merged.step = first.frame_shape, first.step
     merged.trained = first.trained if all(model.trained == first.trained for model in models) else None
-    counts = [len(model.map.positions) or model.map.places for model in models]
-    merged.frame_names = joined_names([model.frame_names for model in models], counts)
-    merged.eval()
+    frames = [model.map.table.frames for model in models]
+    merged.frame_names = _joined_names([model.frame_names for model in models], frames)
     lost = [
         *["thresholds"] * (len(thresholds) > 1),
         *["calibration"] * any(model.calibration is not None for model in models),
@@ -305,22 +353,20 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         log.warning(
             "the merged map has no %s: each holds only for the route it was made for", ", ".join(lost)
         )
-    return merged
+    return merged.eval()
 
 
 def _routes_of(model: DejaVu, name: str) -> list[tuple[str, SpectralMap]]:
     """Name and map of each route of a model's map; `name` where it is one."""
     route = model.map
-    if isinstance(route, MergedMap):
-        return [(one, route.part(one)) for one in route.names]
     if not isinstance(route, SpectralMap) or not route.places:
         seen = f"a map of kind {route.kind!r}" if route.places else "no map"
         raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
-    return [(name, route)]
+    return [(one.name, route.part(one.name)) for one in route.routes] or [(name, route)]
 
 
 def _another(name: str, taken: Sequence[str]) -> str:
-    """A name that is not taken: itself, or with the first number behind it that is free."""
+    """A name that is not taken: itself, or with the first free number after it."""
     if name not in taken:
         return name
     return next(one for one in (f"{name}-{i}" for i in count(2)) if one not in taken)
@@ -345,7 +391,8 @@ def _unlike(first: DejaVu, other: DejaVu) -> str:
     own, theirs = (_routes_of(model, "")[0][1] for model in (first, other))
     for what, mine, yours in (
         ("metric", own.metric, theirs.metric),
-        ("numbers of a descriptor", own.dimension, theirs.dimension),
+        ("transform", own.transform, theirs.transform),
+        ("dimensions of a descriptor", own.dimension, theirs.dimension),
         ("steps between places, in pixels of ground,", first.step, other.step),
     ):
         if mine != yours:
@@ -367,21 +414,15 @@ def _same_tensors(one: torch.nn.Module, two: torch.nn.Module) -> bool:
     )
 
 
-def with_chunks(route: SpectralMap, chunks: list[CodedChunk]) -> SpectralMap:
-    """A map of these chunks, with the mean and settings of another."""
-    made = SpectralMap.of_chunks(chunks, route.mean, **route.settings())
-    return made.to(route.positions.device).train(route.training)
-
-
-def joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
-    """Names of the frames of several parts, one behind the other; "" where a part has none."""
+def _joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
+    """Names of the frames of several parts; "" where a part has none."""
     if not any(parts):
         return []
     return [name for part, count in zip(parts, frames, strict=True) for name in part or [""] * count]
 
 
 def _check_count(places: int, resampled: bool) -> None:
-    most = EXACT if resampled else MOST
+    most = EXACT if resampled else LARGEST
     if places > most:
         steps = " at even steps" if resampled else ""
         raise InputError(f"{places} places{steps} in one map; expected at most {most}: several maps")
@@ -403,7 +444,7 @@ def _check_alike(model: DejaVu, added: Traverse) -> None:
     if not _alike(model, own, shape):
         seen, known = (" x ".join(map(str, one)) for one in (shape, own))
         raise InputError(f"{added.name} has frames of {seen}; expected {known}, as the map was learned from")
-    numbers = next(feature_batches(added, model.pipeline, 1, model.map.positions.device)).shape[1]
+    numbers = next(model.describer._replace(batch_size=1).features(added)).shape[1]
     expected = model.map.dimension
     if model.whitening is not None and model.whitening.learned:
         expected = len(model.whitening.projection)

@@ -14,17 +14,17 @@ from torch import Tensor
 from dejavu_torch.types import InputError
 
 GROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
-OWN = Path("/proc/self/cgroup")  # in which of them the process is
-CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back where memory is short
+OWN = Path("/proc/self/cgroup")  # which of them the process is in
+CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back if memory is short
 
 
 def free_memory() -> float:
-    """Bytes that may still be taken: what the system has, and the process is allowed; inf where none says."""
+    """Bytes the process can still get: what the system has and its limits allow; inf if nothing says."""
     return min(_of_system(), _of_container(), _of_process())
 
 
 def check_room(needed: float, what: str) -> None:
-    """Refuse what the memory does not hold.
+    """Refuse what does not fit into memory.
 
     Args:
         needed: bytes. what: it is, as the message begins.
@@ -37,11 +37,11 @@ def check_room(needed: float, what: str) -> None:
     """
     free = free_memory()
     if needed > free:
-        raise InputError(f"{what} takes {_told(needed)}; expected at most the {_told(free)} free")
+        raise InputError(f"{what} takes {_size(needed)}; expected at most the {_size(free)} free")
 
 
 def empty(rows: int, columns: int, device: torch.device, in_memory: int = 2**29) -> Tensor:
-    """Room for a tensor that may be larger than the memory: then on the CPU, and in a temporary file.
+    """Room for a tensor that may be larger than the memory: on the CPU it then lies in a temporary file.
 
     Args:
         in_memory: bytes, at most. The file has no name and goes with the tensor or the process.
@@ -70,16 +70,15 @@ def empty(rows: int, columns: int, device: torch.device, in_memory: int = 2**29)
         ) from error
 
 
-def _told(size: float) -> str:
-    return f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{max(size, 0) / 1e6:.3g} MB"
+def _size(number: float) -> str:
+    return f"{number / 1e9:.3g} GB" if number >= 1e9 else f"{max(number, 0) / 1e6:.3g} MB"
 
 
 def _of_system() -> float:
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
-        kilobytes = {name: value for name, _, value in (line.partition(":") for line in lines)}
-        return 1024.0 * int(kilobytes["MemAvailable"].split()[0])
-    except (OSError, KeyError, ValueError):  # another system
+        return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, ValueError, StopIteration):  # another system
         pass
     try:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -88,32 +87,22 @@ def _of_system() -> float:
 
 
 def _of_container() -> float:
-    """What is left to the group of the process, and to each that it lies in."""
+    """What is left to the control group of the process, and to each that contains it."""
     try:
-        lines = [line.split(":", 2) for line in OWN.read_text().splitlines()]
-    except OSError:
-        lines = []
-    free = math.inf
-    for _, kinds, place in [line for line in lines if len(line) == 3] or [["0", "", "/"]]:
-        if kinds and "memory" not in kinds.split(","):
-            continue
-        root = GROUPS / "memory" if kinds else GROUPS
-        inside = root / place.lstrip("/")
-        for group in (inside, *inside.parents):
-            if group.is_relative_to(root):
-                free = min(free, _of_group(group, bool(kinds)))
-    return free
+        own = next(line[3:] for line in OWN.read_text().splitlines() if line.startswith("0::"))
+    except (OSError, StopIteration):
+        own = "/"
+    inside = GROUPS / own.lstrip("/")
+    return min(_of_group(group) for group in (inside, *inside.parents) if group.is_relative_to(GROUPS))
 
 
-def _of_group(group: Path, first_version: bool) -> float:
-    names = ("limit_in_bytes", "usage_in_bytes") if first_version else ("max", "current")
+def _of_group(group: Path) -> float:
     try:
-        limit, taken = (float((group / f"memory.{name}").read_text()) for name in names)
-        lines = (group / "memory.stat").read_text().splitlines()
-        parts = {name.removeprefix("total_"): float(value) for name, value in map(str.split, lines)}
+        limit, used = (float((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        stat = dict(map(str.split, (group / "memory.stat").read_text().splitlines()))
+        return limit - used + sum(float(stat.get(name, 0)) for name in CACHES)
     except (OSError, ValueError):  # none, or "max"
         return math.inf
-    return limit - taken + sum(parts.get(name, 0) for name in CACHES)
 
 
 def _of_process() -> float:
@@ -121,7 +110,7 @@ def _of_process() -> float:
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     except (ImportError, OSError, ValueError):  # another system
         return math.inf
-    return math.inf if limit == resource.RLIM_INFINITY else float(limit - taken)
+    return math.inf if limit == resource.RLIM_INFINITY else float(limit - used)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,27 +13,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from dejavu_torch.data.arrays import ArrayTraverse, as_traverse
+from dejavu_torch import learning
+from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import at_size
-from dejavu_torch.data.ground_truth import ground_truth_in_places
 from dejavu_torch.data.names import names_of
-from dejavu_torch.data.positions import place_of
-from dejavu_torch.data.selection import Selection, runs
-from dejavu_torch.features.extract import (
-    check_alone,
-    check_queries,
-    feature_batches,
-    features_of,
-    warn_of_bright,
-)
+from dejavu_torch.features.extract import check_queries, features_of
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.memory import IN_MEMORY, concatenate
+from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
-from dejavu_torch.features.whitening import STRENGTHS, WIDEST, Whitening
+from dejavu_torch.features.views import Views
+from dejavu_torch.features.whitening import WIDEST, Whitening
+from dejavu_torch.learning import Checkpoint, Code, Describer, code_here
 from dejavu_torch.maps.file import HEADER, checksums, digests
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
-from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.model_file import (
@@ -49,17 +40,13 @@ from dejavu_torch.model_file import (
     write_model,
 )
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
-from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
+from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
+from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.matching import Found, Matching, joined
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Search, Searcher, check_scanned, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance
 from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
-from dejavu_torch.streaming import sample as streaming
-from dejavu_torch.streaming.coder import ChunkCoder, Made, code_here, in_one_thread, with_visits
-from dejavu_torch.streaming.sample import sample_of
-from dejavu_torch.streaming.work import Fit, WorkFolder, all_chunks
 from dejavu_torch.types import (
     BATCH_NUMBERS,
     FRAME_NUMBERS,
@@ -73,12 +60,7 @@ from dejavu_torch.version import __version__
 
 log = logging.getLogger("dejavu_torch")
 
-TRIAL_SCORES = 2**22  # of the queries of a trial at all places
-CALIBRATION_SCORES = 2**30  # of all frames that a map is calibrated by, at all places
-LONGEST_TRIAL = 512  # queries that a filter follows, to be calibrated by
 ROWS = 4096  # descriptors on the device at a time
-FEW_DESCRIPTORS = IN_MEMORY // 4  # bytes
-OFF = 0.02  # of the bytes per place asked for: worth a word
 MANY_FEATURES = 50_000  # per frame: worth a word
 
 
@@ -176,6 +158,7 @@ class DejaVu(nn.Module):
         self._searcher: Searcher | None = None
         self._reduces = False  # whether `_reduce` has set the whitening
         self._told: set[tuple[str, str]] = set()  # lines that are said once
+        self._bright: set[str] = set()  # traverses that were said to be bright
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_searcher": None}  # which can hold more than the map, and is soon made again
@@ -190,19 +173,20 @@ class DejaVu(nn.Module):
         traverse: Traverse | Tensor,
         progress: bool = False,
         second: Views | None = None,
-        work: WorkFolder | None = None,
-        make: Callable[..., Made] = code_here,
+        checkpoint: Checkpoint | None = None,
+        code: Code = code_here,
         visits: Views | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
 
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
-            second: see `describe_reference`; `views` makes it.
+            second: another traverse of the same places, from which whitening learns, in place of augmented
+                copies, what changes between two visits; `growth.second_traverse` makes it.
             progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
-            work: keeps the finished chunks of a long route, so that learning goes on from there after a
+            checkpoint: where a long route keeps its partial map, so that learning goes on from there after a
                 kill; it is the caller's to remove.
-            make: what makes the chunks of a long route: `code_here`, or a cluster.
+            code: what makes the chunks of a long route: `code_here`, or a cluster.
             visits: see `growth.learn_mean`.
 
         Returns:
@@ -210,314 +194,98 @@ class DejaVu(nn.Module):
             map without layers, on which every place scores +inf. Features beyond `concatenate`'s share of
             the memory spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
 
-        Convention: of a route of over `SAMPLE` frames a spectral map with an integer chunk learns whitening,
-            mean and step from a sample of them, see `sample_of`, and its chunks are made one by one. Memory
+        Convention: of a route of over `SAMPLE` frames, and over one chunk, a spectral map learns whitening,
+            mean and step from a sample, see `learning.Sample`, and its chunks are made one by one. Memory
             holds a chunk, the sample and the map, whatever the number of frames.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
-        text = "learning" if progress else None
         before = None if self.whitening is None else self.whitening.state_dict()
+        self._reduce(traverse)
+        run = None if checkpoint is None else (checkpoint, lambda: self.run_key(traverse, second, visits))
+        text = "learning" if progress else None
         try:
-            frames = 0 if self._chunked is None else traverse.count()
-            if frames > streaming.SAMPLE:
-                return self._learn_chunks(traverse, frames, second, text, work, make, visits)
-            if work is not None:
-                work.check_unused()
-            descriptors = self.describe_reference(traverse, second, text)
-            if visits is None:
-                return self.learn_features(descriptors, traverse)
-            counts = 1 + shown_by(visits, len(descriptors))
-            self.learn_features(self._averaged(descriptors, visits, progress), traverse)
-            self.map.count_visits(counts)
-            return self
+            route = learning.learn(self.describer, self.mapper, traverse, second, visits, text, run, code)
         except InputError:  # the map that there was is of its own whitening
             if self.whitening is not None and before is not None:
                 self.whitening.load_state_dict(before)
             raise
+        return self._take(route, traverse)
 
-    @property
-    def _chunked(self) -> SpectralMapper | None:
-        """The mapper, where it codes chunk by chunk."""
-        mapper = self.mapper
-        return mapper if isinstance(mapper, SpectralMapper) and mapper.chunk != "route" else None
-
-    def _learn_chunks(
-        self,
-        traverse: Traverse,
-        frames: int,
-        second: Views | None,
-        progress: str | None,
-        work: WorkFolder | None,
-        make: Callable[..., Made],
-        visits: Views | None,
-    ) -> DejaVu:
-        """As `learn`, of a route of over `SAMPLE` frames."""
-        mapper = self._chunked
-        assert mapper is not None
-        size = int(mapper.chunk)
-        counts = visits and 1 + shown_by(visits, frames)
-        names, positions = self._beside(traverse, frames)
-        taken = positions.nbytes
-        if work is not None:
-            sampled = runs(sample_of(frames, size).frame)
-            states = [traverse.state(run.start, run.stop) for run in sampled]
-            key = self.run_key(traverse, frames, states, visits)
-            work.open(key | digests(second=_state_of(second)))
-        self._reduce(traverse)
-        visits = visits and self.read_once(visits, progress)
-        with in_one_thread():
-            fit = self._fit(traverse, frames, second, taken, progress, work, visits)
-        coder = self.chunk_coder(frames, mapper, fit.mean, fit.step, visits)
-        chunks = all_chunks(coder, traverse, work, make, progress)
-        settings = mapper.metric, mapper.transform, size, mapper.resolution
-        route = SpectralMap.of_chunks(chunks, fit.mean, *settings).to(self.map.positions.device)
-        route.needed = fit.needed
-        if counts is not None:
-            route.count_visits(counts)
-        self._say_reached(route, taken, mapper.beside(taken, _is_ready(traverse)))
-        return self._take(route, traverse, names, positions)
-
-    def _fit(
-        self,
-        traverse: Traverse,
-        frames: int,
-        second: Views | None,
-        taken: int,
-        progress: str | None,
-        work: WorkFolder | None,
-        visits: Views | None,
-    ) -> Fit:
-        """Learn the whitening from a sample of a long route; mean and step of its chunks."""
-        found = None if work is None else work.fit()
-        if found is not None:
-            if self.whitening is not None:
-                self.whitening.load_state_dict(found[1])
-            return found[0]
-        mapper = self._chunked
-        assert mapper is not None
-        size = int(mapper.chunk)
-        sample = sample_of(frames, size)
-        part = Selection(traverse, sample.frame)
-        descriptors = self.describe_reference(part, second and sample.views(second), progress and "sampling")
-        if visits is not None and len((shown := sample.shown(visits)).places):
-            descriptors = self._averaged(descriptors, shown)
-        # what the file holds once counts for the sample by its share alone
-        share, once = len(descriptors) / frames, 2 * descriptors.shape[1]
-        other = copy.copy(mapper.beside(round(share * taken - (1 - share) * once), _is_ready(traverse)))
-        other.chunk = sample.stretch
-        with torch.no_grad():
-            route = other(descriptors)
-        fit = Fit(route.mean, float(route.steps[0]), route.needed)
-        if work is not None:
-            work.keep_fit(fit, {} if self.whitening is None else self.whitening.state_dict())
-        return fit
-
-    def chunk_coder(
-        self,
-        frames: int,
-        settings: SpectralMap | SpectralMapper,
-        mean: Tensor,
-        step: float,
-        visits: Views | None = None,
-    ) -> ChunkCoder:
-        """What makes coded chunks of so many frames, described as this model does."""
-        module, whitening = self.pipeline, self.whitening
-        size, transform, resolution = int(settings.chunk), settings.transform, settings.resolution
-        sizes = self._at_once, frames, size
-        return ChunkCoder(module, whitening, *sizes, mean, step, transform, resolution, visits)
-
-    def read_once(self, visits: Views, progress: str | None = None) -> Views:
-        """Visits that can be read anywhere: as they are, or the features of all, which may lie in a file."""
-        if visits.traverse.seeks:
-            return visits
-        features = concatenate(self._features(visits.traverse, progress and "averaging"))
-        return Views(ArrayTraverse(features.cpu(), visits.traverse.name), visits.places)
-
-    def _averaged(self, descriptors: Tensor, visits: Views, progress: bool = False) -> Tensor:
-        """Descriptors (N,K) of places that were visited once, averaged with those of further visits."""
-        seen = self.describe_visits(visits, descriptors.shape[1], progress)
-        return with_visits(descriptors.float(), torch.ones(len(descriptors)), *seen)
-
-    def describe_visits(self, visits: Views, dimension: int, progress: bool = False) -> tuple[Tensor, Tensor]:
-        """Descriptors (n,K) of the frames that show a place, and these places (n,).
-
-        Raises:
-            InputError: descriptors of another dimension or number, or that are not finite.
-        """
-        name = visits.traverse.name
-        rows = self.extract_all(visits.traverse, "averaging" if progress else None)
-        if rows.shape != (len(visits.places), dimension):
-            seen = f"{name} gives descriptors {tuple(rows.shape)} of {len(visits.places)} places"
-            raise InputError(f"{seen}; expected one of {dimension} numbers for each")
-        if not bool(rows.isfinite().all()):
-            raise InputError(f"{name} gives NaN or infinite descriptors; expected finite numbers")
-        shown = visits.places.to(rows.device) >= 0
-        return rows[shown], visits.places[shown.to(visits.places.device)]
-
-    def run_key(
-        self,
-        traverse: Traverse,
-        frames: int,
-        states: list[str] | None = None,
-        visits: Views | None = None,
-    ) -> dict[str, str]:
-        """What the chunks of a traverse are made of, as digests: see `WorkFolder`.
+    def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
+        """As `learn`, from descriptors that are there already. It ends in eval mode.
 
         Args:
-            states: of the frames that the whitening is learned from.
-            visits: that are averaged in.
+            features: (N,K) float, whitened where the model whitens.
+            traverse: what they come from, where known: the map then knows what frames to expect, and,
+                where they were resampled, which frame each place shows.
         """
-        header = recipes_of(self)
-        header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in self.modules()})))
-        weights = weights_of(self, "features")
-        if self.whitening is not None and (self.whitening.fixed or states is None):
-            weights |= weights_of(self, "whitening")
-        header |= {"batch_size": self._at_once, "sample": streaming.SAMPLE}
-        header |= {"version": __version__, "torch": torch.__version__}
-        sums = checksums(weights, header)
-        sources = digests(source=[traverse.identity(), frames, states], visits=_state_of(visits))
-        return sources | {"settings": sums.pop(HEADER), **sums}
-
-    def _say_reached(self, route: SpectralMap, taken: int, mapper: Mapper) -> None:
-        """What a long route takes, where the sample told wrongly."""
-        wanted, places = getattr(mapper, "budget", None), route.places
-        summary = route.summary()
-        if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
-            return
-        reached = (summary.route_bytes + (taken if 2 * taken <= wanted * places else 0)) / places
-        if abs(reached / wanted - 1) > OFF:
-            log.warning(
-                "route_bytes_per_place is %g, and the route takes %.3g: its step is of %d of its %d places",
-                *(wanted, reached, streaming.SAMPLE, places),
-            )
+        overhead = learning.positions_of(traverse).nbytes
+        mapper = self.mapper.with_overhead(overhead, learning.is_ready(traverse))
+        return self._take(learning.learn_descriptors(mapper, features), traverse)
 
     def describe_reference(
         self, traverse: Traverse, second: Views | None = None, progress: str | None = None
     ) -> Tensor:
-        """Descriptors of the reference, the whitening learned from it: what `learn_features` makes a map of.
+        """Descriptors (N,K) of the reference, the whitening learned from it: what `learn_features` takes.
 
         Args:
-            second: another traverse of the same places, from which whitening learns, in place of augmented
-                copies, what changes between two visits.
-            progress: text of a progress bar on a terminal, elsewhere of a line a minute; None shows nothing.
-
-        Shape: -> (N,K).
-
-        Convention: for a spectral map, a whitening of features beyond `concatenate`'s share of the memory is
-            learned from a sample of them, see `sample_of`, and descriptors beyond a quarter of it lie in a
-            temporary file; whitened ones as float16, which is finer than any step of these.
+            second: as of `learn`. progress: text of a progress bar on a terminal; None shows nothing.
 
         Raises:
             InputError: as `learn`, or a second traverse that no whitening learns from.
         """
         if second is not None:
-            self._require_learning_whitening(second.traverse.name)
+            self.require_learning_whitening(second.traverse.name)
         self._reduce(traverse)
-        whitening = self.whitening
-        spectral = isinstance(self.mapper, SpectralMapper)
-        if whitening is not None and not whitening.fixed and spectral and self._has_many_features(traverse):
-            sample = sample_of(traverse.count(), streaming.SAMPLE)
-            part = Selection(traverse, sample.frame)
-            self.describe_reference(part, second and sample.views(second), progress and "sampling")
-            return concatenate(self.extract(traverse, progress), FEW_DESCRIPTORS, half=True)
-        if whitening is None or whitening.fixed:
-            batches = self.extract(traverse, progress, self._look_at(traverse))
-            few = FEW_DESCRIPTORS if spectral else IN_MEMORY
-            return concatenate(batches, few, half=spectral and whitening is not None)
-        device = self.map.positions.device
-        features = concatenate(self._features(traverse, progress, self._look_at(traverse)))
-        if len(features) < 2 and not _is_ready(traverse):
-            raise InputError(f"{traverse.name} has 1 frame; expected at least 2, as of a traverse")
-        looks = "" if second is None else f"by {second.traverse.name}"
-        if second is None and not _is_ready(traverse) and whitening.views != 0:
-            augmented = AugmentedTraverse(
-                traverse,
-                len(features),
-                whitening.copies(*features.shape),
-                whitening.most_views,
-                whitening.strengths,
-                whitening.seed,
-            )
-            second, looks = augmented.views, augmented.looks
-        if second is None:
-            whitening.learn(features)
-        else:
-            batches = self._features(second.traverse, progress and f"learning what changes: {looks}")
-            whitening.learn(features, _labelled(batches, second.places.to(device)))
-        whitening.to(device)
-        return concatenate(self.whitened(part.to(device)) for part in features.split(ROWS))
+        return self.describer.reference(traverse, second, progress, isinstance(self.mapper, SpectralMapper))
+
+    @property
+    def describer(self) -> Describer:
+        """How the model describes frames now."""
+        pixels = math.prod(self._resize or (1,))  # fewer frames at a time if they are brought to a large size
+        batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
+        return Describer(self.pipeline, self.whitening, batch, self.map.positions.device, self._bright)
+
+    def run_key(
+        self, traverse: Traverse, second: Views | None = None, visits: Views | None = None
+    ) -> dict[str, str]:
+        """What the chunks of a traverse are made of, as digests: see `Checkpoint`."""
+        header = recipes_of(self)
+        header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in self.modules()})))
+        header |= {"batch_size": self.describer.batch_size, "sample": learning.SAMPLE}
+        header |= {"version": __version__, "torch": torch.__version__}
+        fixed = self.whitening is not None and self.whitening.fixed
+        sums = checksums(
+            weights_of(self, "features") | (weights_of(self, "whitening") if fixed else {}), header
+        )
+        sources = {
+            name: views and [views.traverse.identity(), views.places.tolist()]
+            for name, views in (("second", second), ("visits", visits))
+        }
+        source = [traverse.identity(), traverse.count()]
+        return digests(source=source, **sources) | {"settings": sums.pop(HEADER), **sums}
 
     def _reduce(self, traverse: Traverse) -> None:
         """Ready features too wide for a spectral map become principal components without whitening, too."""
-        spectral = isinstance(self.mapper, SpectralMapper)
-        wide = spectral and _is_ready(traverse) and traverse.frame_shape[0] > WIDEST
+        ready = learning.is_ready(traverse) and isinstance(self.mapper, SpectralMapper)
+        wide = ready and traverse.frame_shape[0] > WIDEST
         if wide and self.whitening is None:
             self.whitening, self._reduces = Whitening(views=0).to(self.map.positions.device), True
         elif self._reduces and not wide:  # of a route that was learned before
             self.whitening, self._reduces = None, False
 
-    def _warn_of_bright(self, frames: Tensor, name: str) -> None:
-        """Once for each name, see `warn_of_bright`."""
-        if (name, "bright") not in self._told and warn_of_bright(frames, name):
-            self._told.add((name, "bright"))
-
-    def _look_at(self, traverse: Traverse) -> Callable[[Tensor, Tensor], None]:
-        """What the first batch of a reference is checked by."""
-
-        def look(frames: Tensor, features: Tensor) -> None:
-            self._warn_of_bright(frames, traverse.name)
-            check_alone(self.pipeline, frames, features, traverse.name)
-
-        return look
-
-    def _has_many_features(self, traverse: Traverse) -> bool:
-        """Whether the features of a traverse are too many to be held, so that a sample has to do."""
-        if traverse.length is not None and traverse.length <= streaming.SAMPLE:
-            return False
-        one = next(self._features(Selection(traverse, torch.zeros(1, dtype=torch.int64))))
-        frames = traverse.count()
-        return frames > streaming.SAMPLE and frames * one.nbytes > IN_MEMORY
-
-    def views(self, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
-        """Another traverse of the reference's places, for `learn`; resampled where the reference is.
-
-        Args:
-            reference: as `resample` gives it.
-            truth: which frames of the reference it shows, see `find_ground_truth`; None, of one that is as
-                long: frame i is place i. Of several for one frame the first counts; frames that show none are
-                left out.
+    def require_learning_whitening(self, name: str) -> None:
+        """Refuse a second traverse that no whitening learns from.
 
         Raises:
-            InputError: no whitening that could learn from it, or as of `places_shown`.
+            InputError: naming it.
         """
-        self._require_learning_whitening(second.name)
-        return self.places_shown(reference, second, truth)
-
-    def places_shown(self, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
-        """As `views`, for `calibrate`.
-
-        Raises:
-            InputError: nothing says which places it shows, or it shows none.
-        """
-        shape = self.fit(reference, self.frame_shape if self.map.places else None).frame_shape
-        second = self.resample(second, getattr(reference, "step", None), shape=shape)
-        frames, shown = reference.count(), second.count()
-        found = ground_truth_of(truth, reference, second, frames, shown, aligned=True)
-        if found is None:
-            steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
-            raise InputError(
-                f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
-                "many, frame i being place i, or a truth that says which places it shows"
-            )
-        if isinstance(reference, ResampledTraverse):
-            found = ground_truth_in_places(found, partial(place_of, reference.positions))
-        places = found.positives[:, 0]
-        if not (places >= 0).any():
-            raise InputError(f"no frame of {second.name} shows a place of {reference.name}; expected some")
-        return Views(second, places)
+        if self.whitening is None or self.whitening.fixed:
+            seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
+            raise InputError(f"{seen} to learn from {name}; expected one that is learned")
 
     def take_whitening(self, other: DejaVu) -> None:
         """Describe as another model does: its whitening as it is, and what is ahead of it.
@@ -547,11 +315,6 @@ class DejaVu(nn.Module):
     def without_map(self) -> DejaVu:
         """What makes the descriptors, by itself: it serves any route, at its own steps."""
         return DejaVu(**(self.settings() | {"velocity": None})).train(self.training)
-
-    def _require_learning_whitening(self, name: str) -> None:
-        if self.whitening is None or self.whitening.fixed:
-            seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
-            raise InputError(f"{seen} to learn from {name}; expected one that is learned")
 
     def resample(
         self,
@@ -602,52 +365,25 @@ class DejaVu(nn.Module):
             return frames
         return resize_frames(frames, _size_like((frames.shape[2], frames.shape[3]), self.frame_shape))
 
-    def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
-        """As `learn`, from descriptors that are there already. It ends in eval mode.
-
-        Args:
-            features: (N,K) float, whitened where the model whitens.
-            traverse: what they come from, where known: the map then knows what frames to expect, and,
-                where they were resampled, which frame each place shows.
-        """
+    def _take(self, route: PlaceMap, traverse: Traverse | None) -> DejaVu:
+        """The map that was learned from a traverse, in eval mode."""
         shape = () if traverse is None else traverse.frame_shape
-        if len(shape) == 3 and features.shape[1] > MANY_FEATURES:
+        if len(shape) == 3 and route.dimension > MANY_FEATURES:
             log.warning(
-                "each frame gives %d features; smaller frames make a smaller and faster map",
-                features.shape[1],
+                "each frame gives %d features; smaller frames make a smaller and faster map", route.dimension
             )
-        names, positions = self._beside(traverse, len(features))
-        mapper = self.mapper.beside(positions.nbytes, _is_ready(traverse))
-        with torch.no_grad():
-            route: PlaceMap = mapper(features).to(positions.device)  # spilled ones are on the CPU
-        if route.places != len(features) or route.dimension != features.shape[1]:
-            raise InputError(
-                f"{type(self.mapper).__name__} made a map of {route.places} places of {route.dimension} "
-                f"features from features {tuple(features.shape)}; expected as many"
-            )
-        return self._take(route, traverse, names, positions)
-
-    def _beside(self, traverse: Traverse | None, places: int) -> tuple[list[str], Tensor]:
-        """What a file holds beside the map of a traverse: names of its frames, and their positions."""
-        positions = self.map.positions.new_zeros(0)
-        if isinstance(traverse, ResampledTraverse):
-            positions = traverse.positions.to(positions.device)
-            return names_of(traverse.traverse, len(positions)), positions
-        return [] if traverse is None else names_of(traverse, places), positions
-
-    def _take(
-        self, route: PlaceMap, traverse: Traverse | None, names: list[str], positions: Tensor
-    ) -> DejaVu:
-        """The map that was learned of a traverse, with what `_beside` gave."""
-        shape = () if traverse is None else traverse.frame_shape
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast are left as they are")
+        device, positions = self.map.positions.device, learning.positions_of(traverse)
+        route = route.to(device)  # many descriptors lie in a file, on the CPU
         if len(positions):
-            route.positions = positions
+            route.positions = positions.to(device)
             route.check()
-        step = traverse.step if isinstance(traverse, ResampledTraverse) else None
-        self.map, self.step, self.frame_names, self._searcher = route, step, names, None
-        self.frame_shape, self.trained, self.calibration = shape or None, None, None
+        self.step = traverse.step if isinstance(traverse, ResampledTraverse) else None
+        frames = len(positions) or route.places
+        self.frame_names = [] if traverse is None else names_of(source_of(traverse), frames)
+        self.map, self._searcher, self.frame_shape = route, None, shape or None
+        self.trained = self.calibration = None
         return self.eval()
 
     def calibrate(
@@ -683,48 +419,11 @@ class DejaVu(nn.Module):
             True
         """
         self._require_map()
-        if views is None:
-            if reference is None:
-                raise InputError("neither a reference nor views to calibrate by; expected one of them")
-            reference = self.fit(as_traverse(reference), self.frame_shape or ())
-            strengths = STRENGTHS if self.whitening is None else self.whitening.strengths
-            places = torch.arange(self.map.places) if places is None else places
-            stretches = Stretches(reference, len(places), strengths, places=self.map.places)
-            views = Views(stretches, places[stretches.places])
-        another = not isinstance(views.traverse, Stretches)
-        if isinstance(views.traverse, Stretches):
-            length = views.traverse.stretch
-        else:
-            length = max(STRETCH, min(LONGEST_TRIAL, TRIAL_SCORES // self.map.places))
-        name = views.traverse.name
-        if len(views.places) and int(views.places.max()) >= self.map.places:
-            shown = f"{name} shows place {int(views.places.max())}"
-            raise InputError(f"{shown}; expected one of the map's {self.map.places}")
-        if another:
-            views = _stretches_of(views, length, max(LEAST, CALIBRATION_SCORES // self.map.places))
-        descriptors = self.extract_all(views.traverse)
-        if len(descriptors) != len(views.places):
-            seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
-            raise InputError(f"{seen}; expected as many")
-        parts = zip(descriptors.split(length), views.places.split(length), strict=True)
-        try:
-            self.calibration = calibrated(self.map, (Trial(*part) for part in parts), another)
-        except InputError as error:
-            raise InputError(f"calibrating by {name}: {error}") from error
+        own = None
+        if reference is not None and views is None:
+            own = self.fit(as_traverse(reference), self.frame_shape or ())
+        self.calibration = learning.calibrate(self.describer, self.map, own, views, places)
         return self
-
-    def calibrate_if_possible(
-        self, reference: Traverse, views: Views | None = None, places: Tensor | None = None
-    ) -> None:
-        """As `calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
-        reference."""
-        if views is not None:
-            self.calibrate(reference, views)
-        elif self.calibration is None and len(reference.frame_shape) == 3 and self.map.summary().covered:
-            try:
-                self.calibrate(reference, places=places)
-            except InputError as error:
-                log.warning("the map is not calibrated: %s", error)
 
     def describe(self, frames: Tensor) -> Tensor:
         """Features of frames: preprocess, then features. (B,C,H,W) -> (B,D)"""
@@ -733,7 +432,7 @@ class DejaVu(nn.Module):
 
     def whitened(self, features: Tensor) -> Tensor:
         """Descriptors of features, (B,D) -> (B,K); the features themselves without whitening."""
-        return features if self.whitening is None else self.whitening(features)
+        return self.describer.whitened(features)
 
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
@@ -882,10 +581,9 @@ class DejaVu(nn.Module):
 
         def look(frames: Tensor, features: Tensor) -> None:
             self.check_queries(shape, features.shape[1], queries.name)
-            self._warn_of_bright(frames, queries.name)
+            self.describer.warn_of_bright(frames, queries.name)
 
-        for features in self._features(queries, progress, look):
-            yield self.whitened(features)
+        yield from self.describer.descriptors(queries, progress, look)
 
     def matching(self, sequence: SequenceModel | None, search: Search = "auto") -> Matching:
         """A way to match queries, with probabilities where the map is calibrated for it."""
@@ -953,7 +651,7 @@ class DejaVu(nn.Module):
                 return (
                     Found(Candidates(place[:, None].cpu(), score[:, None].cpu())) for score, place in best
                 )
-            return matching._replace(sequence=None).stream(self.map.sequences(parts, sequence))
+            return matching._replace(sequence=None).stream(sequence.follow(parts, self.map))
         scores: Iterator[Tensor] = map(self.map.scores, parts)
         if order is not None:
             place = order.argsort()
@@ -973,25 +671,6 @@ class DejaVu(nn.Module):
         """Find best places by a searcher of the map that is made already, such as one of a cluster."""
         self._searcher = searcher
 
-    def extract(
-        self,
-        traverse: Traverse,
-        progress: str | None = None,
-        look: Callable[[Tensor, Tensor], None] | None = None,
-    ) -> Iterator[Tensor]:
-        """Descriptors of a traverse in batches (B,K), without gradients; `look` as of `feature_batches`."""
-        return map(self.whitened, self._features(traverse, progress, look))
-
-    def _features(
-        self,
-        traverse: Traverse,
-        progress: str | None = None,
-        look: Callable[[Tensor, Tensor], None] | None = None,
-    ) -> Iterator[Tensor]:
-        """What whitening takes: features of a traverse in batches (B,D), without gradients."""
-        device = self.map.positions.device
-        return feature_batches(traverse, self.pipeline, self._at_once, device, progress, look)
-
     @property
     def _resize(self) -> tuple[int, int] | None:
         """The size (height, width) that the features resize frames to, where one of this package's does."""
@@ -1004,15 +683,9 @@ class DejaVu(nn.Module):
             return (self.features.cell * self.features.block,) * 2
         return self._resize
 
-    @property
-    def _at_once(self) -> int:
-        """Frames of a batch: fewer than asked for where they are brought to a large size."""
-        pixels = math.prod(self._resize or (1,))
-        return max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
-
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
         """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""
-        return concatenate(self.extract(traverse, progress))
+        return concatenate(self.describer.descriptors(traverse, progress))
 
     @property
     def pipeline(self) -> nn.Sequential:
@@ -1107,21 +780,6 @@ class DejaVu(nn.Module):
             raise InputError("there is no map yet; expected learn(...) or load(...) first")
 
 
-def check_sizes(model: DejaVu, reference: Traverse, query: Traverse) -> int:
-    """How many features a frame gives; refuse, before the long work, traverses that do not give as many."""
-    device = model.map.positions.device
-    counts = [
-        next(feature_batches(traverse, model.pipeline, 1, device)).shape[1] for traverse in (reference, query)
-    ]
-    if counts[0] != counts[1]:
-        seen = " and ".join(
-            f"{traverse.name} gives {count} features a frame of {' x '.join(map(str, traverse.frame_shape))}"
-            for traverse, count in zip((reference, query), counts, strict=True)
-        )
-        raise InputError(f"{seen}; expected as many, as frames of one size give")
-    return counts[0]
-
-
 def _size_like(own: tuple[int, int], shape: tuple[int, ...]) -> tuple[int, int]:
     """The size of frames of a shape (C,H,W), for frames of one aspect ratio with it; else their own."""
     same = len(shape) == 3 and not is_stretched(own, (shape[1], shape[2]))
@@ -1138,32 +796,6 @@ def check_precision(precision: float | None) -> None:
         raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
 
 
-def _is_ready(traverse: Traverse | None) -> bool:
-    """Whether a traverse is known to hold ready features, not frames."""
-    return traverse is not None and len(traverse.frame_shape) == 1
-
-
-def _stretches_of(views: Views, length: int, most: int) -> Views:
-    """Evenly spaced stretches of views, as long as that and about `most` frames in all; all if there are no
-    more."""
-    count = len(views.places) // length
-    wanted = max(1, most // length)
-    if count <= wanted:
-        return views
-    starts = torch.arange(wanted) * (count - 1) // max(1, wanted - 1) * length
-    frame = (starts[:, None] + torch.arange(length)).flatten()
-    return Views(Selection(views.traverse, frame), views.places[frame.to(views.places.device)])
-
-
-def _labelled(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Batches of descriptors, each with the places (B,) that they show; those that show none left out."""
-    done = 0
-    for batch in batches:
-        shown = places[done : done + len(batch)]
-        yield batch[shown >= 0], shown[shown >= 0]
-        done += len(batch)
-
-
 def _code_of(cls: type[nn.Module]) -> str:
     """The source of a class of the user's own; "" where there is none, or where a version tells of it."""
     if cls.__module__.partition(".")[0] in ("dejavu_torch", "torch"):
@@ -1172,24 +804,3 @@ def _code_of(cls: type[nn.Module]) -> str:
         return inspect.getsource(cls)
     except (OSError, TypeError):
         return ""
-
-
-def shown_by(visits: Views, places: int) -> Tensor:
-    """How many frames of visits show each of so many places, (N,).
-
-    Raises:
-        InputError: they show a place beyond these.
-    """
-    shown = visits.places[visits.places >= 0].cpu()
-    if len(shown) and int(shown.max()) >= places:
-        seen = f"{visits.traverse.name} shows place {int(shown.max())}"
-        raise InputError(f"{seen}; expected one of {places}")
-    return shown.bincount(minlength=places)
-
-
-def _state_of(views: Views | None) -> list[Any] | None:
-    """What tells views from others, as JSON takes it."""
-    if views is None:
-        return None
-    traverse, places = views
-    return [traverse.identity(), traverse.state(0, len(places)), places.tolist()]

@@ -1,4 +1,4 @@
-"""The one way in which frames are resized, by every room: what is described, stored and drawn is the same."""
+"""How frames are resized, in every room: what is described, stored and drawn is the same."""
 
 from __future__ import annotations
 
@@ -9,19 +9,12 @@ from torch.nn.functional import interpolate
 
 from dejavu_torch.types import InputError
 
-MOST_PIXELS = 2**26  # of a frame: a number in a file or an option can be any
-STRETCHED = 1.05  # the ratio of the sides may change by this factor
+MOST_PIXELS = 2**26  # of a frame: files and options can name any number
+STRETCHED = 1.05  # change of the aspect ratio that counts
 
 
 def check_size(size: tuple[int, int], least: int, what: str) -> None:
-    """Refuse what is no size in pixels, (height, width).
-
-    Args:
-        least: pixels of each side. what: the message begins with, up to the =.
-
-    Raises:
-        InputError: not two numbers, one below the least, or more than 2^26 pixels.
-    """
+    """Refuse what is not (height, width) of at least `least` pixels each; the message begins with `what`."""
     if len(size) != 2 or min(size) < least or math.prod(size) > MOST_PIXELS:
         raise InputError(
             f"{what}={tuple(size)}; expected (height, width) in pixels, at least {least} each "
@@ -30,7 +23,7 @@ def check_size(size: tuple[int, int], least: int, what: str) -> None:
 
 
 def resize_frames(frames: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """Frames of another size, antialiased: bilinear, over areas where they shrink.
+    """Frames of another size, antialiased: bilinear, over areas if they shrink.
 
     Args:
         size: (height, width) in pixels; None, and the size that the frames have, change nothing.
@@ -67,6 +60,6 @@ def reduced_size(
     """
     if longest is None:
         return own
-    needed = (0, 0) if least is None else least
-    scale = max(longest / max(own), needed[0] / own[0], needed[1] / own[1])
+    height, width = least or (0, 0)
+    scale = max(longest / max(own), height / own[0], width / own[1])
     return own if scale >= 1 else (max(1, round(scale * own[0])), max(1, round(scale * own[1])))

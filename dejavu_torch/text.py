@@ -1,4 +1,4 @@
-"""Text that others wrote, such as the names of files, as part of ours."""
+"""Text from elsewhere, such as the names of files, as part of messages."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from unicodedata import category
 
 
 def printable(text: object) -> str:
-    """A text of one line: each character that is neither printable nor a space, as a line break, is escaped.
-
-    Bytes of a file name that are no text in the system's encoding count among them.
+    """A text of one line: what is neither printable nor a space, as a line break, is escaped.
 
     Example:
         >>> printable("two\\nlines")

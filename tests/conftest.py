@@ -35,7 +35,7 @@ settings.load_profile("repeatable")
 # whole commands, trainings, real footage and notebooks: not in a developer's inner loop
 SLOW = (
     *("training", "experiments", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
-    "test_real_routes",
+    *("test_real_routes", "test_golden"),
     *(
         "test_periods_on_real_data",
         "test_spectral_model",

@@ -38,15 +38,15 @@ def test_the_limit_of_a_container_counts(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_the_limits_of_the_groups_around_a_job_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    own, inside = tmp_path / "own", tmp_path / "memory" / "slurm" / "job" / "step"
+    own, inside = tmp_path / "own", tmp_path / "slurm" / "job" / "step"
     monkeypatch.setattr(memory, "GROUPS", tmp_path)
     monkeypatch.setattr(memory, "OWN", own)
-    own.write_text("5:cpu:/elsewhere\n4:memory:/slurm/job/step\n0::/slurm\n")
+    own.write_text("4:memory:/elsewhere\n0::/slurm/job/step\n")
     inside.mkdir(parents=True)
-    for group, limit in ((inside, 2**63 - 4096), (inside.parent, 3_000_000)):
-        (group / "memory.limit_in_bytes").write_text(f"{limit}\n")
-        (group / "memory.usage_in_bytes").write_text("1000000\n")
-        (group / "memory.stat").write_text("inactive_file 9\ntotal_inactive_file 400000\n")
+    for group, limit in ((inside, "max"), (inside.parent, "3000000"), (inside.parents[1], "9000000")):
+        (group / "memory.max").write_text(f"{limit}\n")
+        (group / "memory.current").write_text("1000000\n")
+        (group / "memory.stat").write_text("anon 9\ninactive_file 400000\n")
     assert free_memory() == 2.4e6
     own.write_text("0::/slurm/../..\n")
     assert free_memory() > 2.4e6

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from dejavu_torch.maps.merged import MergedMap
 from footage import REFERENCE, SIDE, camera, footage
 from helpers import refused, template_model
 from hypothesis import given
@@ -30,7 +31,6 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import append, average, learn_mean, merge, shown_on_map
 from dejavu_torch.maps.file import read_map, write_map
-from dejavu_torch.maps.merged import MergedMap
 from dejavu_torch.maps.spectral import SpectralMap, code_chunk
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.streaming import coder

@@ -9,7 +9,7 @@ import copy
 import shlex
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -26,10 +26,12 @@ from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
-from dejavu_torch.maps.merged import MergedMap
+from dejavu_torch.learning import SAMPLE as SHORT
+from dejavu_torch.learning import Checkpoint, Code, code_here
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.spectral import SpectralMap
-from dejavu_torch.model import DejaVu, check_precision, check_sizes
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
@@ -39,9 +41,6 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.matching import Found
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.streaming.coder import Made, code_here
-from dejavu_torch.streaming.sample import SAMPLE as SHORT
-from dejavu_torch.streaming.work import WorkFolder, work_folder_of
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
@@ -147,8 +146,6 @@ def run_learn(
     if cluster is not None:
         _check_cluster(cluster, device)
         _check_chunks(cluster, model)
-        if average is not None:
-            raise InputError(f"--cluster {cluster} with --average {average}; expected one of them")
     _check_map_name(map)
     check_output_file(map)
     check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
@@ -166,7 +163,7 @@ def run_learn(
         traverse, views = _with_second(model, traverse, second, second_truth)
         if average is not None:
             with _truth_by("--average_truth"):
-                visits = model.places_shown(traverse, open_source(average), average_truth)
+                visits = growth.associate(model, traverse, open_source(average), average_truth)
         _check_calibration(model, traverse, calibration, precision)
         traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
     else:
@@ -179,31 +176,31 @@ def run_learn(
             with _truth_by("--calibration_truth"):
                 known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
-    done, start, work = "", model.map.places, WorkFolder(work_folder_of(map))
-    with _making(cluster) as make:
+    done, start, checkpoint = "", model.map.places, Checkpoint(map)
+    with _coding(cluster) as code:
         if append is not None and sources:
-            growth.append(model, traverse, progress=True, work=work, make=make, visits=visits)
+            growth.append(model, traverse, progress=True, checkpoint=checkpoint, code=code, visits=visits)
             places = torch.arange(start, model.map.places)
             known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
             done = f"{len(places)} places behind the {start} of {append}; written to {map}"
         elif append is not None:
             assert visits is not None
-            work.check_unused()
+            checkpoint.check_unused()
             count, places = growth.average(model, visits, progress=True), visits.places
             done = f"{count} of the {start} places of {append}"
             done += ": decoded, averaged and coded again at the same step"
         elif visits is not None:
-            growth.learn_mean(model, traverse, visits, True, views, work, make)
+            growth.learn_mean(model, traverse, visits, True, views, checkpoint, code)
         else:
-            model.learn(traverse, progress=True, second=views, work=work, make=make)
+            model.learn(traverse, progress=True, second=views, checkpoint=checkpoint, code=code)
             if cluster is not None and model.map.places <= SHORT:
                 seen = f"{model.map.places} frames are learned here"
                 print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
     if calibration != NO_CALIBRATION:
-        model.calibrate_if_possible(traverse, known, places)
+        growth.calibrate_if_possible(model, traverse, known, places)
     model.check_precision(None)
     model.save(map)
-    work.remove()
+    checkpoint.remove()
     print_map(model)
     if done:
         _say(done)
@@ -808,7 +805,7 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
 
 def _check_cluster(cluster: str, device: str) -> None:
     """Refuse early what no cluster does."""
-    from dejavu_torch.cluster.session import check_installed
+    from dejavu_torch.cluster import check_installed
 
     if device != "cpu":
         raise InputError(f"--cluster {cluster} and --device {device}; expected one of them")
@@ -817,19 +814,18 @@ def _check_cluster(cluster: str, device: str) -> None:
 
 def _check_chunks(cluster: str, model: DejaVu) -> None:
     """Refuse to divide among workers what is made as one."""
-    if getattr(model.mapper, "chunk", "route") == "route":
-        seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none here"
-        raise InputError(f"{seen}; expected a spectral map of --mapper.chunk places each, such as 1000")
+    if not isinstance(model.mapper, SpectralMapper):
+        seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none"
+        raise InputError(f"{seen}; expected a spectral map")
 
 
 @contextmanager
-def _making(cluster: str | None) -> Iterator[Callable[..., Made]]:
+def _coding(cluster: str | None) -> Iterator[Code]:
     """What makes the chunks of a long route: this process, or a cluster, which ends with the block."""
     if cluster is None:
         yield code_here
         return
-    from dejavu_torch.cluster.learning import code_on
-    from dejavu_torch.cluster.session import Cluster
+    from dejavu_torch.cluster import Cluster, code_on
 
     with ExitStack() as stack:
         # no sooner than there are chunks to make: it takes seconds
@@ -842,8 +838,7 @@ def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
     if cluster is None:
         yield
         return
-    from dejavu_torch.cluster.searching import ClusterSearcher
-    from dejavu_torch.cluster.session import Cluster
+    from dejavu_torch.cluster import Cluster, ClusterSearcher
 
     with Cluster(cluster) as workers:
         model.search_by(ClusterSearcher(workers, model.map))
@@ -866,7 +861,7 @@ def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
     default = recipe_of(given.features) == recipe_of(HOG())
     model = _load_map(path, None if default else given.features)
     try:
-        (growth.growing if places else growth.one_route)(model)
+        growth.one_route(model, "append to" if places else "average visits into")
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     _accept_by(model, given.threshold, given.precision)
@@ -980,7 +975,7 @@ def _with_second(
         raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
     reference = model.resample(reference, progress=True, shape=model.frame_shape)
     with _truth_by("--second_truth"):
-        return reference, model.views(reference, traverse, truth)
+        return reference, growth.second_traverse(model, reference, traverse, truth)
 
 
 def _with_calibration(
@@ -1005,9 +1000,9 @@ def _with_calibration(
         raise InputError(f"--calibration {source} is {same.name} itself; expected another traverse")
     reference = model.resample(reference, model.step, True, model.frame_shape)
     traverse = model.fit(traverse, reference.frame_shape)
-    check_sizes(model, reference, traverse)
+    model.describer.check_sizes(reference, traverse)
     with _truth_by("--calibration_truth"):
-        return reference, model.places_shown(reference, traverse, truth)
+        return reference, growth.associate(model, reference, traverse, truth)
 
 
 @contextmanager
@@ -1100,7 +1095,7 @@ def print_map(model: DejaVu) -> None:
 
 def route_lines(route: PlaceMap) -> list[str]:
     """The routes of a merged map: their places, frames and bytes."""
-    if not isinstance(route, MergedMap):
+    if not isinstance(route, SpectralMap):
         return []
     lines, start = [], 0
     for one in route.routes:

@@ -15,7 +15,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.distance import Metric, phase_distances
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
@@ -205,7 +205,7 @@ def _compact_stores(model: DejaVu, reference: Tensor, tolerance: int) -> dict[st
     one = "place" if len(model.map.positions) else "frame"
     apart, short = max(1, 2 * tolerance), as_int8(reference)
     between, spaced, keys = interpolated(short, model.map.summary().route_bytes)
-    metric = "l2" if model.map.metric == "l2" else "cosine"
+    metric: Metric = "l2" if model.map.metric == "l2" else "cosine"
 
     def store(name: str, stored: Tensor, numbers: int, k: int, apart: int = 1) -> Store:
         return Store(name, stored, metric, numbers * dimension + fixed, k, fixed, apart)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, period_of
 
 COUNTS = (1, 4, 16)  # strongest periods that are added up, beside all
@@ -57,9 +57,9 @@ def components(
         kept = torch.zeros_like(lines)
         for chosen in ([0], *(lines_of[period] for period in strongest[:count])):
             kept[chosen] = lines[chosen]
-        products = from_spectrum(kept, route.transform) + query @ route.mean.to(query)
+        products = from_spectrum(kept, route.transform) + query @ route.means[0].to(query)
         if route.metric == "cosine":
-            scores = 1 - products * route.per_norm(start, stop)
+            scores = 1 - products * route.inverse_norms(start, stop)
         else:
             scores = length.square() - 2 * products + route.norms[start:stop].square()
         found.append(Component(tuple(strongest[:count]), scores.cpu()))

@@ -13,7 +13,8 @@ from torch import Tensor
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.place_map import Mapper
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap, log_posterior
 from dejavu_torch.maps.templates import PhaseTemplates
 from dejavu_torch.model import DejaVu
@@ -75,7 +76,7 @@ def null_model(
     order, mixed = shuffled(reference, seed)
     mapper = model.mapper
     if isinstance(model.map, SpectralMap):  # as many bytes, however the map's own step was chosen
-        mapper = model.map.mapper_of_equal_size()
+        mapper = SpectralMapper.of_equal_size(model.map)
     null = with_mapper(model, mapper)
     if same_plan:
         null.map = _same_layers(template_map_of(model, "the null of the same layers"), mixed)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import as_number, read_text
 from dejavu_torch.data.output import whole_file
-from dejavu_torch.maps.place_map import Route
+from dejavu_torch.maps.frame_table import Route
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match
 

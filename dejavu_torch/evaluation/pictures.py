@@ -45,7 +45,7 @@ from dejavu_torch.evaluation.score_plots import (
 )
 from dejavu_torch.evaluation.spectral_plots import Lines, plot_spectrum
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of, spectrum
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
@@ -97,12 +97,12 @@ class Localization(NamedTuple):
     @property
     def scored(self) -> Match:
         """The matches as the scores count them."""
-        return self.match._replace(index=self.model.map.scored(self.match.index))
+        return self.match._replace(index=self.model.map.table.scored(self.match.index))
 
     @property
     def borders(self) -> Tensor:
         """(N+1,) the reference frame with which each place begins, and the number of frames."""
-        return self.model.map.borders.cpu()
+        return self.model.map.table.borders.cpu()
 
     @property
     def query_frames(self) -> Tensor:
@@ -413,7 +413,9 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
         return {}
     energy = lines.value.new_zeros(route.dimension).index_add(0, lines.feature, lines.value.square())
     chosen = energy.argsort(descending=True, stable=True)[:STRONGEST].cpu()
-    values = run.reference_features[start:stop].cpu()[:, chosen].float() - route.mean.cpu()[chosen].float()
+    values = (
+        run.reference_features[start:stop].cpu()[:, chosen].float() - route.means[0].cpu()[chosen].float()
+    )
     amplitudes = spectrum(values.T, route.transform).abs()[:, 1:]
     kept = torch.zeros(stop - start, route.dimension, dtype=torch.bool)
     kept[lines.line.cpu(), lines.feature.cpu()] = True

@@ -45,7 +45,7 @@ def spectral(places: Tensor, budget: float, seed: int | None = None) -> Kept:
     order = torch.arange(len(places)) if seed is None else shuffled(places, seed)[0]
     route = SpectralMapper(budget)(places[order])
     back = torch.empty_like(places)
-    back[order] = route.rebuilt(0)
+    back[order] = route.decode(0)
     return Kept(back, sum(tensor.nbytes for tensor in route.packed().values()))
 
 

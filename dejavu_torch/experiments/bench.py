@@ -107,8 +107,7 @@ def bench_matcher(
         frames: grey frames to describe, of each size in `images` (height, width in pixels).
         repeats: timed runs of each contender, in turn; the best counts.
         distances: queries, features and templates of each case of L1.
-        sequences: queries, queries of a sequence and places of each case of a template map whose sequences
-            are matched in its layers, beside its score rows.
+        sequences: queries, queries of a sequence and places of each case of sequences on a template map.
         filters: queries and places of each case of a filter that searches all places for every 50th query,
             beside one that does for every query; the difference is one of probabilities.
         exports: frames, their height and width, and places of each case of single frames, found one behind
@@ -264,16 +263,11 @@ def _sequence_case(
     blocks = [templates[:tau, j, None] for j, tau in enumerate(PERIODS)]
     route, matcher = TemplateMap(plan, blocks, places, len(plan)), SequenceMatcher(length)
 
-    def tables() -> Tensor:
-        (scores,) = route.sequences([query], matcher)
-        return scores[:, length:]  # ahead of it some are +inf
+    def run() -> Tensor:
+        scores: Tensor = matcher(route.scores(query))
+        return scores[:, length:]  # before it some are +inf
 
-    def rows() -> Tensor:
-        (scores,) = matcher.stream([route.scores(query)])
-        return scores[:, length:]
-
-    beside = Program("dejavu (score rows)", torch.get_num_threads(), lambda: rows)
-    return benchmark(case, [*_ours(tables), beside], repeats)
+    return benchmark(case, _ours(run), repeats)
 
 
 def _smooth(steps: Tensor) -> Tensor:

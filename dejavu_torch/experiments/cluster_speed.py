@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dejavu_torch.cluster.learning import code_on, coded
-from dejavu_torch.cluster.session import Cluster
+from dejavu_torch.cluster import Cluster, code_on
 from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.experiments.bench import Row, write_bench
-from dejavu_torch.maps.spectral import CodedChunk, SpectralMap, SpectralMapper
+from dejavu_torch.learning import ChunkCoder, code_here
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.streaming.coder import ChunkCoder, code_here
 from dejavu_torch.types import Traverse
 
 CHUNK = 128  # places
@@ -56,34 +56,30 @@ def run_cluster(out: Path, frames: int = 8192, repeats: int = 3) -> list[Row]:
 def _coder(route: Traverse) -> ChunkCoder:
     model = DejaVu(mapper=SpectralMapper(4.0, chunk=CHUNK)).learn(FrameRange(route, stop=SAMPLE))
     assert isinstance(model.map, SpectralMap)
-    return model.chunk_coder(route.count(), model.map, model.map.mean, float(model.map.steps[0]))
+    return ChunkCoder.like(model.map, model.describer, route.count())
 
 
 def _contenders(
     coder: ChunkCoder, route: Traverse, cluster: Cluster
-) -> dict[tuple[str, int], Callable[[], list[CodedChunk]]]:
+) -> dict[tuple[str, int], Callable[[], list[Chunk]]]:
     """By name and number of threads in all: what makes all chunks."""
-    shards = coder.shards()
-    shared = cluster.put(coder, route)
 
-    def here() -> list[CodedChunk]:
-        return [one for _, chunks in code_here(coder, route, shards) for one in chunks]
+    def here() -> list[Chunk]:
+        return [*code_here(coder, route, 0)]
 
-    def threaded() -> list[CodedChunk]:
+    def threaded() -> list[Chunk]:
         threads = torch.get_num_threads()
         torch.set_num_threads(cluster.workers)
         try:
-            return list(coder.chunks(route, range(shards[-1].stop)))
+            return [*coder.chunks(route, range(coder.total))]
         finally:
             torch.set_num_threads(threads)
 
-    def one_worker() -> list[CodedChunk]:
-        ((_, made, _),) = cluster.run(coded, shared, [shards])
-        return [one for chunks in made for one in chunks]
+    def one_worker() -> list[Chunk]:
+        return [*code_on(cluster, coder, route, 0, together=coder.total)]
 
-    def workers() -> list[CodedChunk]:
-        made = dict(code_on(cluster, coder, route, shards))
-        return [one for shard in shards for one in made[shard]]
+    def workers() -> list[Chunk]:
+        return [*code_on(cluster, coder, route, 0)]
 
     return {
         ("dejavu, one process", 1): here,
@@ -113,7 +109,7 @@ def cluster_table(rows: Sequence[Row]) -> list[list[str]]:
 
 
 def _timed(
-    contenders: dict[tuple[str, int], Callable[[], list[CodedChunk]]], frames: int, repeats: int
+    contenders: dict[tuple[str, int], Callable[[], list[Chunk]]], frames: int, repeats: int
 ) -> list[Row]:
     seconds: dict[tuple[str, int], list[float]] = {key: [] for key in contenders}
     busy: dict[tuple[str, int], list[float]] = {key: [] for key in contenders}

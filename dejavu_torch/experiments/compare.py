@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch import growth
 from dejavu_torch.data.arrays import UNNAMED, as_traverse
 from dejavu_torch.data.fitted import Fitted
 from dejavu_torch.data.ground_truth import (
@@ -37,10 +38,10 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.maps.l1 import l1_backend
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.model import DejaVu, check_sizes
+from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
@@ -130,7 +131,7 @@ def compare(
     has_map = model.map.places > 0
     reference = model.fit(reference, model.frame_shape if has_map else None)
     query = model.fit(query, reference.frame_shape)
-    features = check_sizes(model, reference, query)
+    features = model.describer.check_sizes(reference, query)
     seconds: dict[str, float] = defaultdict(float)
     work = "describe" if has_map else "learn"
     with timed(seconds, work):
@@ -150,7 +151,7 @@ def compare(
     with timed(seconds, work):
         places = _described(model, reference, second, tolerance, progress)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
-            model.calibrate_if_possible(reference, calibration)
+            growth.calibrate_if_possible(model, reference, calibration)
         model.check_precision(sequence)
     with timed(seconds, "localize"):
         model.check_queries(query.frame_shape, features, query.name)
@@ -199,7 +200,7 @@ def compare(
             known is not None,
             offset_of(truth, carried),
         ),
-        **candidate_facts(model.map.scored(candidates.index), known, tolerance),
+        **candidate_facts(model.map.table.scored(candidates.index), known, tolerance),
         **rejection_facts(run.scored, known, tolerance, off_map),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
@@ -279,7 +280,7 @@ def _check_places(route: PlaceMap, name: str, places: int) -> None:
 
 def of_shown_frames(match: Match, route: PlaceMap) -> Match:
     """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
-    return match._replace(index=route.scored(match.index))
+    return match._replace(index=route.table.scored(match.index))
 
 
 def _contenders(
@@ -302,7 +303,7 @@ def _contenders(
     if run.sequence is not None:
         baselines |= seqslam_baseline(*traverses, size, progress, run.matching)
     for key, (name, answers, bytes, k, fixed) in baselines.items():
-        truth, answers = run.truth, answers.moved(model.map.scored)
+        truth, answers = run.truth, answers.moved(model.map.table.scored)
         if key == "leave_out":  # its queries are the places themselves
             own = model.map.frame_of(torch.arange(model.map.places))[:, None]
             truth = ground_truth_in_places(as_ground_truth(own), model.map.place_of)
@@ -312,7 +313,7 @@ def _contenders(
 
 def _contend(run: Localization, name: str, found: Found, model: DejaVu) -> Contender:
     """What a model found of the run's places."""
-    found, summary = found.moved(run.model.map.scored), model.summary()
+    found, summary = found.moved(run.model.map.table.scored), model.summary()
     sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
     return contend(name, found.match(), run.truth, run.tolerance, **sizes, sequences=found.sequences)
 
@@ -331,7 +332,7 @@ def _at_other_sizes(
     if not isinstance(route, SpectralMap):
         return None, {}
     storage = storage_curve(run, seed=seed, progress=progress)
-    whole = route.chunk == "route"
+    whole = len(route.chunks) == 1
     return storage, {"noise_over_map": noise_over_map(route, run.reference_features, seed)} if whole else {}
 
 

@@ -32,7 +32,7 @@ from dejavu_torch.evaluation.pictures import draw_coverage, draw_curves
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
-from dejavu_torch.maps.merged import MergedMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import printable
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
@@ -83,9 +83,9 @@ def evaluate_file(
     if truth is not None:
         check_ground_truth(truth, interpolate)
     place_map = None if map is None else read_place_map(map)
-    if isinstance(place_map, MergedMap):
+    if isinstance(place_map, SpectralMap) and place_map.routes:
         if route is None:
-            names = ", ".join(place_map.names)
+            names = ", ".join(one.name for one in place_map.routes)
             raise InputError(f"{map} has the routes {names}; expected --route with the one that truth is of")
         place_map = place_map.part(route)
     positions = torch.zeros(0) if place_map is None else place_map.positions
@@ -127,7 +127,7 @@ def evaluate_file(
     ours = contend(printable(matches.name), match, known, tolerance)
     here = match._replace(index=match.index.masked_fill(elsewhere[0], -1))
     seen = places or 1 + max(int(table.max()) for table in (here.index, known.positives))
-    borders = torch.tensor([seen]) if place_map is None else place_map.borders
+    borders = torch.tensor([seen]) if place_map is None else place_map.table.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
     pictures |= draw_coverage(here, known, tolerance, borders, queries, facts["unit"])
     pictures |= draw_reliability(match, known, tolerance)

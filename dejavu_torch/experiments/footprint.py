@@ -87,7 +87,7 @@ class Held(Contender):
         model = self.model()
         fixed = {}
         if model.whitening is None:
-            held = gathered(model.extract(route), route)
+            held = gathered(model.describer.descriptors(route), route)
         else:
             held = model.describe_reference(route)
             fixed = model.whitening.state_dict()
@@ -99,7 +99,10 @@ class Held(Contender):
         if model.whitening is not None:
             model.whitening.load_state_dict(state)
         lengths = torch.linalg.vector_norm(held, dim=1).square()
-        return gathered(((lengths - 2 * part @ held.T).argmin(1) for part in model.extract(queries)), queries)
+        return gathered(
+            ((lengths - 2 * part @ held.T).argmin(1) for part in model.describer.descriptors(queries)),
+            queries,
+        )
 
 
 class Faiss(Contender):
@@ -109,7 +112,7 @@ class Faiss(Contender):
         import faiss
 
         index: Any = None
-        for part in DejaVu(whitening="none").extract(route):
+        for part in DejaVu(whitening="none").describer.descriptors(route):
             index = faiss.IndexFlatL2(part.shape[1]) if index is None else index
             index.add(part.numpy())
         faiss.write_index(index, str(path))
@@ -119,7 +122,7 @@ class Faiss(Contender):
 
         faiss.omp_set_num_threads(torch.get_num_threads())
         index = faiss.read_index(str(path))
-        parts = DejaVu(whitening="none").extract(queries)
+        parts = DejaVu(whitening="none").describer.descriptors(queries)
         return gathered((torch.from_numpy(index.search(part.numpy(), 1)[1][:, 0]) for part in parts), queries)
 
 

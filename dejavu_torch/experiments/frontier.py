@@ -25,7 +25,7 @@ from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments.bench import peak_memory
 from dejavu_torch.experiments.reproduce import paper_model
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.model import DejaVu, check_sizes
+from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.matching import LENGTHS, Found, Matching, lengths_beside
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -191,7 +191,7 @@ def _model(whitening: DejaVu | None) -> DejaVu:
 
 def _check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
     """Refuse, before the long work, a pair that does not fit the model or each other."""
-    features, whitening = check_sizes(model, reference, query), model.whitening
+    features, whitening = model.describer.check_sizes(reference, query), model.whitening
     if whitening is not None and whitening.learned and len(whitening.projection) != features:
         raise InputError(
             f"the whitening is of {len(whitening.projection)} features and {reference.name} gives {features} "
@@ -307,7 +307,7 @@ def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Store]
     def elsewhere() -> Tensor:
         if other is None:
             raise InputError("no other route to train codebooks on; expected --codebooks SOURCE")
-        check_sizes(route.model, route.reference, other)
+        route.model.describer.check_sizes(route.reference, other)
         return route.model.extract_all(other).float()
 
     @cache  # one training for all strides
@@ -347,7 +347,7 @@ def _other_whitenings(route: Route, other: Traverse | None, seed: int) -> Iterat
     def shared() -> DejaVu:
         if other is None:
             raise InputError("no other route to learn a whitening on; expected --codebooks SOURCE")
-        check_sizes(route.model, route.reference, other)
+        route.model.describer.check_sizes(route.reference, other)
         source, model = DejaVu(), DejaVu()
         assert source.whitening is not None
         source.whitening.seed = seed
@@ -374,7 +374,7 @@ def _among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer
 
 def _by_map(route: Route, model: DejaVu, matching: Matching) -> Answer:
     """A map on descriptors of its own."""
-    found = model.found(model.extract_all(route.query), matching).moved(model.map.scored)
+    found = model.found(model.extract_all(route.query), matching).moved(model.map.table.scored)
     summary = model.summary()
     return Answer(found, summary.route_bytes, summary.fixed_bytes)
 

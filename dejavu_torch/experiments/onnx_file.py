@@ -22,7 +22,7 @@ from torch import Tensor, nn
 import dejavu_torch
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.calibration import MARGIN
 from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN
@@ -66,10 +66,10 @@ class Rebuilt(nn.Module):
     def __init__(self, route: SpectralMap) -> None:
         super().__init__()
         self.metric = route.metric
-        rebuilt = torch.cat([route.rebuilt(g) for g in range(len(route.chunks))])
+        rebuilt = torch.cat([route.decode(g) for g in range(len(route.chunks))])
         self.register_buffer("descriptors", rebuilt.T.contiguous())
         self.register_buffer("norms", route.norms)
-        self.register_buffer("per_norm", route.per_norm())
+        self.register_buffer("per_norm", route.inverse_norms())
 
     def forward(self, queries: Tensor) -> Tensor:
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -61,12 +60,12 @@ class TiledRoute(IndexedTraverse):
         return F.normalize(self.first[at % len(self.first)] + self.second[at % len(self.second)], dim=1)
 
 
-def step_that_holds(share: float, route: IndexedTraverse, chunk: int | Literal["route"]) -> float:
+def step_that_holds(share: float, route: IndexedTraverse, chunk: int) -> float:
     """The step of a spectral map that keeps so much of a route's variance, by some of its numbers."""
     columns = torch.linspace(0, route.frame_shape[0] - 1, LOOKED_AT).long()
     series = torch.cat([part[:, columns] for part in route.batches(ROWS)])
     series -= series.mean(0)
-    parts = series.split(len(series) if chunk == "route" else chunk)
+    parts = series.split(chunk)
     lines = torch.cat([spectrum(part.T).T for part in parts])
     total = float(lines.square().sum())
     low, high = 1e-3 * math.sqrt(total / lines.numel()), 2 * float(lines.abs().max())

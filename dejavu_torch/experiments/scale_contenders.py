@@ -71,14 +71,14 @@ class Mapped(Contender):
     """Ours: a spectral map.
 
     Args:
-        budget: route bytes per place. chunk: places, or "route". step: in place of the budget.
+        budget: route bytes per place. chunk: places. step: in place of the budget.
         shuffled: in random order, the null. search: as of `DejaVu.localize`.
     """
 
     def __init__(
         self,
         budget: float | None,
-        chunk: Any,
+        chunk: int,
         step: float | None = None,
         shuffled: bool = False,
         search: Search = "auto",
@@ -120,7 +120,7 @@ class Mapped(Contender):
 class Held(Mapped):
     """Ours, in steps that keep so much of the variance of a route."""
 
-    def __init__(self, chunk: Any) -> None:
+    def __init__(self, chunk: int) -> None:
         super().__init__(None, chunk, step=1.0)
 
     def prepare(self, route: IndexedTraverse) -> float | None:
@@ -218,6 +218,7 @@ class Interpolated(Contender):
         return Opened(find)
 
 
+WHOLE = 2**31 - 1  # places of a chunk, more than any route has
 ONE_CHUNK = f"{OURS}, one chunk"
 FIXED = f"{OURS}, chunks of {CHUNK}"
 FLOWN = f"{OURS}, one chunk, of noisy frames"
@@ -228,8 +229,8 @@ FLOWN = f"{OURS}, one chunk, of noisy frames"
 PLACED: dict[str, Callable[[float, float], Contender]] = {
     f"{OURS} 1 B": lambda *_: Mapped(1.0, CHUNK),
     f"{OURS} 4 B": lambda *_: Mapped(4.0, CHUNK),
-    f"{OURS} 1 B, one chunk": lambda *_: Mapped(1.0, "route"),
-    f"{OURS} 4 B, one chunk": lambda *_: Mapped(4.0, "route"),
+    f"{OURS} 1 B, one chunk": lambda *_: Mapped(1.0, WHOLE),
+    f"{OURS} 4 B, one chunk": lambda *_: Mapped(4.0, WHOLE),
     f"{OURS} 1 B{IVF}": lambda *_: Mapped(1.0, CHUNK, search="ivf"),
     f"{OURS} 4 B{IVF}": lambda *_: Mapped(4.0, CHUNK, search="ivf"),
     "null 1 B": lambda *_: Mapped(1.0, CHUNK, shuffled=True),
@@ -243,10 +244,10 @@ PLACED: dict[str, Callable[[float, float], Contender]] = {
     "faiss HNSW": lambda *_: Faiss("HNSW16,Flat"),
 }
 REPEATED: dict[str, Callable[[float, float], Contender]] = {
-    ONE_CHUNK: lambda *_: Held("route"),
+    ONE_CHUNK: lambda *_: Held(WHOLE),
     FIXED: lambda *_: Held(CHUNK),
-    FLOWN: lambda room, step: Mapped(None, "route", step),
-    "null": lambda room, step: Mapped(room, "route", shuffled=True),
+    FLOWN: lambda room, step: Mapped(None, WHOLE, step),
+    "null": lambda room, step: Mapped(room, WHOLE, shuffled=True),
     "interpolated frames": lambda room, step: Interpolated(room),
 }
 CONTENDERS = PLACED | REPEATED

@@ -15,7 +15,8 @@ from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.pictures import Localization
 from dejavu_torch.evaluation.score_plots import Stored
-from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.recognition.matching import Found
 from dejavu_torch.types import InputError
@@ -59,7 +60,7 @@ def storage_curve(
     cases = [(key, budget) for key in kinds for budget in budgets]
     for key, budget in tqdm(cases, "storage", disable=None if progress else True, leave=False):
         for answers, size in kinds[key](budget):
-            answers = answers.moved(route.scored)
+            answers = answers.moved(route.table.scored)
             scores = evaluate(answers.match(), run.truth, run.tolerance)
             beside = evaluate_each(answers.sequences, run.truth, run.tolerance)
             found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1, beside))
@@ -76,12 +77,12 @@ def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float
     Args:
         route: the map, of one chunk. features: (N,K) the descriptors that it holds. seed: of the noise.
     """
-    lines = spectrum((features.float() - route.mean.float()).T, route.transform)
+    lines = spectrum((features.float() - route.means[0].float()).T, route.transform)
     band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).log2()).long()
     sums = lines.new_zeros(len(lines), int(band[-1]) + 1).index_add(1, band, lines.square())
     energy = (sums / band.bincount().clamp(min=1))[:, band]
     normal = torch.randn(lines.shape, generator=torch.Generator().manual_seed(seed))
-    noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.mean.float()
+    noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.means[0].float()
     settings = route.chunk, route.transform, route.metric, route.resolution
     mapper = SpectralMapper(None, float(route.steps.mean()), *settings)
     streams = [one.packed()["streams"].nbytes for one in (mapper(noise), route)]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.experiments.bench import Program, Row, benchmark, in_one_thread
-from dejavu_torch.maps.layer_search import LayerSearch
+from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError
@@ -62,10 +62,10 @@ def random_map(places: int, generator: torch.Generator) -> TemplateMap:
 
 def _case(route: TemplateMap, queries: int, repeats: int, generator: torch.Generator) -> Iterator[Row]:
     asked = torch.rand(queries, route.dimension, generator=generator).split(1)
-    search = LayerSearch(route)
 
     def in_layers(query: Tensor) -> Tensor:
-        return search.lowest(route.distances(query))[1]
+        one, other = route.distances(query)
+        return lowest(one, other, route.places, route.divisor([0, 1]))[1]
 
     def scan(query: Tensor) -> Tensor:
         return best_match(route.scores(query)).index

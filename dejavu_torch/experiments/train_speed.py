@@ -23,7 +23,6 @@ from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.training.datamodule import RouteData
@@ -61,14 +60,10 @@ def network() -> SmallCNN:
 def ladder() -> list[Rung]:
     """Each rung changes one thing of the one before; 16 bits only where the processor has them."""
 
-    def kornia() -> Augmentation:
-        return KorniaAugmentation(**STRENGTHS)
-
     def fused() -> Augmentation:
         return Augmentation(**STRENGTHS)  # type: ignore[arg-type]
 
     rungs = [
-        Rung("kornia's augmentation", network, kornia),
         Rung("fused augmentation", network, fused),
         Rung("twice the learning rate", network, fused, lr=LEARNING_RATE),
     ]

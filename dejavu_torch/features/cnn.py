@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from dejavu_torch.features.frames import settings_of
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
@@ -16,8 +17,8 @@ FLAT = 2 / 255  # contrast below which nothing is blown up
 def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
     """Each pixel minus the mean around it, divided by the contrast around it.
 
-    Mean and contrast are those of square cells, interpolated between the cells' centres: one pass instead
-    of a window at every pixel (`normalise_patches`), and gradients everywhere.
+    Mean and contrast are those of square cells, interpolated between the cells' centres, which is faster than
+    a window at every pixel (`normalise_patches`).
 
     Args:
         frames: in [0, 1]; all channels share the contrast, so that colours stay comparable.
@@ -30,12 +31,6 @@ def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
 
     Raises:
         InputError: a cell below 1.
-
-    Example:
-        >>> import torch
-        >>> frames = torch.rand(1, 3, 32, 32)
-        >>> bool((local_contrast(frames) - local_contrast(0.5 * frames + 0.2)).abs().max() < 0.01)
-        True
     """
     if cell < 1:
         raise InputError(f"local_contrast got a cell of {cell} pixels; expected at least 1")
@@ -51,15 +46,14 @@ def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
 
 
 class SmallCNN(nn.Module):
-    """Local contrast, strided convolutions, and one linear layer that still knows where things are.
+    """Local contrast, strided convolutions, and one linear layer, which keeps where things are.
 
-    The last layer's outputs are standardised by their running mean and deviation over the training
-    frames, so that features, and with them L1 distances, share one scale.
+    The features are standardised by their running mean and deviation over the training frames, so that they
+    share one scale in L1 distances.
 
     Args:
         dimension: D, number of features.
-        channels: of the frames, 3 or 1; None is 3, until a training has frames of other channels, or weights
-            are loaded.
+        channels: of the frames; None is 3, until a training or loaded weights have others.
         resize: (height, width) in pixels that frames are brought to, antialiased.
         widths: channels after each convolution; each halves height and width.
         squeeze: channels ahead of the linear layer.
@@ -97,12 +91,9 @@ class SmallCNN(nn.Module):
                 f"widths={tuple(widths)}, squeeze={squeeze}, cell={cell}; expected at least 1 each, "
                 "cell 0 or more"
             )
-        self.dimension = dimension
-        self.channels = channels
+        self.dimension, self.channels, self.squeeze, self.cell = dimension, channels, squeeze, cell
         self.resize = (int(resize[0]), int(resize[1]))  # a map gives lists
         self.widths = tuple(int(width) for width in widths)
-        self.squeeze = squeeze
-        self.cell = cell
         layers: list[nn.Module] = []
         height, width = self.resize
         for before, after in zip((channels, *self.widths), self.widths, strict=False):
@@ -120,7 +111,7 @@ class SmallCNN(nn.Module):
         self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
     def follow(self, channels: int) -> None:
-        """Take frames of so many channels where none were asked for: the first layer begins anew."""
+        """Accept frames of so many channels if None was given: the first layer begins anew."""
         if self.follows and channels != self.channels:
             self.channels = channels
             first = nn.Conv2d(channels, self.widths[0], 5, stride=2, padding=2, bias=False)
@@ -148,7 +139,4 @@ class SmallCNN(nn.Module):
         return standardised
 
     def extra_repr(self) -> str:
-        return (
-            f"dimension={self.dimension}, channels={self.channels}, resize={self.resize}, "
-            f"widths={self.widths}, squeeze={self.squeeze}, cell={self.cell}"
-        )
+        return settings_of(self)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from dejavu_torch.features.preprocess import FLAT, check_frames
+from dejavu_torch.features.frames import check_frames, settings_of
+from dejavu_torch.features.preprocess import FLAT
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
@@ -13,7 +14,7 @@ class PatchPixels(nn.Module):
     """Pixels of frames made small, each patch with mean 0 and standard deviation 1.
 
     Args:
-        size: (height, width) in pixels; smaller frames keep theirs, but for what is no whole patch.
+        size: (height, width) in pixels; smaller frames keep theirs, cut to whole patches.
         patch: side in pixels of the square patches, which lie side by side.
 
     Shape: (B,C,H,W) -> (B, C x height x width).
@@ -23,7 +24,7 @@ class PatchPixels(nn.Module):
     Source: Milford and Wyeth, SeqSLAM, ICRA 2012.
 
     Raises:
-        InputError: a size that holds no patch; forward: frames that are not (B,C,H,W) float, or hold none.
+        InputError: a size smaller than a patch; forward: frames that are not (B,C,H,W) float, or as small.
 
     Example:
         >>> import torch
@@ -39,20 +40,18 @@ class PatchPixels(nn.Module):
         self.size, self.patch = size, patch
 
     def forward(self, frames: Tensor) -> Tensor:
-        check_frames(frames)
-        side = self.patch
-        height, width = (
-            min(own, most) // side * side for own, most in zip(frames.shape[-2:], self.size, strict=True)
-        )
-        if not height or not width:
-            seen = f"frames of {frames.shape[-2]} x {frames.shape[-1]} pixels"
-            raise InputError(f"{seen}; expected at least one patch, {side} x {side}")
-        small = resize_frames(frames, (height, width))
-        patches = small.unflatten(-1, (-1, side)).unflatten(-3, (-1, side))  # (B,C,rows,side,columns,side)
-        centred = patches - patches.mean((-3, -1), keepdim=True)
+        check_frames(frames, "PatchPixels")
+        side, (height, width) = self.patch, frames.shape[-2:]
+        if min(height, width) < side:
+            raise InputError(
+                f"frames of {height} x {width} pixels; expected at least one patch, {side} x {side}"
+            )
+        small = (min(height, self.size[0]) // side * side, min(width, self.size[1]) // side * side)
+        patches = resize_frames(frames, small).unflatten(-1, (-1, side)).unflatten(-3, (-1, side))
+        centred = patches - patches.mean((-3, -1), keepdim=True)  # (B,C,rows,side,columns,side)
         deviation = centred.square().mean((-3, -1), keepdim=True).clamp(min=FLAT**2).sqrt()
         pixels: Tensor = (centred / deviation).flatten(1)
         return pixels
 
     def extra_repr(self) -> str:
-        return f"size={self.size}, patch={self.patch}"
+        return settings_of(self)

@@ -1,4 +1,4 @@
-"""What may be done to frames ahead of the features: choose a channel, normalise the contrast."""
+"""What may be done to frames before the features: choose a channel, normalise the contrast."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.hog import parts
+from dejavu_torch.features.frames import check_frames, in_parts, settings_of
 from dejavu_torch.types import InputError
 
 MOST_CLIP = 1e6
@@ -17,16 +17,8 @@ SIZE = 160  # pixels of the longer side of a frame, unless said otherwise
 FLAT = 1 / 255  # one step of an 8-bit image: a smaller standard deviation says nothing
 
 
-def check_frames(frames: Tensor) -> None:
-    """Refuse what is not a batch of float frames."""
-    if frames.ndim != 4 or not frames.is_floating_point():
-        raise InputError(
-            f"preprocess got {tuple(frames.shape)} {frames.dtype}; expected float frames (B,C,H,W) in [0, 1]"
-        )
-
-
 def channel_name(channel: str) -> str:
-    """The name of a channel as it is kept: "grey", "R", "R-B"; upper and lower case mean the same."""
+    """A channel in the case that is stored: "grey", "R", "R-B"."""
     name = str(channel).strip().upper()
     letters = name.split("-")
     if name == "GREY":
@@ -55,14 +47,9 @@ def check_clahe(clip_limit: float, grid: tuple[int, int]) -> None:
 
 
 def select_channel(frames: Tensor, channel: str) -> Tensor:
-    """One channel of colour frames.
+    """One channel of colour frames, see `Preprocess`; grey frames pass unchanged as "grey".
 
-    Args:
-        frames: RGB; for "grey" also frames that are grey already, which pass unchanged.
-        channel: "grey" (luminance, 0.299 R + 0.587 G + 0.114 B), "R", "G", "B", or the difference of
-            two of them such as "R-B", in upper or lower case. A difference lies in [-1, 1].
-
-    Shape: (B,C,H,W) -> (B,1,H,W).
+    Shape: (B,C,H,W) -> (B,1,H,W); a difference lies in [-1, 1].
 
     Raises:
         InputError: not (B,C,H,W) float, an unknown channel, or frames that do not have it.
@@ -72,9 +59,8 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
         >>> select_channel(sky, "R-B").item()
         -0.75
     """
-    check_frames(frames)
-    name = channel_name(channel)
-    count = frames.shape[1]
+    check_frames(frames, "preprocess")
+    name, count = channel_name(channel), frames.shape[1]
     if name == "grey" and count == 1:
         return frames
     if count != 3:
@@ -90,42 +76,31 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
 
 def box_mean(frames: Tensor, side: int) -> Tensor:
     """Mean of the side x side pixels around each pixel; at the border only those inside count."""
-    if torch.compiler.is_exporting():  # no onnxruntime pools in double precision
-        return _row_mean(_row_mean(frames, side).mT, side).mT
-    reach = side // 2
-    pool = nn.functional.avg_pool2d  # one axis at a time: 2 * side values a pixel instead of side**2
-    frames = pool(frames, (1, side), 1, (0, reach), count_include_pad=False)
-    return pool(frames, (side, 1), 1, (reach, 0), count_include_pad=False)
 
+    def sums(values: Tensor) -> Tensor:
+        """Of `side` values along the last axis."""
+        running = nn.functional.pad(values, (side // 2 + 1, side // 2)).cumsum(-1)
+        return running[..., side:] - running[..., :-side]
 
-def _row_mean(frames: Tensor, side: int) -> Tensor:
-    """Mean of the side pixels of its row around each pixel, as a sum of rows that are moved."""
-    width, reach = frames.shape[-1], side // 2
-    padded, there = (nn.functional.pad(one, (reach, reach)) for one in (frames, frames.new_ones(width)))
-    total, count = torch.zeros_like(frames), frames.new_zeros(width)
-    for k in range(side):
-        total, count = total + padded[..., k : k + width], count + there[k : k + width]
-    return total / count
+    for _ in range(2):  # rows, then columns
+        frames = (sums(frames) / sums(torch.ones_like(frames[0, 0, 0]))).mT
+    return frames
 
 
 def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
-    """Each pixel minus the mean, divided by the standard deviation, of the patch around it.
-
-    Args:
-        frames: each channel is treated by itself.
-        patch: side of the square patch in pixels, odd.
+    """Each pixel minus the mean, divided by the standard deviation, of the patch around it, for each channel.
 
     Shape: (B,C,H,W) -> (B,C,H,W), mean about 0, unbounded.
 
     Convention: the patch slides with the pixel, so that there are no edges between patches; at the border
-        only pixels inside the frame count. The standard deviation is that of the patch (divided by the
-        number of pixels), and at least 1/255, so that noise in a flat sky is not blown up. Above that
-        floor a gain and an offset of brightness change nothing. Gradients are finite everywhere.
+        only pixels inside the frame count. The standard deviation divides by the number of pixels, and is at
+        least 1/255, so that noise in a flat sky is not amplified. Above that floor a gain and an offset of
+        brightness change nothing. Gradients are finite everywhere.
 
     Source: Milford and Wyeth, SeqSLAM, ICRA 2012; there in patches side by side.
 
     Raises:
-        InputError: not (B,C,H,W) float, an even patch or one under 3, or a frame smaller than the patch.
+        InputError: not (B,C,H,W) float, a bad patch, or a frame smaller than it.
 
     Example:
         >>> checks = (torch.arange(8)[:, None] + torch.arange(8)).remainder(2)[None, None]
@@ -133,7 +108,7 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
         >>> round(dark.item(), 3), round(bright.item(), 3)  # half of four pixels, half of six
         (-1.0, 1.0)
     """
-    check_frames(frames)
+    check_frames(frames, "preprocess")
     check_patch(patch)
     height, width = frames.shape[-2:]
     if min(height, width) < patch:
@@ -142,41 +117,33 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
             f"expected at least one patch, {patch} x {patch}"
         )
 
-    def normalised(part: Tensor) -> Tensor:
+    def normalise(part: Tensor) -> Tensor:
         exact = part.double()  # the difference of the squares below cancels: too much for float32
         mean = box_mean(exact, patch)
         variance = box_mean(exact.square(), patch) - mean.square()
         return ((exact - mean) / variance.clamp(min=FLAT**2).sqrt()).to(part)
 
-    return torch.cat([normalised(part) for part in parts(frames)])
+    return in_parts(normalise, frames)
 
 
 def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8, 8)) -> Tensor:
-    """Contrast-limited adaptive histogram equalisation (CLAHE) by kornia, of each channel by itself.
+    """Contrast-limited adaptive histogram equalisation (CLAHE) by kornia, for each channel.
 
-    Args:
-        frames: in [0, 1].
-        clip_limit: a grey level counts at most this many times as often as in a flat histogram, and at
-            least once; 0 is no limit. Of tiles under 256 / clip_limit pixels every level counts once.
-        grid: (rows, columns) of tiles; they need not divide the frame.
-
-    Shape: (B,C,H,W) -> (B,C,H,W), in [0, 1].
+    Shape: (B,C,H,W) in [0, 1] -> the same.
 
     Convention: a table of 256 grey levels has no gradient: it is passed straight through, as if the output
-        followed the input one to one. The values do not depend on whether a gradient is asked for. Kornia's
-        own differentiable form is not used: it gives other values (up to 0.3 away), and its gradient, that of
-        the histograms without the pixel's own, does not follow the slope of what it computes.
+        followed the input one to one. Kornia's differentiable form gives other values (up to 0.3 away).
 
     Raises:
-        InputError: not (B,C,H,W) float, a bad clip limit or grid, values outside [0, 1], or a frame
-            without a pixel more than the grid has tiles along both sides.
+        InputError: not (B,C,H,W) float, a bad clip limit or grid, values outside [0, 1], or no more pixels
+            than tiles along one side.
 
     Example:
         >>> dull = 0.4 + 0.2 * torch.rand(1, 1, 64, 64)
         >>> bool(equalise(dull, grid=(2, 2)).std() > dull.std())
         True
     """
-    check_frames(frames)
+    check_frames(frames, "preprocess")
     check_clahe(clip_limit, grid)
     if torch.compiler.is_exporting():
         raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")
@@ -193,7 +160,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     if not ((fixed >= 0) & (fixed <= 1)).all():
         low, high = fixed.min().item(), fixed.max().item()
         raise InputError(f"clahe got values from {low:g} to {high:g}; expected values in [0, 1]")
-    even = torch.cat([equalize_clahe(part, float(clip_limit), (rows, columns)) for part in parts(fixed)])
+    even = in_parts(lambda part: equalize_clahe(part, float(clip_limit), (rows, columns)), fixed)
     return frames + (even - fixed) if frames.requires_grad else even
 
 
@@ -201,25 +168,24 @@ class Preprocess(nn.Module):
     """`select_channel`, then `normalise_patches` ("patch") or `equalise` ("clahe"), as one module.
 
     Args:
-        channel: "grey", "R", "G", "B", or a difference such as "R-B"; None keeps the frames' channels.
-        contrast: "patch" normalises each pixel by the patch around it, "clahe" equalises the
-            histograms of tiles; None keeps the contrast.
-        patch: side of the patch for "patch", pixels, odd.
-        clip_limit: for "clahe": a grey level counts at most this many times as often as in a flat
-            histogram; 0 is no limit.
-        grid: (rows, columns) of tiles for "clahe".
-        size: pixels that the longer side of a traverse's frames is reduced to where it has more, but no
-            further than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so as
-            frames are read, ahead of all else; forward does not.
+        channel: "grey" (luminance, 0.299 R + 0.587 G + 0.114 B), "R", "G", "B", or a difference such as
+            "R-B", in upper or lower case; None keeps the frames' channels.
+        contrast: "patch", "clahe", or None, which keeps it.
+        patch: side of the square patch for "patch", pixels, odd, at least 3.
+        clip_limit: for "clahe": a grey level counts at most this many times as often as in a flat histogram,
+            and at least once, as all do in tiles under 256 / clip_limit pixels; 0 is no limit.
+        grid: (rows, columns) of tiles for "clahe"; they need not divide the frame.
+        size: pixels that the longer side of a traverse's frames is reduced to if it has more, but no further
+            than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so as frames are
+            read; forward does not.
 
-    Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) where `channel` is None.
+    Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
-    Convention: without channel and contrast the input itself is returned, whatever it is. Ahead of "clahe"
+    Convention: without channel and contrast the input itself is returned, whatever it is. Before "clahe"
         a difference of channels d in [-1, 1] becomes (d + 1) / 2, in [0, 1].
 
     Raises:
-        InputError: an unknown channel or contrast, a bad patch, clip limit, grid or size; forward: frames
-            that do not fit them.
+        InputError: settings out of range; forward: frames that do not fit them.
 
     Example:
         >>> Preprocess(channel="grey", contrast="patch")(torch.rand(2, 3, 32, 48)).shape
@@ -244,8 +210,7 @@ class Preprocess(nn.Module):
         check_clahe(clip_limit, grid)
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
-        self.patch, self.size = patch, size
-        self.clip_limit = float(clip_limit)
+        self.patch, self.clip_limit, self.size = patch, float(clip_limit), size
         self.grid = (int(grid[0]), int(grid[1]))  # a map gives a list
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -254,13 +219,9 @@ class Preprocess(nn.Module):
         if self.contrast == "patch":
             return normalise_patches(frames, self.patch)
         if self.contrast == "clahe":
-            if self.channel is not None and "-" in self.channel:
-                frames = (frames + 1) / 2
-            return equalise(frames, self.clip_limit, self.grid)
+            difference = self.channel is not None and "-" in self.channel
+            return equalise((frames + 1) / 2 if difference else frames, self.clip_limit, self.grid)
         return frames
 
     def extra_repr(self) -> str:
-        return (
-            f"channel={self.channel!r}, contrast={self.contrast!r}, patch={self.patch}, "
-            f"clip_limit={self.clip_limit}, grid={self.grid}, size={self.size}"
-        )
+        return settings_of(self)

@@ -1,8 +1,9 @@
-"""Further looks at the places of a route, from which whitening learns what changes between two visits."""
+"""Further views of the places of a route, from which whitening learns what changes between two visits."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import torch
@@ -12,10 +13,10 @@ from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.types import InputError, Traverse
 
 BLOCK = 64  # frames augmented at once
-STRETCH, EVERY = 20, 10  # frames of a stretch, and which of the stretches are taken
-STRONGER = 1.5  # than what a whitening knows, since it has seen the frames themselves
+STRETCH, EVERY = 20, 10  # frames of a stretch, and which of the stretches are used
+STRONGER = 1.5  # than for a whitening, which has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all stretches together
-TIMES = 2  # of a short route, as many as it has itself at most
+TIMES = 2  # frames of all stretches over the frames of a short route, at most
 LEAST, SCORES = 240, 2**27  # frames of a long route at least, and scores of them all at all of its places
 
 
@@ -29,13 +30,63 @@ class Views(NamedTuple):
     places: Tensor
 
 
-class AugmentedTraverse(Traverse):
+class _Augmented(Traverse):
+    """Blocks of frames of a traverse, each augmented several times.
+
+    Raises:
+        InputError: ready features, or strengths that `Augmentation` refuses.
+    """
+
+    def __init__(
+        self,
+        traverse: Traverse,
+        blocks: Sequence[Tensor],
+        copies: int,
+        strengths: Mapping[str, Any],
+        seed: int,
+    ) -> None:
+        try:
+            self.augmentation = Augmentation(**strengths)
+        except TypeError as error:
+            expected = ", ".join(LARGEST)
+            raise InputError(f"the strengths of whitening are {strengths}; expected {expected}") from error
+        self.traverse, self.copies, self.seed = traverse, copies, seed
+        self.places = torch.cat([block.repeat(copies) for block in blocks])
+        self.length = len(self.places)
+        self.name = f"augmented copies of {traverse.name}"
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        state = torch.Generator().manual_seed(self.seed).get_state()
+        for frames in self._blocks():
+            for _ in range(self.copies):
+                with torch.random.fork_rng(devices=[]):
+                    torch.set_rng_state(state)
+                    copies: Tensor = self.augmentation.train()(frames)
+                    state = torch.get_rng_state()
+                yield from copies.split(size)
+
+    def _blocks(self) -> Iterator[Tensor]:
+        """The frames of each block."""
+        raise NotImplementedError
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """See `Traverse`."""
+        return self.traverse.frame_shape
+
+    @property
+    def views(self) -> Views:
+        """The copies with the frames that they show."""
+        return Views(self, self.places)
+
+
+class AugmentedTraverse(_Augmented):
     """Augmented copies of a traverse's frames: one of each frame of a block, another of each, and so on.
 
     Args:
         traverse: frames (B,C,H,W).
         frames: their number N.
-        copies: of each frame. most: in all; frames are drawn evenly where there would be more.
+        copies: of each frame. most: in all; frames are drawn evenly if there would be more.
         strengths: arguments of `Augmentation`.
         seed: of the copies.
 
@@ -52,31 +103,13 @@ class AugmentedTraverse(Traverse):
         strengths: Mapping[str, Any],
         seed: int = 0,
     ) -> None:
-        from dejavu_torch.features.kornia_augmentation import KorniaAugmentation  # kornia takes a second
-
-        if len(traverse.frame_shape) != 3:
-            raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
-        self.traverse, self.copies, self.seed = traverse, copies, seed
+        _require_frames(traverse)
         self.shown = range(0, frames, max(1, -(-frames * copies // most)))
-        self.block = traverse.batch_size(BLOCK)  # of frames, whatever the batch size: the same copies
-        self.augmentation = KorniaAugmentation(**_checked(strengths)).train()
-        self.name = f"augmented copies of {traverse.name}"
-        self.length = copies * len(self.shown)
+        self.block = traverse.batch_size(BLOCK)  # whatever the batch size: the same copies
+        super().__init__(traverse, torch.tensor(self.shown).split(self.block), copies, strengths, seed)
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        state = torch.Generator().manual_seed(self.seed).get_state()
-        for frames in self.traverse.select(self.shown, self.block):
-            for _ in range(self.copies):
-                with torch.random.fork_rng(devices=[]):
-                    torch.set_rng_state(state)
-                    copies: Tensor = self.augmentation(frames)
-                    state = torch.get_rng_state()
-                yield from copies.split(size)
-
-    @property
-    def frame_shape(self) -> tuple[int, ...]:
-        """See `Traverse`."""
-        return self.traverse.frame_shape
+    def _blocks(self) -> Iterator[Tensor]:
+        return self.traverse.select(self.shown, self.block)
 
     @property
     def looks(self) -> str:
@@ -84,27 +117,21 @@ class AugmentedTraverse(Traverse):
         each = "each frame" if self.shown.step == 1 else f"{len(self.shown)} of the frames"
         return f"{self.copies} look{'s' * (self.copies > 1)} at {each}"
 
-    @property
-    def views(self) -> Views:
-        """The copies with the frames that they show."""
-        blocks = torch.tensor(self.shown).split(self.block)
-        return Views(self, torch.cat([block.repeat(self.copies) for block in blocks]))
 
+class Stretches(_Augmented):
+    """Stretches of a traverse, each frame as it may look on another visit, by which a map is calibrated.
 
-class Stretches(Traverse):
-    """Stretches of a traverse, each frame as it may look on another visit: what a map is calibrated by.
-
-    Every 10th stretch of 20 frames is taken, of a short traverse fewer frames; several times where that is
-    little, and of a long one not all: 1200 frames of one of 10^5, down to 240 of longer ones. Each frame is
-    changed for itself, 1.5 times as much as by `strengths`.
+    Every 10th stretch of 20 frames is used, shorter ones of a short traverse; several times if that is
+    little, and fewer of a long one: 1200 frames of one of 10^5, down to 240 of longer ones. Each frame is
+    changed separately, 1.5 times as much as by `strengths`.
 
     Args:
         traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
-        seed: of the changes. places: of the map, among which they are looked up; None is N.
-        starts: of the stretches of 20 frames that are taken instead; None is as above.
+        seed: of the changes. places: of the map, among which they are searched; None is N.
+        starts: of stretches of 20 frames, increasing, in place of every 10th.
 
     Raises:
-        InputError: ready features.
+        InputError: ready features, or strengths that `Augmentation` refuses.
     """
 
     def __init__(
@@ -116,73 +143,29 @@ class Stretches(Traverse):
         places: int | None = None,
         starts: Sequence[int] | None = None,
     ) -> None:
-        from dejavu_torch.features.kornia_augmentation import KorniaAugmentation
-
-        if len(traverse.frame_shape) != 3:
-            raise InputError(f"{traverse.name} holds ready features; expected frames to calibrate by")
+        _require_frames(traverse)
         length = min(STRETCH, max(1, frames // EVERY)) if starts is None else STRETCH
         starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
         most = min(MOST, max(LEAST, SCORES // (places or frames)))
-        self.starts = starts[:: max(1, -(-len(starts) * length // most))]
+        self.starts, self.stretch = starts[:: max(1, -(-len(starts) * length // most))], length
         wanted = min(FEWEST, TIMES * frames, most)
-        self.times = max(1, -(-wanted // (len(self.starts) * length)))
-        self.traverse, self.stretch, self.seed = traverse, length, seed
-        self.augmentation = KorniaAugmentation(**_checked(strengths, STRONGER))
-        self.name, self.length = f"changed frames of {traverse.name}", len(self.places)
+        times = max(1, -(-wanted // (len(self.starts) * length)))
+        blocks = [torch.arange(start, start + length) for start in self.starts]
+        super().__init__(traverse, blocks, times, strengths, seed)
+        self.augmentation = self.augmentation.stronger(STRONGER)
 
-    @property
-    def places(self) -> Tensor:
-        """The frame that each shows, (n,) int64."""
-        one = torch.tensor(self.starts)[:, None] + torch.arange(self.stretch)
-        return one[:, None].expand(-1, self.times, -1).flatten()
-
-    def batches(self, size: int) -> Iterator[Tensor]:
-        state = torch.Generator().manual_seed(self.seed).get_state()
-        for frames in self._stretches():
-            for _ in range(self.times):
-                with torch.random.fork_rng(devices=[]):
-                    torch.set_rng_state(state)
-                    changed: Tensor = self.augmentation.train()(frames)
-                    state = torch.get_rng_state()
-                yield from changed.split(size)
-
-    def _stretches(self) -> Iterator[Tensor]:
-        """The frames of each."""
+    def _blocks(self) -> Iterator[Tensor]:
         if self.traverse.seeks:
             for start in self.starts:
                 yield torch.cat(list(self.traverse.between(start, start + self.stretch)))
             return
-        held: list[Tensor] = []
-        starts = iter(self.starts)
-        place, start = 0, next(starts)
-        for batch in self.traverse.between(0, self.starts[-1] + self.stretch):
-            for frame in batch:
-                held += [frame] if place >= start else []
-                place += 1
-                if len(held) == self.stretch:
-                    yield torch.stack(held)
-                    held, start = [], next(starts, place)
-
-    @property
-    def frame_shape(self) -> tuple[int, ...]:
-        """See `Traverse`."""
-        return self.traverse.frame_shape
-
-    @property
-    def views(self) -> Views:
-        """The frames with the places that they show."""
-        return Views(self, self.places)
+        frames = chain.from_iterable(self.traverse.between(0, self.starts[-1] + self.stretch))
+        at = 0
+        for start in self.starts:
+            yield torch.stack(list(islice(frames, start - at, start - at + self.stretch)))
+            at = start + self.stretch
 
 
-def _checked(strengths: Mapping[str, Any], factor: float = 1.0) -> dict[str, Any]:
-    """Strengths, which may come from a file, times a factor, as far as `Augmentation` takes them."""
-    try:
-        known = Augmentation(**strengths).strengths
-    except TypeError as error:
-        expected = ", ".join(LARGEST)
-        raise InputError(f"the strengths of whitening are {strengths}; expected {expected}") from error
-    scaled = {
-        name: tuple(min(factor * one, most) for one, most in zip(known[name], LARGEST[name], strict=True))
-        for name in strengths
-    }
-    return {name: pair if len(pair) > 1 else pair[0] for name, pair in scaled.items()}
+def _require_frames(traverse: Traverse) -> None:
+    if len(traverse.frame_shape) != 3:
+        raise InputError(f"{traverse.name} holds ready features; expected frames to augment")

@@ -123,14 +123,14 @@ class LiveLocalizer:
         shown, routes = int(found.frame_of(match.index)), found.routes
         return LiveMatch(
             place,
-            int(found.own_frame_of(match.index)) if routes else shown,
+            int(found.table.own_frame_of(match.index)) if routes else shown,
             self.model.frame_name(shown) if shown >= 0 else "",
             score,
             math.nan if filter is None else math.exp(-score),
             math.nan if match.probability is None else float(match.probability),
             bool(match.accepted),
             1e3 * (time.perf_counter() - began),
-            routes[int(found.route_of(match.index))].name if routes and place >= 0 else "",
+            routes[int(found.table.route_of(match.index))].name if routes and place >= 0 else "",
         )
 
     @property

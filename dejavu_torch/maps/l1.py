@@ -21,17 +21,17 @@ from dejavu_torch.maps.compiling import compiled
 log = logging.getLogger("dejavu_torch")
 
 Floats = NDArray[np.float32]
+Kernel = Callable[[Floats, Floats, Floats], None]
 
-WORTH_COMPILING = 2**14  # P x F from which on even a single query is faster than with torch
+WORTH_COMPILING = 2**14  # P x F above which the loop is faster than torch even for one query
 QUERIES_AT_ONCE = 64  # they stay in cache while the templates stream by
 TASK = 2**23  # |a - b| for one thread at a time, about half a millisecond
 
 
 def _distances(query: Floats, templates: Floats, out: Floats) -> None:
-    """Four templates at a time, so that a query's numbers are loaded once for all four.
+    """Four templates at a time, so that each number of a query is loaded once for all four; compiled only.
 
-    Compiled, never run as it stands. The last block repeats the last template instead of summing what
-    is left in a loop of its own: every pair is summed in one order, wherever it stands.
+    The last block repeats the last template, so that every pair is summed in the same order.
     """
     last = len(templates) - 1
     for a in range(0, len(templates), 4):
@@ -48,23 +48,17 @@ def _distances(query: Floats, templates: Floats, out: Floats) -> None:
 
 
 @cache
-def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
-    try:
-        return compiled(
-            _distances,
-            "void(float32[:,::1], float32[:,::1], float32[:,:])",
-            # sums in any order, but not "nnan" and "ninf": NaN and infinity have to arrive
-            fastmath={"reassoc", "nsz", "contract"},
-        )
+def _compiled() -> Kernel | None:
+    signature = "void(float32[:,::1], float32[:,::1], float32[:,:])"
+    try:  # sums in any order, but not "nnan" and "ninf": NaN and infinity have to arrive
+        return compiled(_distances, signature, fastmath={"reassoc", "nsz", "contract"})
     except Exception as error:  # a broken compiler must not break what works without one
         log.info("L1 distances by torch, not by numba: %s", " ".join(str(error).split()))
         return None
 
 
 def l1_backend() -> Literal["numba", "torch"]:
-    """What computes large L1 distances on the CPU where no gradient is asked for.
-
-    Convention: "numba" where it can be imported and compiles; the first call tries that.
+    """What computes large L1 distances on the CPU without gradients; the first call compiles the loop.
 
     Example:
         >>> l1_backend() in ("numba", "torch")
@@ -74,48 +68,46 @@ def l1_backend() -> Literal["numba", "torch"]:
 
 
 def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
-    """Sum of |a - b| over features for every pair, or None where this is left to torch.
+    """Sum of |a - b| over features for every pair, or None if torch has to compute it.
 
-    Torch keeps: gradients and what else follows or traces operations (vmap, torch.compile, export),
-    other devices and dtypes, templates too few to be worth compiling for, and all without numba.
+    Torch does so for gradients and whatever else follows or traces operations (vmap, torch.compile, export),
+    on other devices and dtypes, for few templates, and without numba.
 
     Shape: (Q,F), (P,F) -> (Q,P).
 
-    Convention: the number of queries has no say, and a pair is summed in one order wherever it stands:
-        a query alone gets the bits it gets in a batch, and equal templates get equal distances.
+    Convention: a pair is summed in one order wherever it stands: a query alone has the distances, to the bit,
+        that it has in a batch, and equal templates have equal distances.
     """
     if templates.numel() < WORTH_COMPILING:
         return None
-    if query.ndim != 2 or templates.ndim != 2 or query.shape[1] != templates.shape[1]:
-        return None  # torch says what is wrong
     a, b = numbers_of(query), numbers_of(templates)
     kernel = None if a is None or b is None else _compiled()
     if a is None or b is None or kernel is None:
         return None
-    return torch.from_numpy(_in_threads(kernel, a, b, torch.get_num_threads()))
+    return torch.from_numpy(_in_threads(kernel, a, b))
 
 
 def numbers_of(tensor: Tensor) -> Floats | None:
-    """The float32 numbers of a tensor on the CPU, or None where they are not all there is to it."""
-    if torch.compiler.is_compiling():
-        return None
-    if torch.jit.is_tracing() or is_in_torch_dispatch_mode():  # type: ignore[attr-defined, no-untyped-call]
-        return None
-    if type(tensor) not in (Tensor, Parameter) or tensor.device.type != "cpu":
-        return None
-    if tensor.dtype != torch.float32 or (tensor.requires_grad and torch.is_grad_enabled()):
-        return None
-    if forward_ad.unpack_dual(tensor).tangent is not None:
+    """The numbers of a float32 tensor on the CPU, or None if its operations are followed or traced."""
+    if (
+        torch.compiler.is_compiling()
+        or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+        or is_in_torch_dispatch_mode()
+        or type(tensor) not in (Tensor, Parameter)
+        or (tensor.device.type, tensor.dtype) != ("cpu", torch.float32)
+        or (tensor.requires_grad and torch.is_grad_enabled())
+        or forward_ad.unpack_dual(tensor).tangent is not None
+    ):
         return None
     try:
         numbers: Floats = tensor.detach().contiguous().numpy()
         return numbers
-    except (RuntimeError, TypeError):  # vmap and its kin have no memory, sparse tensors no rows
+    except (RuntimeError, TypeError):  # tensors of vmap have no memory, sparse ones no rows
         return None
 
 
-def _in_threads(kernel: Callable[..., None], query: Floats, templates: Floats, threads: int) -> Floats:
-    """Threads of Python, made anew in every call: safe after fork and from several threads at once."""
+def _in_threads(kernel: Kernel, query: Floats, templates: Floats) -> Floats:
+    """The kernel in new threads, so that a fork, or calls from several threads, do no harm."""
     out = np.empty((len(query), len(templates)), np.float32)
     rows = max(1, min(QUERIES_AT_ONCE, len(query)))
     width = 4 * max(1, TASK // (4 * rows * query.shape[1]))
@@ -124,12 +116,12 @@ def _in_threads(kernel: Callable[..., None], query: Floats, templates: Floats, t
         for q in range(0, len(query), rows)
         for p in range(0, len(templates), width)
     ]
-    threads = min(threads, out.size * query.shape[1] // TASK)
+    threads = min(torch.get_num_threads(), out.size * query.shape[1] // TASK)
     if threads < 2:
         for task in tasks:
             kernel(*task)
-        return out
-    with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(kernel, *task) for task in tasks]:
-            done.result()
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            for _ in pool.map(kernel, *zip(*tasks, strict=True)):
+                pass
     return out

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.files import LARGEST
-from dejavu_torch.data.positions import borders, count_places, look_up, place_of, shown_frames
+from dejavu_torch.data.positions import count_places
+from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
-
-
-class Route(NamedTuple):
-    """A route of a map that has several: its name, and how many places and frames."""
-
-    name: str
-    places: int
-    frames: int
+OPTIONAL = ("visits", "escapes")  # left out of a file where they are empty
 
 
 class PlaceMap(nn.Module, ABC):
@@ -35,19 +29,17 @@ class PlaceMap(nn.Module, ABC):
         kind: a name of the kind, stored with the map.
         state: type of what `get_extra_state` gives, by which a file is checked: a NamedTuple of its entries.
         places: N, the number of places. dimension: D, features per frame. Plain ints.
-        positions: (F,) float32, how many even steps each reference frame lies from the first place, where
-            frames were resampled (section IV-B); (0,) where place i is reference frame i. Of a merged map
-            float64.
+        positions: (F,) float32, how many even steps each reference frame lies from the first place of its
+            route, where frames were resampled (section IV-B); (0,) where place i is reference frame i.
         visits: (V,2) int32, runs of places and how many visits each of these is the mean of; (0,2) where all
             are of one.
-        routes: of a merged map, in order; () for one route. Places and frames then count through all of them,
-            and `route_of` and `own_frame_of` tell the route of a place and the frame of that route.
+        routes: of a merged map, in order; () for one route. Places and frames then count through all of them.
 
     Shape: queries (Q,D) -> scores (Q,N), lower is better, +inf where nothing covers a place.
 
     Convention: the state is whole: everything that changes a score is in `state_dict`, settings included,
-        and a state of another kind or of other settings is refused. Loading takes the shapes of what is
-        loaded, so an empty map of the same settings can receive any map.
+        and a state of another kind or of other settings is refused. Its tensors are those of a file. Loading
+        takes the shapes of what is loaded, so an empty map of the same settings can receive any map.
     """
 
     kind: ClassVar[str]
@@ -91,7 +83,7 @@ class PlaceMap(nn.Module, ABC):
     def score_blocks(
         self, queries: Tensor, start: int = 0, stop: int | None = None
     ) -> Iterator[tuple[int, Tensor]]:
-        """As `scores_between`, a block of places behind the other: the first place and (Q,n) scores of each.
+        """As `scores_between`, one block of places after another: the first place and (Q,n) scores of each.
 
         Convention: a kind of map that needs no more memory for many places yields more than one.
         """
@@ -112,24 +104,26 @@ class PlaceMap(nn.Module, ABC):
         """
         return None
 
-    def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
-        """Scores of consecutive queries together, from batches (B,D) of them: (B,N) each.
-
-        Convention: what `sequence` gives of `scores`; a kind of map may have a shorter way there.
-        """
-        return sequence.follow(batches, self)
-
-    def extend(self, features: Tensor) -> None:
-        """Add the places of (n,D) features behind the last one.
+    def extend(self, chunks: Iterable[Any]) -> None:
+        """Add the places of coded chunks after the last one.
 
         Raises:
             InputError: a kind of map that cannot grow.
         """
         raise InputError(f"a map of kind {self.kind!r} cannot be extended; expected to learn the route anew")
 
+    @property
+    def table(self) -> FrameTable:
+        """Which frames and routes the places show."""
+        return FrameTable(self.places, self.positions, self.routes)
+
     def frame_of(self, places: Tensor) -> Tensor:
         """The reference frame that each place shows; -1, no place, stays -1. int64 of any shape."""
-        return look_up(shown_frames(self.positions), places) if len(self.positions) else places
+        return self.table.frame_of(places)
+
+    def place_of(self, frames: Tensor) -> Tensor:
+        """The place nearest to each reference frame, see `FrameTable`. int64 of any shape."""
+        return self.table.place_of(frames)
 
     @property
     def visit_counts(self) -> Tensor:
@@ -145,62 +139,25 @@ class PlaceMap(nn.Module, ABC):
         once = bool((values == 1).all())
         self.visits = torch.stack([runs, values], 1).int()[: 0 if once else None]
 
-    def route_of(self, places: Tensor) -> Tensor:
-        """The number of the route that each place is on; -1, no place, stays -1. int64 of any shape."""
-        ends = torch.tensor([route.places for route in self.routes], device=places.device).cumsum(0)
-        return torch.where(places >= 0, torch.searchsorted(ends, places.contiguous(), right=True), -1)
-
-    def own_frame_of(self, places: Tensor) -> Tensor:
-        """As `frame_of`, each frame counted on its own route. int64 of any shape."""
-        counts = torch.tensor([0, *(route.frames for route in self.routes)], device=places.device)
-        ahead = look_up(counts.cumsum(0), self.route_of(places))
-        return torch.where(places >= 0, self.frame_of(places) - ahead, -1)
-
-    def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each reference frame; -1 for one behind the first place, and for -1.
-
-        Shape: int64 of any shape.
-
-        Raises:
-            InputError: a frame that the reference does not have.
-        """
-        count = len(self.positions) or self.places
-        if frames.numel() and int(frames.max()) >= count:
-            raise InputError(
-                f"frame {int(frames.max())} of the reference; expected frames from 0 to {count - 1}"
-            )
-        return place_of(self.positions, frames) if len(self.positions) else frames
-
-    def scored(self, places: Tensor) -> Tensor:
-        """Of the places that show one frame, the one nearest to it: what a ground truth in frames counts."""
-        return self.place_of(self.frame_of(places))
-
-    @property
-    def borders(self) -> Tensor:
-        """(N+1,) int64, the reference frame with which each place begins, and the number of frames."""
-        return borders(self.positions) if len(self.positions) else torch.arange(self.places + 1)
-
     def check(self) -> None:
         """Refuse buffers that do not fit together.
 
         Raises:
             InputError: naming the first disagreement.
         """
-        problem = self.disagreement()
-        positions = self.positions
+        problem, positions, visits = self.disagreement(), self.positions, self.visits
         if not problem and not (
             positions.ndim == 1 and positions.is_floating_point() and positions.isfinite().all()
         ):
             problem = f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)"
-        visits = self.visits
         if not problem and (
             visits.shape[1:] != (2,) or visits.dtype != torch.int32 or bool((visits < 1).any())
         ):
             problem = f"visits {tuple(visits.shape)} {visits.dtype}; expected int32 (V,2) of at least 1"
         if not problem and len(visits) and int(visits[:, 0].sum()) != self.places:
             problem = f"visits of {int(visits[:, 0].sum())} places; expected {self.places}"
-        if not problem and len(positions) and count_places(positions) != self.places:
-            problem = f"positions of {count_places(positions)} places; expected {self.places}"
+        if not problem and len(positions) and count_places(self.table.steps) != self.places:
+            problem = f"positions of {count_places(self.table.steps)} places; expected {self.places}"
         if problem:
             raise InputError(f"the map does not fit together: {problem}")
 
@@ -231,20 +188,20 @@ class PlaceMap(nn.Module, ABC):
         if not any(name.startswith(prefix) for name in state_dict):  # of other parts of a model
             super()._load_from_state_dict(state_dict, prefix, *args)
             return
-        before = self.get_extra_state(), dict(self._buffers), dict(self._parameters)
+        before = self.__dict__ | {name: dict(self.__dict__[name]) for name in ("_buffers", "_parameters")}
         try:
             if prefix + EXTRA in state_dict:  # before any tensor is touched
                 self.set_extra_state(state_dict[prefix + EXTRA])
-                if "visits" not in self._non_persistent_buffers_set:
-                    state_dict.setdefault(f"{prefix}visits", self.visits[:0])
+                for name in OPTIONAL:
+                    if name in self._buffers and name not in self._non_persistent_buffers_set:
+                        state_dict.setdefault(prefix + name, getattr(self, name)[:0])
             self._take_shapes(state_dict, prefix)
             super()._load_from_state_dict(state_dict, prefix, *args)
             self.loaded()
             self.check()
         except InputError:  # a state that is refused leaves the map as it was
-            extra, self._buffers, self._parameters = before
-            self.set_extra_state(extra)
-            self.loaded()
+            self.__dict__.clear()
+            self.__dict__.update(before)
             raise
 
     def _take_shapes(self, state_dict: dict[str, Any], prefix: str) -> None:
@@ -256,17 +213,12 @@ class PlaceMap(nn.Module, ABC):
                 setattr(self, name, nn.Parameter(new) if trained else new)
 
     def packed(self) -> dict[str, Tensor]:
-        """The tensors that a file holds of the map; a kind that compresses them says how."""
-        kept = {name: value for name, value in self.state_dict().items() if isinstance(value, Tensor)}
-        return kept if len(self.visits) else {k: v for k, v in kept.items() if k != "visits"}
-
-    def unpacked(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The state's tensors, from what `packed` gave.
-
-        Raises:
-            InputError: tensors that do not fit together.
-        """
-        return tensors
+        """The tensors of a file: those of the state, without optional ones that are empty."""
+        return {
+            name: value
+            for name, value in self.state_dict().items()
+            if isinstance(value, Tensor) and (len(value) or name not in OPTIONAL)
+        }
 
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load what `packed` and `get_extra_state` gave.
@@ -274,11 +226,12 @@ class PlaceMap(nn.Module, ABC):
         Raises:
             InputError: tensors or a state that do not fit.
         """
-        state = {**self.unpacked(tensors), EXTRA: extra}
-        missing = self.state_dict().keys() - state.keys() - {"visits"}
-        if missing:
-            raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
-        self.load_state_dict(state)
+        own = self.state_dict().keys() - {EXTRA}
+        missing, unknown = own - tensors.keys() - {*OPTIONAL}, tensors.keys() - own
+        if missing or unknown:
+            seen = f"it does not hold the map's {', '.join(sorted(missing))}"
+            raise InputError(seen if missing else f"it holds {', '.join(sorted(unknown))}, which no map has")
+        self.load_state_dict({**tensors, EXTRA: extra})
 
     def loaded(self) -> None:
         """Called when a state was loaded: work out what follows from the buffers."""
@@ -305,7 +258,7 @@ class Mapper(nn.Module, ABC):
     def empty(self) -> PlaceMap:
         """A map without places, which can load any map of this mapper."""
 
-    def beside(self, taken: int, ready: bool = False) -> Mapper:
+    def with_overhead(self, overhead: int, ready: bool = False) -> Mapper:
         """The mapper that leaves room for so many bytes, which a file holds of the places beside the map.
 
         Args:

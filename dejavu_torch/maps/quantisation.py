@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -13,13 +13,11 @@ from dejavu_torch.maps.codec import coded_bytes, to_int8
 from dejavu_torch.maps.spectrum import Transform, spectrum
 from dejavu_torch.memory import empty
 
-ROUNDING = 0.35  # what is added ahead of rounding down: a dead zone of 1.3 steps around 0
+ROUNDING = 0.35  # what is added before rounding down: a dead zone of 1.3 steps around 0
 FINEST = 64  # steps in an RMS line at most: a finer step changes no score
 HALVINGS = 14  # of the steps to choose from, which leaves 0.1 % of a step
-AT_ONCE = 2**24  # numbers of a route that is gone through as a whole
-BLOCK = 2**20  # numbers at a time of a longer one
-COLUMNS = 2**23  # and where all of its places are needed
-CLOSE = 0.995  # of a long route's budget: no finer step is looked for
+BLOCK = 2**23  # numbers at a time
+CLOSE = 0.995  # of the budget of a route of more numbers: no finer step is looked for
 
 
 @torch.no_grad()
@@ -58,36 +56,35 @@ class RouteLines:
     of the memory are in a temporary file.
 
     Args:
-        lengths: places of each chunk, one behind the other.
-        transform, resolution: see `spectrum`, `dead_zone`.
+        lengths: places of each chunk, one after another. transform, resolution: see `spectrum`, `dead_zone`.
+        mean: (K,) that is taken off; None is that of the route, in bfloat16 as a map stores it.
 
     Shape: features (N,K), float of any kind.
-
-    Convention: the mean that is taken off is (K,) bfloat16, as a map stores it.
     """
 
     def __init__(
-        self, features: Tensor, lengths: Sequence[int], transform: Transform, resolution: float = 0.0
+        self,
+        features: Tensor,
+        lengths: Sequence[int],
+        transform: Transform,
+        resolution: float = 0.0,
+        mean: Tensor | None = None,
     ) -> None:
-        self.whole = features.numel() <= AT_ONCE
         places, numbers = features.shape
-        self.rows = places if self.whole else max(1, BLOCK // numbers)
-        self.rms = _rms(features, self.rows)
-        means = [part.float().mean(0).double() * len(part) for part in features.split(self.rows)]
-        self.mean = (torch.stack(means).sum(0) / places).to(torch.bfloat16)
+        self.rows = max(1, BLOCK // numbers)
+        if mean is None:
+            means = [part.float().mean(0).double() * len(part) for part in features.split(self.rows)]
+            mean = (torch.stack(means).sum(0) / places).to(torch.bfloat16)
+        self.mean = mean
         stops = torch.tensor(lengths).cumsum(0).tolist()
         self.chunks = list(zip([0, *stops[:-1]], stops, strict=True))
         self.lines = empty(places, numbers, features.device)
         for start, stop in self.chunks:
-            columns = numbers if self.whole else max(1, COLUMNS // (stop - start))
-            for first in range(0, numbers, columns):
-                some = slice(first, first + columns)
-                part = features[start:stop, some].float() - self.mean[some].float()
-                self.lines[start:stop, some] = spectrum(part.T, transform).T
+            for some in torch.arange(numbers).split(max(1, BLOCK // (stop - start))):
+                columns = slice(int(some[0]), int(some[-1]) + 1)
+                part = features[start:stop, columns].float() - mean[columns].float()
+                self.lines[start:stop, columns] = spectrum(part.T, transform).T
         self.width = dead_zone(self.lines, [*lengths], resolution, transform)
-        self.scale = _rms(self.lines, self.rows)
-        #: the finest step that is worth trying, and one so coarse that no line is left
-        self.steps = self.scale / FINEST, 2 * max(float(part.abs().max()) for part in self._blocks())
 
     def levels(self, step: float, even: bool = False) -> Iterator[tuple[Tensor, Tensor]]:
         """Of each chunk, as `to_int8` gives them.
@@ -96,12 +93,10 @@ class RouteLines:
             even: all lines have the same dead zone.
         """
         for start, stop in self.chunks:
-            small = torch.empty_like(self.lines[start:stop], dtype=torch.int8)
-            escapes = []
+            small, escapes = torch.empty_like(self.lines[start:stop], dtype=torch.int8), []
             for first in range(start, stop, self.rows):
                 rows = slice(first, min(first + self.rows, stop))
-                width = None if even or self.width is None else self.width[rows]
-                part, large = to_int8(quantise(self.lines[rows], step, width))
+                part, large = to_int8(quantise(self.lines[rows], step, self._widths(rows, even)))
                 small[rows.start - start : rows.stop - start] = part
                 escapes.append(large)
             yield small, torch.cat(escapes)
@@ -112,68 +107,57 @@ class RouteLines:
 
     def held(self, step: float, even: bool = False) -> float:
         """The share of the variance that lines in such steps hold."""
-        widths = itertools.repeat(None) if even or self.width is None else self.width.split(self.rows)
-        errors = [
-            float((part - step * quantise(part, step, width)).square().sum())
-            for part, width in zip(self._blocks(), widths, strict=False)
-        ]
-        return 1 - sum(errors) / sum(float(part.square().sum()) for part in self._blocks())
+        error = 0.0
+        for first in range(0, len(self.lines), self.rows):
+            rows = slice(first, first + self.rows)
+            part = self.lines[rows]
+            error += float((part - step * quantise(part, step, self._widths(rows, even))).square().sum())
+        return 1 - error / self.energy
 
     def step_of(self, room: float) -> float:
         """The smallest step in which the lines take so many bytes, or fewer; of a long route, about it."""
-        if self.whole:
-            return _smallest_step(lambda step: self.coded_bytes(step) <= room, *self.steps)
-        return _close_step(self.coded_bytes, room, *self.steps)
+        close = CLOSE if self.lines.numel() > BLOCK else 1.0
+        return self._smallest_step(self.coded_bytes, room, close)
 
     def step_that_holds(self, share: float) -> float:
         """The smallest step in which even lines hold less than a share of the variance."""
-        return _smallest_step(lambda step: self.held(step, even=True) < share, *self.steps)
+        return self._smallest_step(lambda step: self.held(step, even=True), math.nextafter(share, 0))
 
-    def _blocks(self) -> Sequence[Tensor]:
-        blocks: Sequence[Tensor] = self.lines.split(self.rows)
-        return blocks
+    @cached_property
+    def coarsest(self) -> float:
+        """A step in which no line is left."""
+        return 2 * max(float(part.abs().max()) for part in self.lines.split(self.rows))
+
+    @cached_property
+    def energy(self) -> float:
+        """The sum of the squares of the lines."""
+        return sum(float(part.square().sum()) for part in self.lines.split(self.rows))
+
+    @cached_property
+    def scale(self) -> float:
+        """The RMS of the lines."""
+        return rms(self.lines, self.rows)
+
+    def _widths(self, rows: slice, even: bool) -> Tensor | None:
+        return None if even or self.width is None else self.width[rows]
+
+    def _smallest_step(self, value: Callable[[float], float], most: float, close: float = 1.0) -> float:
+        """The smallest step whose value, which falls as the step grows, is at most so large: by bisection of
+        its logarithm, until the value is within that and `close` times it."""
+        finest, coarsest = self.scale / FINEST, self.coarsest
+        if value(finest) <= most:
+            return finest
+        low, high = math.log(finest), math.log(coarsest)
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            found = value(math.exp(middle))
+            low, high = (low, middle) if found <= most else (middle, high)
+            if close * most <= found < most:
+                break
+        return math.exp(high)
 
 
-def _rms(numbers: Tensor, rows: int) -> float:
-    """So many rows at a time."""
+def rms(numbers: Tensor, rows: int) -> float:
+    """The root of the mean square of (N,K) numbers, so many rows at a time."""
     squares = [float(part.float().square().mean()) * len(part) for part in numbers.split(rows)]
     return float(torch.tensor(sum(squares) / len(numbers)).sqrt())
-
-
-def _smallest_step(enough: Callable[[float], bool], finest: float, coarsest: float) -> float:
-    """The smallest step that is coarse enough, by bisection of its logarithm."""
-    if enough(finest):
-        return finest
-    low, high = math.log(finest), math.log(coarsest)
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
-    return math.exp(high)
-
-
-def _close_step(cost: Callable[[float], int], room: float, finest: float, coarsest: float) -> float:
-    """A step whose cost is within the room, and over `CLOSE` of it: false position of logarithms (Illinois).
-
-    About 8 steps are tried where a bisection tries 15.
-    """
-    most, least = math.log(room), math.log(room * CLOSE)
-
-    def above(log_step: float) -> float:
-        return math.log(max(1, cost(math.exp(log_step)))) - (most + least) / 2
-
-    low, high = math.log(finest), math.log(coarsest)
-    over, under = above(low), above(high)
-    if over <= (most - least) / 2:
-        return finest
-    middle, kept = (low + high) / 2, 0
-    for _ in range(2 * HALVINGS):
-        found = above(middle)
-        if abs(found) <= (most - least) / 2:
-            return math.exp(middle)
-        if found > 0:
-            low, over, under = middle, found, under / (1 + (kept > 0))
-        else:
-            high, under, over = middle, found, over / (1 + (kept < 0))
-        kept = 1 if found > 0 else -1
-        middle = (low * under - high * over) / (under - over)
-    return math.exp(high)

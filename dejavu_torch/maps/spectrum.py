@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -48,30 +48,22 @@ def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
 def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
     """The series that has these lines: the inverse of `spectrum`. (...,W) -> (...,W)"""
     count = _check(lines, transform)
-    where, factor, size = slots(lines, transform)
-    slotted = lines.new_zeros(*lines.shape[:-1], size).index_copy(-1, where, lines * factor)
-    return from_slots(slotted, count, transform)
+    where, factor = slots(count, transform, lines.dtype, lines.device)
+    slotted = lines.new_zeros(*lines.shape[:-1], len(factor)).index_copy(-1, where, lines)
+    return from_slots(slotted * factor, count, transform)
 
 
-class Slots(NamedTuple):
-    """Where the inverse transform takes the lines of W numbers from, so that no copy brings them there.
-
-    where: (W,) int64, of each line. factor: (W,), what the line is multiplied with there. count: S, of slots;
-    those that no line goes to are 0.
-    """
-
-    where: Tensor
-    factor: Tensor
-    count: int  # type: ignore[assignment]  # the field shadows tuple.count
-
-
-def slots(lines: Tensor, transform: Transform) -> Slots:
-    """Of lines (...,W), whose dtype and device the factors have."""
-    count = lines.shape[-1]
-    where = torch.arange(count, device=lines.device)
-    if transform == "dct":
-        return Slots(where, 1 / _scale(lines, transform), count)
-    return Slots(where + (where > 0), 1 / _scale(lines, transform), 2 * (count // 2) + 2)  # pairs
+def slots(
+    count: int, transform: Transform, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Where `from_slots` takes the lines of W numbers from, (W,) int64, and what it expects the S slots to be
+    multiplied with, (S,); slots without a line are 0."""
+    where = torch.arange(count, device=device)
+    size = count
+    if transform == "dft":  # pairs of a cosine and a sine; the mean has no sine
+        where, size = where + (where > 0), 2 * (count // 2) + 2
+    scale = 1 / _scale(torch.empty(count, dtype=dtype, device=device), transform)
+    return where, scale.new_zeros(size).index_copy(0, where, scale)
 
 
 def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:

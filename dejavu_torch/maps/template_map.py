@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from functools import reduce
 from itertools import accumulate, pairwise
@@ -12,21 +12,21 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.maps.distance import Metric, check_metric, metric_name, phase_distances
-from dejavu_torch.maps.layer_search import LayerSearch
+from dejavu_torch.maps.distance import Metric, check_metric, phase_distances
+from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.summary import MapSummary, summarise
-from dejavu_torch.maps.templates import PhaseTemplates
-from dejavu_torch.maps.trajectories import LayerSums
+from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel
+from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 Reduction = Literal["mean", "sum"]
-TRAINABLE = ("templates", "weights")
-MOST_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
-PLACE_BYTES = 16  # that a place takes while a query is scored
+MAX_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
+PLACE_BYTES = 16  # per place, while a query is scored
+PHASE_COST = 8  # of a phase of two layers that are searched, in places that are scored in the same time
+SEARCH_COST = 2**15  # of any search, in the same unit
 
 
 class TemplateState(NamedTuple):
@@ -35,39 +35,48 @@ class TemplateState(NamedTuple):
     kind: Literal["templates"]
     places: int
     dimension: int
-    metric: Literal["l1", "l2", "cosine"]
+    metric: Metric
     reduction: Reduction
     temperature: float | None
 
 
 class Segment(NamedTuple):
-    """Places [start, stop) that the same layers cover, by their positions in the plan."""
+    """Places [start, stop) that the same layers cover, by their positions in the plan.
+
+    lap: places until the scores repeat. searched: whether `lowest` searches the two layers. cost: of that, or
+    of a scan, in places that are scored.
+    """
 
     start: int
     stop: int
     layers: tuple[int, ...]
+    lap: int
+    searched: bool
+    cost: int
 
 
-def segments(plan: Plan, places: int) -> tuple[Segment, ...]:
+def segments(plan: Plan, places: int) -> Iterator[Segment]:
     """Cut 0..places at every start and stop of a layer: within a segment L of eq. 4 is constant."""
     cuts = sorted({0, places, *(layer.start for layer in plan), *(layer.stop for layer in plan)})
-    return tuple(
-        Segment(a, b, tuple(j for j, layer in enumerate(plan) if layer.start <= a and b <= layer.stop))
-        for a, b in pairwise(cuts)
-    )
+    for start, stop in pairwise(cuts):
+        members = tuple(j for j, layer in enumerate(plan) if layer.start <= start and stop <= layer.stop)
+        sizes = [plan[j].period.numerator for j in members]
+        lap = reduce(lambda length, size: min(math.lcm(length, size), stop - start), sizes, 1)
+        search = PHASE_COST * sum(sizes)
+        pays = len(members) == 2 and search < lap
+        yield Segment(start, stop, members, lap, pays, search if pays else lap)
 
 
 def weight_per_feature(metric: Metric, features: int) -> float:
     """What a layer's distance grows with: its features for l1, their root for l2, nothing for cosine."""
-    return {"l2": math.sqrt(features), "cosine": 1.0}.get(metric if isinstance(metric, str) else "", features)
+    return {"l1": features, "l2": math.sqrt(features), "cosine": 1.0}[metric]
 
 
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
     """How unlikely each place is: -log softmax(-S / T) over places.
 
-    It orders the places of a query as S does (but for rounding where T is large), and makes the scores of
-    different queries comparable: S grows with everything in a frame that no template has, this only with what
-    fits other places as well.
+    It keeps the order of places (but for rounding at a large T) and makes the scores of different queries
+    comparable: what no template explains raises S at all places, and this not at all.
 
     Args:
         scores: S, lower is better. temperature: T, in units of S.
@@ -82,7 +91,7 @@ def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
     """
     closed = scores.isinf()
     reachable = ~closed.all(1, keepdim=True)
-    # what is +inf must not meet T: its gradient would be NaN
+    # +inf must not meet T: its gradient would be NaN
     logits = (-scores.masked_fill(closed, 0) / temperature).masked_fill(closed & reachable, -math.inf)
     return -logits.log_softmax(1).masked_fill(closed, -math.inf)
 
@@ -95,7 +104,7 @@ class TemplateMap(PlaceMap):
         feature_ptr: (L+1,) int64, where each layer's features begin in `feature_index`.
         feature_index: (sum F,) int32.
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
-        weights: (D,) float, what a difference in each feature counts in eq. 3; (0,) where all count alike.
+        weights: (D,) float, the factor of each feature's difference in eq. 3; (0,) for 1.
         positions: see `PlaceMap`.
 
     Args:
@@ -109,12 +118,12 @@ class TemplateMap(PlaceMap):
             few are comparable.
         temperature: scores are those of `log_posterior`; None, the paper's letter, leaves S as it is. It is
             part of the state, not of the settings.
-        weights: see above; None where all features count alike.
+        weights: see above; None for 1.
 
     Shape: scores: query features (Q,D) -> (Q,N), lower is better, uncovered +inf.
 
-    Convention: L in eq. 4 is the set of layers whose chunk holds i. Templates are of `weighted` features:
-        |w H - w mu| = w |H - mu|. Gradients reach the queries and the templates.
+    Convention: L in eq. 4 is the set of layers whose chunk holds i. Templates are means of `weighted`
+        features: |w H - w mu| = w |H - mu|. Gradients reach the queries and the templates.
 
     Raises:
         InputError: templates that do not fit the plan, an unknown metric or reduction, a temperature of 0 or
@@ -135,7 +144,7 @@ class TemplateMap(PlaceMap):
     feature_index: Tensor
     templates: Tensor
     weights: Tensor
-    lap_phases: Tensor
+    lap_phases: Tensor  # of each layer at its first places, until they repeat
 
     def __init__(
         self,
@@ -154,23 +163,23 @@ class TemplateMap(PlaceMap):
             raise InputError(f"reduction {reduction!r} is unknown; expected 'mean' or 'sum'")
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
         for layer, block in zip(plan, templates, strict=True):
-            if tuple(block.shape) != (layer.phases, len(layer.features)):
+            expected = layer.phases, len(layer.features)
+            if block.shape != expected:
                 raise InputError(
-                    f"a layer of {layer.phases} phases and {len(layer.features)} features got templates "
-                    f"{tuple(block.shape)}; expected ({layer.phases}, {len(layer.features)})"
+                    f"a layer of {expected[0]} phases and {expected[1]} features got templates "
+                    f"{tuple(block.shape)}; expected {expected}"
                 )
         rows = [(*layer.period.as_integer_ratio(), layer.phases, layer.start, layer.stop) for layer in plan]
         index = [feature for layer in plan for feature in layer.features]
         pointer = [0, *accumulate(len(layer.features) for layer in plan)]
+        numbers = torch.cat([block.flatten() for block in templates]) if plan else torch.zeros(0)
         self.register_buffer("layers", torch.tensor(rows, dtype=torch.int64).reshape(-1, 5))
         self.register_buffer("feature_ptr", torch.tensor(pointer))
         self.register_buffer("feature_index", torch.tensor(index, dtype=torch.int32))
-        self.register_buffer(
-            "templates", torch.cat([b.flatten() for b in templates]) if plan else torch.zeros(0)
-        )
+        self.register_buffer("templates", numbers)
         self.register_buffer("weights", torch.zeros(0) if weights is None else weights.float())
         self.register_buffer("lap_phases", torch.zeros(0, dtype=torch.int64), persistent=False)
-        self.to(self.templates.device)
+        self.to(numbers.device)
         self.loaded()
         self.check()
 
@@ -181,75 +190,59 @@ class TemplateMap(PlaceMap):
 
     @temperature.setter
     def temperature(self, value: float | None) -> None:
-        if value is not None and not 0 < value < math.inf:
-            raise InputError(f"the temperature is {value}; expected a number above 0")
+        if value is not None and not (isinstance(value, (int, float)) and 0 < value < math.inf):
+            raise InputError(f"the temperature is {value!r}; expected a number above 0")
         self._temperature = value
 
     def loaded(self) -> None:
-        """The plan, and the phases of each layer in the order of its places, from the buffers."""
-        problem = self._buffer_disagreement()
+        """Derive the plan, its segments and the phases of each layer from the buffers."""
+        problem = self._plan_problem()
         if problem:
             raise InputError(f"the map does not fit together: {problem}")
-        pointer, index = self.feature_ptr.tolist(), self.feature_index.tolist()
+        index = self.feature_index.split(self.feature_ptr.diff().tolist())
         self.plan: Plan = tuple(
-            FrequencyLayer(Fraction(a, b), phases, start, stop, tuple(index[pointer[j] : pointer[j + 1]]))
-            for j, (a, b, phases, start, stop) in enumerate(self.layers.tolist())
+            FrequencyLayer(Fraction(a, b), phases, start, stop, tuple(features.tolist()))
+            for (a, b, phases, start, stop), features in zip(self.layers.tolist(), index, strict=True)
         )
-        outside = [
-            layer for layer in self.plan if layer.stop > self.places or layer.features[-1] >= self.dimension
-        ]
-        if outside:
-            raise InputError(
-                f"the map does not fit together: a layer covers [{outside[0].start}, {outside[0].stop}) and "
-                f"feature {outside[0].features[-1]}; expected it inside {self.places} places of "
-                f"{self.dimension} features"
-            )
+        check_plan(self.plan, self.places, self.dimension)
         covered = sum(layer.stop - layer.start for layer in self.plan)
-        if max(self.places, covered) > MOST_PLACES:
+        if max(self.places, covered) > MAX_PLACES:
             raise InputError(
-                f"a map of {self.places} places, {covered} in all layers; expected at most {MOST_PLACES}"
+                f"a map of {self.places} places, {covered} in all layers; expected at most {MAX_PLACES}"
             )
-        check_room(PLACE_BYTES * self.places, f"a map of {self.places} places")
-        self.segments = segments(self.plan, self.places)
-        # phases repeat after as many places as the period's numerator says
-        self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
-        check_room(PLACE_BYTES * sum(self.laps), f"the phases of {len(self.plan)} layers")
-        phases = [
-            layer.phase(torch.arange(layer.start, layer.start + lap))
-            for layer, lap in zip(self.plan, self.laps, strict=True)
-        ]
-        self.lap_phases = torch.cat(phases).to(self.layers.device) if phases else self.layers.new_zeros(0)
-        self._search: LayerSearch | None = None
+        # phases repeat after as many places as the numerator of the period
+        laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
+        check_room(PLACE_BYTES * (self.places + sum(laps)), f"a map of {self.places} places")
+        pairs = list(zip(self.plan, laps, strict=True))
+        phases = [layer.phase(torch.arange(layer.start, layer.start + lap)) for layer, lap in pairs]
+        self.lap_phases = torch.cat([torch.zeros(0, dtype=torch.int64), *phases]).to(self.layers.device)
+        self.laps = [slice(end - lap, end) for lap, end in zip(laps, accumulate(laps), strict=True)]
+        self.segments = tuple(segments(self.plan, self.places))
 
     def settings(self) -> dict[str, Any]:
-        return {"metric": metric_name(self.metric), "reduction": self.reduction}
+        return {"metric": self.metric, "reduction": self.reduction}
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the state holds beside the tensors."""
         return super().get_extra_state() | {"temperature": self.temperature}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See `PlaceMap`; the temperature is taken over."""
+        """See `PlaceMap`; the temperature comes from the state."""
         super().set_extra_state(state)
-        temperature = state.get("temperature")
-        if temperature is not None and not isinstance(temperature, (int, float)):
-            raise InputError(f"the map's temperature is {temperature!r}; expected a number above 0 or none")
-        self.temperature = temperature
+        self.temperature = state.get("temperature")
 
     def blocks(self) -> list[Tensor]:
         """Templates of each layer, (P,F) views of the flat buffer."""
-        sizes = [layer.phases * len(layer.features) for layer in self.plan]
-        parts = self.templates.split(sizes) if sizes else ()
-        return [part.view(layer.phases, -1) for part, layer in zip(parts, self.plan, strict=True)]
+        shapes = [(layer.phases, len(layer.features)) for layer in self.plan]
+        parts = self.templates.split([math.prod(shape) for shape in shapes])
+        return [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def layer_features(self) -> list[Tensor]:
         """Feature indices of each layer, (F,) int32."""
-        return (
-            list(self.feature_index.split([len(layer.features) for layer in self.plan])) if self.plan else []
-        )
+        return list(self.feature_index.split([len(layer.features) for layer in self.plan]))
 
     def weighted(self, features: Tensor) -> Tensor:
-        """Features as the templates are made of and compared with: times `weights`. (n,D) -> (n,D)."""
+        """Features times `weights`, which templates are made from and compared with. (n,D) -> (n,D)."""
         return features * self.weights if len(self.weights) else features
 
     def distances(self, queries: Tensor, layers: Sequence[int] | None = None) -> list[Tensor]:
@@ -264,63 +257,34 @@ class TemplateMap(PlaceMap):
             for j in (range(len(blocks)) if layers is None else layers)
         ]
 
-    def along(
-        self, distances: Tensor, layer: int, start: int, stop: int, lap: Tensor | None = None
-    ) -> Tensor:
-        """The distances of a layer to the places [start, stop) that it covers: (Q,P) -> (Q,stop - start).
-
-        Args:
-            layer: its position in the plan.
-            lap: the column of the distances for each place until they repeat; None is the phase.
-        """
-        if lap is None:
-            lap = self.lap_phases.split(self.laps)[layer]
+    def along(self, distances: Tensor, layer: int, start: int, stop: int) -> Tensor:
+        """Distances of a layer at the places [start, stop) that it covers: (Q,P) -> (Q,stop - start)."""
+        lap = self.lap_phases[self.laps[layer]]
         first, count = (start - self.plan[layer].start) % len(lap), stop - start
         if first + count <= len(lap):
             return distances.index_select(1, lap[first : first + count])
-        lap = torch.cat([lap[first:], lap[:first]])
+        lap = lap.roll(-first) if first else lap
         return distances.index_select(1, lap).repeat(1, -(-count // len(lap)))[:, :count]
 
-    def added(self, members: Sequence[int], distances: Sequence[Tensor]) -> Tensor:
-        """S of places (eq. 4), from the distances that the layers which cover them have there.
+    def divisor(self, layers: Sequence[int]) -> float:
+        """What the sum of the distances of these layers is divided by in S."""
+        if self.reduction == "sum":
+            return 1.0
+        return sum(weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
 
-        Args:
-            members: the layers, by their positions in the plan.
-
-        Shape: for each a tensor (Q,n) -> (Q,n).
-        """
-        total: Tensor = reduce(torch.add, distances)
-        if self.reduction == "mean":
-            total = total / sum(weight_per_feature(self.metric, len(self.plan[j].features)) for j in members)
-        return total
-
-    def combine(
-        self,
-        distances: Sequence[Tensor],
-        segments: Sequence[Segment] | None = None,
-        laps: Sequence[Tensor] | None = None,
-    ) -> Tensor:
+    def combine(self, distances: Sequence[Tensor], segments: Sequence[Segment] | None = None) -> Tensor:
         """S(i) from the phase distances of each layer (eq. 4): L tensors (Q,P) -> (Q,N).
 
         Args:
-            segments: of which places, in order; None is all of them.
-            laps: of each layer, see `along`.
+            segments: whose places, in order; None for all.
 
         Convention: a place that no layer covers scores +inf.
-
-        Raises:
-            InputError: no layers.
         """
-        if not distances:
-            raise InputError("there are no layers to combine; expected at least one")
-        if laps is None:
-            laps = self.lap_phases.split(self.laps)
         parts = []
-        for start, stop, members in self.segments if segments is None else segments:
-            if members:
-                parts.append(
-                    self.added(members, [self.along(distances[j], j, start, stop, laps[j]) for j in members])
-                )
+        for start, stop, layers, *_ in self.segments if segments is None else segments:
+            if layers:
+                total: Tensor = reduce(torch.add, [self.along(distances[j], j, start, stop) for j in layers])
+                parts.append(total / self.divisor(layers) if self.reduction == "mean" else total)
             else:
                 parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, stop - start))
         return torch.cat(parts, 1)
@@ -340,39 +304,34 @@ class TemplateMap(PlaceMap):
         members = sorted({j for segment in inside for j in segment.layers})
         if not members or self.temperature is not None:
             return super().scores_between(queries, start, stop)
-        distances = self.distances(queries, members)
-        rows = [distances[0]] * len(self.plan)  # no other row is looked up
-        for j, row in zip(members, distances, strict=True):
-            rows[j] = row
-        return self.combine(rows, inside)[:, start - inside[0].start : stop - inside[0].start]
+        rows = dict(zip(members, self.distances(queries, members), strict=True))
+        distances = [rows.get(j, rows[members[0]]) for j in range(len(self.plan))]  # no other row is read
+        return self.combine(distances, inside)[:, start - inside[0].start : stop - inside[0].start]
 
     @torch.no_grad()
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """See `PlaceMap`; by `LayerSearch` where that is less work than the scores of all places."""
-        if self.temperature is not None:
+        """See `PlaceMap`: segments of two layers are searched, others scanned until their scores repeat."""
+        cost = SEARCH_COST + sum(segment.cost for segment in self.segments)
+        if self.temperature is not None or not self.plan or cost >= self.places:
             return None
-        if self._search is None or self._search.device != self.layers.device:
-            self._search = LayerSearch(self)
-        search = self._search
-        if not search.worth:
-            return None
-        found = [search.lowest(self.distances(part)) for part in queries.split(search.at_once)]
-        scores, places = zip(*found, strict=True)
-        return torch.cat(scores), torch.cat(places)
-
-    def sequences(self, batches: Iterable[Tensor], sequence: SequenceModel) -> Iterator[Tensor]:
-        """See `PlaceMap`; mean scores along trajectories come from `LayerSums` where that is less work."""
-        sums = LayerSums(self, sequence) if sequence.shifts and self.temperature is None else None
-        if sums is None or not sums.worth:
-            yield from super().sequences(batches, sequence)
-            return
-        kept = len(sequence.shifts[0]) - 1
-        rows = [block.new_zeros(0, len(block)) for block in self.blocks()]
-        for queries in batches:
-            ahead = len(rows[0])
-            rows = [torch.cat(pair) for pair in zip(rows, self.distances(queries), strict=True)]
-            yield sums.scores(rows, ahead)
-            rows = [row[max(0, len(row) - kept) :] for row in rows]
+        distances, found = self.distances(queries), []
+        for segment in self.segments:
+            start, _, layers, lap, searched, _ = segment
+            if searched:
+                ends = [start + self.plan[j].period.numerator for j in layers]
+                one, other = (
+                    self.along(distances[j], j, start, end) for j, end in zip(layers, ends, strict=True)
+                )
+                score, place = lowest(one, other, lap, self.divisor(layers))
+            elif layers:
+                score, place = self.combine(distances, [segment._replace(stop=start + lap)]).min(1)
+            else:
+                continue
+            found.append((score, start + place))
+        scores, places = (torch.stack(column, 1) for column in zip(*found, strict=True))
+        best = scores.amin(1)
+        first = places.masked_fill(scores != best[:, None], self.places).amin(1)
+        return best, torch.where(best.isfinite(), first, -1)
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
         """Make parameters of the templates, of the weights, or of both, until `freeze`.
@@ -390,9 +349,8 @@ class TemplateMap(PlaceMap):
                 if start.shape != own.shape:
                     raise InputError(f"the weights start as {tuple(start.shape)}; expected ({len(own)},)")
                 own = start.detach().clone()
-            self.templates = self._times(own)  # they are of weighted features
-            self.weights = own
-        for name, wanted in zip(TRAINABLE, (templates, weights), strict=True):
+            self.templates, self.weights = self._times(own), own
+        for name, wanted in (("templates", templates), ("weights", weights)):
             if wanted:
                 value = getattr(self, name).detach().clone()
                 delattr(self, name)
@@ -412,7 +370,7 @@ class TemplateMap(PlaceMap):
         self.check()
 
     def _times(self, factors: Tensor) -> Tensor:
-        """The templates, those of each feature times its factor (D,)."""
+        """The flat templates, each feature times its factor (D,)."""
         pairs = zip(self.blocks(), self.layer_features(), strict=True)
         scaled = [(block * factors[features]).flatten() for block, features in pairs]
         return torch.cat(scaled) if scaled else self.templates
@@ -424,43 +382,33 @@ class TemplateMap(PlaceMap):
         route["layers"] = self.layers.nbytes + self.feature_ptr.nbytes + self.feature_index.nbytes
         return summarise(self.plan, self.places, route)
 
-    def _buffer_disagreement(self) -> str:
-        """What is wrong with the buffers that the plan is made of."""
-        shapes = {"layers": "(L,5)", "feature_ptr": "(L+1,)", "feature_index": "(F,)"}
+    def _plan_problem(self) -> str:
+        """What is wrong with the buffers that the plan is derived from; empty if nothing is."""
+        count, last = self.layers.numel() // 5, self.feature_index.numel()
+        shapes = {"layers": (count, 5), "feature_ptr": (count + 1,), "feature_index": (last,)}
         for name, shape in shapes.items():
             buffer = getattr(self, name)
-            whole = buffer.dtype in (torch.int32, torch.int64)  # what selects features
-            if buffer.ndim != 1 + (name == "layers") or not whole:
+            if buffer.shape != shape or buffer.dtype not in (torch.int32, torch.int64):
                 return f"{name} {tuple(buffer.shape)} {buffer.dtype}; expected {shape} int32 or int64"
-        if self.layers.shape[1] != 5:
-            return f"layers {tuple(self.layers.shape)}; expected (L,5)"
         pointer = self.feature_ptr.tolist()
-        if len(pointer) != len(self.layers) + 1 or pointer[0] != 0 or sorted(pointer) != pointer:
-            return f"feature_ptr does not rise from 0 over {len(self.layers)} layers"
-        if pointer[-1] != len(self.feature_index):
-            return f"{len(self.feature_index)} feature indices; expected {pointer[-1]}"
-        if bool((self.layers[:, 1] < 1).any()):
-            return "a period with a denominator below 1"
-        return ""
+        if pointer != sorted(pointer) or (pointer[0], pointer[-1]) != (0, last):
+            return f"feature_ptr does not rise from 0 to {last}"
+        return "a period with a denominator below 1" if bool((self.layers[:, 1] < 1).any()) else ""
 
     def disagreement(self) -> str:
         numbers = sum(layer.phases * len(layer.features) for layer in self.plan)
-        if self.templates.ndim != 1 or len(self.templates) != numbers:
-            return f"templates {tuple(self.templates.shape)}; expected ({numbers},)"
-        if not self.templates.is_floating_point() or not self.templates.isfinite().all():
-            return "templates that are not finite floats"
-        if tuple(self.weights.shape) not in ((0,), (self.dimension,)):
-            return f"weights {tuple(self.weights.shape)}; expected ({self.dimension},) or none"
-        if not self.weights.is_floating_point() or not self.weights.isfinite().all():
-            return "weights that are not finite floats"
+        for name, sizes in (("templates", [numbers]), ("weights", [self.dimension, 0])):
+            values = getattr(self, name)
+            if values.ndim != 1 or len(values) not in sizes:
+                expected = " or ".join(f"({size},)" for size in sizes)
+                return f"{name} {tuple(values.shape)}; expected {expected}"
+            if not values.is_floating_point() or not values.isfinite().all():
+                return f"{name} that are not finite floats"
         return ""
 
     def extra_repr(self) -> str:
-        return (
-            f"places={self.places}, dimension={self.dimension}, layers={len(self.plan)}, "
-            f"template_numbers={self.templates.numel()}, metric={metric_name(self.metric)!r}, "
-            f"reduction={self.reduction!r}, temperature={self.temperature}"
-        )
+        sizes = f"places={self.places}, dimension={self.dimension}, layers={len(self.plan)}"
+        return f"{sizes}, template_numbers={self.templates.numel()}, {_repr(self)}"
 
 
 class TemplateMapper(Mapper):
@@ -472,7 +420,7 @@ class TemplateMapper(Mapper):
         trainable: make the templates nn.Parameters, to be fine-tuned, instead of buffers.
 
     Shape: features (N,D) -> TemplateMap of N places; one without layers, on which every place scores +inf,
-        where nothing repeats.
+        if nothing repeats.
 
     Convention: periods are exact numbers and get no gradient; the templates do, where gradients are enabled.
 
@@ -508,19 +456,21 @@ class TemplateMapper(Mapper):
 
     def forward(self, features: Tensor) -> TemplateMap:
         plan = self.periods.plan(features)
-        return self.map_of(plan, self.templates(features, plan), *features.shape).to(features.device)
+        return self._map(plan, self.templates(features, plan), *features.shape).to(features.device)
 
-    def map_of(self, plan: Plan, templates: Sequence[Tensor], places: int, dimension: int) -> TemplateMap:
-        """A map of these layers and templates with the mapper's settings."""
+    def empty(self) -> TemplateMap:
+        return self._map((), (), 0, 0)
+
+    def _map(self, plan: Plan, templates: Sequence[Tensor], places: int, dimension: int) -> TemplateMap:
         settings = self.metric, self.reduction, self.temperature
         route = TemplateMap(plan, templates, places, dimension, *settings)
         if self.trainable:
             route.trainable()
         return route
 
-    def empty(self) -> TemplateMap:
-        return self.map_of((), (), 0, 0)
-
     def extra_repr(self) -> str:
-        metric, reduction = metric_name(self.metric), self.reduction
-        return f"metric={metric!r}, reduction={reduction!r}, temperature={self.temperature}"
+        return _repr(self)
+
+
+def _repr(one: TemplateMap | TemplateMapper) -> str:
+    return f"metric={one.metric!r}, reduction={one.reduction!r}, temperature={one.temperature}"

@@ -35,7 +35,7 @@ def phase_mask(
         M(i, tau, k) = 1 where mod(i - k, tau) = 0.
 
     Raises:
-        InputError: a fractional period without `phases`, or a chunk that ends behind a number of frames.
+        InputError: a fractional period without `phases`, or a chunk that ends after a number of frames.
 
     Example:
         >>> phase_mask(5, 2)
@@ -45,16 +45,17 @@ def phase_mask(
     period = Fraction(period)
     if phases is None and period.denominator != 1:
         raise InputError(f"phase_mask got period {period} and no phases; expected phases for a fraction")
-    index = torch.arange(frames) if isinstance(frames, int) else frames
-    if isinstance(frames, int) and stop is not None and stop > frames:
-        raise InputError(f"phase_mask got the chunk [{start}, {stop}); expected it inside {frames} frames")
-    last = max(start, int(index.max()) if len(index) else 0) + 1
-    layer = FrequencyLayer(
-        period, period.numerator if phases is None else phases, start, last if stop is None else stop, (0,)
-    )
-    mask = torch.zeros(layer.phases, len(index), dtype=dtype, device=index.device)
-    inside = ((index >= layer.start) & (index < layer.stop)).to(mask.dtype)
-    return mask.scatter_(0, layer.phase(index)[None], inside[None])
+    if isinstance(frames, int):
+        if stop is not None and stop > frames:
+            raise InputError(
+                f"phase_mask got the chunk [{start}, {stop}); expected it inside {frames} frames"
+            )
+        frames = torch.arange(frames)
+    inside = frames >= start if stop is None else (frames >= start) & (frames < stop)
+    phases = period.numerator if phases is None else phases
+    layer = FrequencyLayer(period, phases, start, start + 1 if stop is None else stop, (0,))
+    mask = torch.zeros(phases, len(frames), dtype=dtype, device=frames.device)
+    return mask.scatter_(0, layer.phase(frames)[None], inside.to(mask.dtype)[None])
 
 
 class PhaseTemplates(nn.Module):
@@ -62,9 +63,8 @@ class PhaseTemplates(nn.Module):
 
     Shape: features (N,D), plan of L layers -> tuple of L tensors (P,F).
 
-    Convention: the mean runs over the layer's own chunk only. A phase that no frame of the chunk has gets 0;
-        no place of the chunk has that phase, so nothing reads it. Gradients reach the features; the plan is
-        exact numbers and gets none.
+    Convention: the mean runs over the layer's own chunk only. A phase that no frame of the chunk has gets 0,
+        which nothing reads. Gradients reach the features; the plan is exact numbers and gets none.
 
     Raises:
         InputError: a layer that reaches beyond the N frames or the D features.
@@ -78,25 +78,29 @@ class PhaseTemplates(nn.Module):
     def forward(self, features: Tensor, plan: Sequence[FrequencyLayer]) -> tuple[Tensor, ...]:
         if features.ndim != 2:
             raise InputError(f"the features are {tuple(features.shape)}; expected (N,D)")
-        frames, dimension = features.shape
-        for layer in plan:
-            if layer.stop > frames or layer.features[-1] >= dimension:
-                raise InputError(
-                    f"a layer covers [{layer.start}, {layer.stop}) and feature {layer.features[-1]}; "
-                    f"expected it inside {frames} frames of {dimension} features"
-                )
+        check_plan(plan, *features.shape)
         return tuple(_means(features, layer) for layer in plan)
 
 
+def check_plan(plan: Sequence[FrequencyLayer], places: int, dimension: int) -> None:
+    """Refuse, by an InputError, a layer that reaches beyond the places or the features."""
+    for layer in plan:
+        if layer.stop > places or layer.features[-1] >= dimension:
+            raise InputError(
+                f"a layer covers [{layer.start}, {layer.stop}) and feature {layer.features[-1]}; "
+                f"expected it inside {places} places of {dimension} features"
+            )
+
+
 def _means(features: Tensor, layer: FrequencyLayer) -> Tensor:
-    """Eq. 1 for one layer, a stretch of its chunk at a time: (N,D) -> (P,F)."""
+    """Eq. 1 for one layer, some frames of its chunk at a time: (N,D) -> (P,F)."""
     chosen = torch.tensor(layer.features, device=features.device)
     total = features.new_zeros(layer.phases, len(layer.features))
     count = features.new_zeros(layer.phases, 1)
-    for frames in torch.arange(layer.start, layer.stop, device=features.device).split(
-        max(1, MASK_NUMBERS // layer.phases)
-    ):
-        mask = phase_mask(frames, layer.period, layer.phases, dtype=features.dtype)
-        total = total + mask @ features[frames[0] : frames[-1] + 1].index_select(1, chosen)
+    at_once = max(1, MASK_NUMBERS // layer.phases)
+    frames = torch.arange(layer.start, layer.stop, device=features.device).split(at_once)
+    for some, values in zip(frames, features[layer.start : layer.stop].split(at_once), strict=True):
+        mask = phase_mask(some, layer.period, layer.phases, dtype=features.dtype)
+        total = total + mask @ values.index_select(1, chosen)
         count = count + mask.sum(1, keepdim=True)
     return total / count.clamp(min=1)

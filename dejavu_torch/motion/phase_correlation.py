@@ -8,35 +8,34 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from dejavu_torch.motion.ground_plane import FLOOR, check_pairs
+from dejavu_torch.motion.ground_plane import FLAT, check_pairs
 
-REACH = 0.42  # of the patch: beyond it the two have too little in common
-SIDEWAYS = 3  # pixels of sway to either side
-PEAKS = 4  # refined
-SURE = 0.4  # unrelated patches agree by 0.15 to 0.25, the same ground by 0.6 and more
-BAND = 0.1  # cycles/pixel: the far rows are interpolated, and the finest of what they show stays where it is
+REACH = 0.42  # largest shift, as a share of the patch
+SWAY = 3  # pixels to either side
+PEAKS = 4  # of the coarse scores, each refined
+MIN_CONFIDENCE = 0.4  # unrelated patches reach 0.15 to 0.25, the same ground 0.6 and more
+BAND = 0.1  # cycles/pixel: the far rows are interpolated, and their finest detail does not move
 
 
 def shift_between(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """How far the ground moved along the rows from one patch to another, each pair by itself.
+    """How far the ground moved along the rows from one patch to the next, each pair by itself.
 
-    Correlation of phases, each frequency weighted by its coherence over the columns: noise, and what motion
-    blurs away, weighs little. Coarse to fine: every peak at half the resolution is refined by windows that
-    move with the ground, and the one that agrees best wins.
+    Correlation of phases, each frequency weighted by its coherence over the columns, so that noise and what
+    motion blurs away weigh little. Every peak at half the resolution is refined by windows that move with
+    the ground, and the best one wins.
 
     Args:
         first, second: patches of ground, of any gain and offset of brightness.
 
     Shape: (B,1,h,w), (B,1,h,w) -> shift (B,) in pixels, rows of the patch; confidence (B,) in [0, 1].
 
-    Convention: shift > 0 is forward: the ground comes nearer, what is in row r of the first is in row
-        r + shift of the second. |shift| is at most about 0.42 h, sway at most 3 columns. The confidence is
-        the mean coherence of the two, each frequency counted by its coherence: 1 for the same picture, mostly
-        0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of 96 x 96), 0 for flat ones
-        and those that are not finite.
+    Convention: shift > 0 is forward: what is in row r of the first is in row r + shift of the second.
+        |shift| is at most about 0.42 h, sway at most 3 columns. The confidence is the mean coherence: 1 for
+        the same picture, mostly 0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of
+        96 x 96), 0 for patches that are flat or not finite.
 
     Raises:
-        InputError: patches that are not two equal (B,1,h,w), or smaller than 32 x 32.
+        InputError: patches that are not two equal (B,1,h,w) of at least 32 x 32.
 
     Example:
         >>> ground = torch.rand(1, 1, 80, 64)
@@ -44,31 +43,28 @@ def shift_between(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         >>> round(shift.item(), 1), confidence.item() > 0.9
         (7.0, True)
     """
-    shifts, sure = shift_peaks(first, second)
-    best = sure.argmax(1, keepdim=True)
-    return shifts.gather(1, best)[:, 0], sure.gather(1, best)[:, 0]
+    shifts, confidences = shift_peaks(first, second)
+    best = confidences.argmax(1, keepdim=True)
+    return shifts.gather(1, best)[:, 0], confidences.gather(1, best)[:, 0]
 
 
-def steady(shifts: Tensor, sure: Tensor, height: int) -> Tensor:
-    """Which peak of each pair, where the pairs follow one another in time.
+def viterbi_path(shifts: Tensor, confidences: Tensor, height: int) -> Tensor:
+    """Which peak of each pair, if the pairs follow one another in time.
 
-    Sleepers look the same a whole period further on. Of all paths through the peaks the one is taken that
-    has the highest sum of confidences, less the changes of the shift in patch heights, so that a little
-    texture in each pair adds up. Where it is far below the noise the path may still be off by whole periods.
-
-    Args:
-        shifts: pixels. sure: confidences. height: rows of the patch, pixels.
+    Sleepers look the same one period further on. The path through the peaks with the highest sum of
+    confidences less changes of the shift, in patch heights (`height`, pixels), resolves that.
 
     Shape: (n,K), (n,K) -> (n,) int64, on the CPU.
 
     Example:
-        >>> steady(torch.tensor([[9.0, 33.0]] * 3), torch.tensor([[0.9, 0.8], [0.8, 0.85], [0.9, 0.8]]), 96)
+        >>> shifts = torch.tensor([[9.0, 33.0]] * 3)
+        >>> viterbi_path(shifts, torch.tensor([[0.9, 0.8], [0.8, 0.85], [0.9, 0.8]]), 96)
         tensor([0, 0, 0])
     """
-    shifts, sure = shifts.double().cpu(), sure.double().cpu()
+    shifts, confidences = shifts.double().cpu(), confidences.double().cpu()
     change = (shifts[1:, :, None] - shifts[:-1, None]).abs() / height
-    best, origins = sure[:1].sum(0), []
-    for cost, gain in zip(change, sure[1:], strict=True):
+    best, origins = confidences[:1].sum(0), []
+    for cost, gain in zip(change, confidences[1:], strict=True):
         total, origin = (best - cost).max(1)
         best = total + gain
         origins.append(origin)
@@ -91,22 +87,22 @@ def shift_peaks(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     reach = int(REACH * (height // 2))
     lags = torch.arange(-reach, reach + 1.0).to(first)
     one, other = (avg_pool2d(patch, 2)[:, 0] for patch in (first, second))
-    score = _agreement(one, other, first.new_zeros(count), lags, SIDEWAYS // 2 + 1, 2 * BAND)
-    around = pad(score, (1, 1), value=-1)
-    peak = (score >= around[:, :-2]) & (score > around[:, 2:])
+    score = _coherence(one, other, first.new_zeros(count), lags, SWAY // 2 + 1, 2 * BAND)
+    padded = pad(score, (1, 1), value=-1)
+    peak = (score >= padded[:, :-2]) & (score > padded[:, 2:])
     shift = 2 * lags[score.masked_fill(~peak, -1).topk(PEAKS).indices].flatten()
     # fine: the neighbourhood of each peak
     one, other = (patch[:, 0].repeat_interleave(PEAKS, 0) for patch in (first, second))
     for span, step in ((4.0, 0.5), (1.0, 0.25)):
-        near = torch.arange(-span, span + step / 2, step).to(first)
-        score = _agreement(one, other, shift, near, SIDEWAYS, BAND)
+        lags = torch.arange(-span, span + step / 2, step).to(first)
+        score = _coherence(one, other, shift, lags, SWAY, BAND)
         best, at = score.max(1)
-        shift = shift + near[at] + step * _vertex(score, at)
+        shift = shift + lags[at] + step * _vertex(score, at)
     return shift.view(count, PEAKS), best.view(count, PEAKS).nan_to_num(0).clamp(0, 1)
 
 
-def _agreement(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway: int, band: float) -> Tensor:
-    """How well the frequencies agree on a shift of guess + lag, the best of any sway within +-sway columns.
+def _coherence(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway: int, band: float) -> Tensor:
+    """Mean coherence at the shifts guess + lag, the best over sways of up to `sway` columns.
 
     Args:
         band: standard deviation of a Gaussian over the frequencies, cycles/pixel.
@@ -115,41 +111,36 @@ def _agreement(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway:
     """
     height, width = first.shape[1:]
     row = torch.arange(height).to(first)
-    common = (height - guess.abs())[:, None]  # rows of ground that both show
+    common = (height - guess.abs())[:, None]  # rows of ground in both
     start = (-guess).clamp(min=0)[:, None]
     spectra = []
     for patch, moved in ((first, 0.0), (second, guess[:, None])):  # the window moves with the ground
         at = (row - start - moved + 0.5) / common
         window = torch.where((at > 0) & (at < 1), (math.pi * at).sin(), 0.0)[..., None]
         mean = (patch * window).sum(1, keepdim=True) / window.sum(1, keepdim=True)
-        spectra.append(
-            torch.fft.rfft((patch - mean) * window, dim=1)[:, 1:]
-        )  # rails look the same wherever they are
+        # without frequency 0: rails look the same wherever they are
+        spectra.append(torch.fft.rfft((patch - mean) * window, dim=1)[:, 1:])
     frequency = torch.arange(1, height // 2 + 1).to(first) / height
-    low = (-0.5 * (frequency / band) ** 2).exp()
-    back, wave = (_turn(frequency[:, None] * by) for by in (guess, lags))
+    low_pass = (-0.5 * (frequency / band) ** 2).exp()
+    turns = (2 * math.pi * (frequency[:, None] * by) for by in (guess, lags))
+    back, wave = (torch.polar(torch.ones_like(turn), turn) for turn in turns)
     columns = width - 2 * sway
-    floor = FLOOR * common * columns
+    floor = FLAT * common * columns
     middle = spectra[0][..., sway : sway + columns]
     power = middle.abs().square().sum(2) + floor
     scores = []
     for side in range(2 * sway + 1):
         other = spectra[1][..., side : side + columns]
-        both = (power * (other.abs().square().sum(2) + floor)).sqrt()
-        coherence = (middle.conj() * other).sum(2) / both * back.T
-        weight = coherence.abs() * low
+        norm = (power * (other.abs().square().sum(2) + floor)).sqrt()
+        coherence = (middle.conj() * other).sum(2) / norm * back.T
+        weight = coherence.abs() * low_pass
         scores.append(((coherence * weight) @ wave).real / weight.sum(1, keepdim=True).clamp(min=1e-9))
     return torch.stack(scores).amax(0)
 
 
-def _turn(cycles: Tensor) -> Tensor:
-    return torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)
-
-
 def _vertex(score: Tensor, at: Tensor) -> Tensor:
-    """Where between the samples a parabola through the best one and its neighbours has its top, in steps."""
+    """Offset, in samples, of the top of a parabola through the best sample and its neighbours."""
     inside = at.clamp(1, score.shape[1] - 2)
     left, mid, right = (score.gather(1, (inside + k)[:, None])[:, 0] for k in (-1, 0, 1))
     curve = (2 * mid - left - right).clamp(min=1e-9)
-    offset = (0.5 * (right - left) / curve).clamp(-1, 1)
-    return torch.where(inside == at, offset, 0.0)
+    return torch.where(inside == at, (0.5 * (right - left) / curve).clamp(-1, 1), 0.0)

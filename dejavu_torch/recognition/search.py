@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Iterable
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.maps.coefficients import Coefficients
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.spectral import SpectralMap
 from dejavu_torch.recognition.candidates import Candidates
 from dejavu_torch.types import InputError
 
@@ -141,79 +139,6 @@ def scan(route: PlaceMap, queries: Tensor, n: int) -> Best:
     return found
 
 
-class Bound:
-    """Below which no score of a chunk can be, without scoring its places.
-
-    The low lines alone give samples of every descriptor, one for each `COARSE` places. A place differs from
-    the nearest sample by its residual, whose product with a query is at most the product of their lengths. So
-    a chunk's largest product with a sample, and the query's length times the chunk's largest residual, are
-    together more than any product with a place; the metric makes a score of it by the shortest or the longest
-    descriptor of the chunk.
-
-    Args:
-        route: a spectral map.
-
-    Shape: queries (Q,K) -> (Q,G), for each chunk.
-    """
-
-    def __init__(self, route: SpectralMap) -> None:
-        self.metric = route.metric
-        self.low = _low_lines(route)
-        # one small tensor for each chunk, made beside large ones that go, would leave the heap full of holes
-        self.residual, self.least, self.most = (route.steps.new_empty(len(route.chunks)) for _ in range(3))
-        self.silent = torch.zeros_like(self.residual, dtype=torch.bool)
-        for g, (start, stop) in enumerate(route.chunks):
-            samples = self.low.rebuilt(g)
-            nearest = _nearest_sample(stop - start, len(samples), route.transform)
-            norms = route.norms[start:stop]
-            heard = norms > route.audible
-            away = route.rebuilt(g) - samples[nearest.to(samples.device)]
-            self.residual[g] = torch.linalg.vector_norm(away, dim=1).max()
-            self.least[g] = torch.where(heard, norms, math.inf).min()
-            self.most[g] = norms.max()
-            self.silent[g] = ~heard.all()
-
-    def __call__(self, queries: Tensor) -> Tensor:
-        length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
-        if self.metric == "cosine":
-            queries = queries / torch.where(length > 0, length, 1)
-            length = (length > 0).to(length)
-        products = torch.cat([part.amax(2) for part in self.low.product_blocks(queries)], 1)
-        products += length * self.residual
-        if self.metric == "l2":
-            square = length.square()
-            least = torch.where(self.silent, 0, self.least)
-            return square - 2 * products + least.square() - SLACK * (square + self.most.square())
-        products = torch.where(self.silent, products.clamp(min=0), products)  # a silent place scores 1
-        return 1 - products / torch.where(products < 0, self.most, self.least) - SLACK
-
-
-def _low_lines(route: SpectralMap) -> SpectralMap:
-    """Samples of the descriptors by the low lines alone: a map of as many chunks, `COARSE` times shorter."""
-    parts, lengths, steps = [], [], []
-    for g, (start, stop) in enumerate(route.chunks):
-        count = max(1, (stop - start) // COARSE)
-        lines = max(1, count - (route.transform == "dft" and count % 2 == 0))  # a cosine without its sine
-        counts = route.counts[start:stop][:count].clone()
-        counts[lines:] = 0
-        first = route.bounds[g]
-        last = first + int(counts.sum())
-        parts.append(Coefficients(counts, route.feature[first:last], route.level[first:last]))
-        lengths.append(count)
-        steps.append(route.steps[g] * math.sqrt(count / (stop - start)))
-    coefficients = Coefficients(*(torch.cat(column) for column in zip(*parts, strict=True)))
-    sizes = torch.tensor(lengths, device=route.lengths.device)
-    return SpectralMap(coefficients, sizes, torch.stack(steps), route.mean, "l2", route.transform)
-
-
-def _nearest_sample(places: int, samples: int, transform: str) -> Tensor:
-    """Of each place of a chunk, (W,) int64; a cosine transform's samples lie half a step off its ends."""
-    place = torch.arange(places, dtype=torch.float64)
-    if transform == "dct":
-        return ((place + 0.5) * samples / places).long().clamp(max=samples - 1)
-    return (place * samples / places).round().long() % samples
-
-
 class Searched(NamedTuple):
     """How queries were searched for.
 
@@ -261,12 +186,6 @@ class Searcher:
     Raises:
         InputError: an unknown method, or one that the map does not have; "ivf" without faiss.
 
-    Example:
-        >>> wave = torch.sin(torch.arange(500.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
-        >>> from dejavu_torch import SpectralMapper
-        >>> searcher = Searcher(SpectralMapper(chunk=100)(wave), "bound")
-        >>> searcher(wave[20:22], 1).index.tolist(), searcher.told.chunks
-        ([[20], [21]], 5)
     """
 
     def __init__(
@@ -280,10 +199,7 @@ class Searcher:
         check_search(method, route)
         self.route, self.asked, self.sample, self.sizes = route, method, sample, (lists, probes)
         self._made = [*route.buffers()]
-        self._bound: Bound | None = None
-        self._index: Any = None
-        chunks = len(route.chunks) if isinstance(route, SpectralMap) else 0
-        self.told = Searched(method, chunks=chunks)
+        self.told = Searched(method)
 
     def fits(self, route: PlaceMap, method: Search) -> bool:
         """Whether it is for this map as it is now, and this method."""
@@ -303,144 +219,12 @@ class Searcher:
         n = min(n, self.route.places)
         if not len(queries):
             return none_yet(queries, n)
-        if self.told.method == "auto":
-            self.told = self.told._replace(method=self._chosen(queries))
         method, before = self.told.method, self.told.queries
         self.told = self.told._replace(queries=before + len(queries))
-        if method == "bound":
-            return self._by_bound(queries, n)
-        if method == "ivf":
-            found = self._by_lists(queries, n)
-            self._check(queries, found)
-            return found
         own = self.route.lowest(queries) if n == 1 else None
         if own is not None:
             return Best(own[0][:, None], own[1][:, None])
         return scan(self.route, queries, n)
-
-    def _chosen(self, queries: Tensor) -> Search:
-        """Bounds where they spare enough of some chunks for some queries; they are the same either way."""
-        route = self.route
-        if not isinstance(route, SpectralMap) or route.chunk == "route":
-            return "scan"
-        if route.places * route.dimension < WORTH_BOUNDS:
-            return "scan"
-        some = part_of(route, TRIAL_CHUNKS)
-        trial = Searcher(some, "bound")
-        trial(queries[:TRIAL_QUERIES], 1)
-        return "bound" if (trial.told.pruned or 0) >= SPARED else "scan"
-
-    def _by_bound(self, queries: Tensor, n: int) -> Best:
-        route = self.route
-        assert isinstance(route, SpectralMap)
-        if self._bound is None:
-            self._bound = Bound(route)
-        parts, spared = [], 0.0
-        for some in queries.split(max(1, SCORES_AT_ONCE // max(1, route.block_places, len(route.chunks)))):
-            best, visits = _visited(route, self._bound(some), some, n)
-            parts.append(best)
-            spared += len(some) - visits / max(1, len(route.chunks))
-        done = self.told.queries
-        before = (self.told.pruned or 0) * (done - len(queries))
-        self.told = self.told._replace(pruned=(before + spared) / max(1, done))
-        return _joined(parts)
-
-    def _by_lists(self, queries: Tensor, n: int) -> Best:
-        route = self.route
-        assert isinstance(route, SpectralMap)
-        if self._index is None:
-            self._index = inverted_lists(route, *self.sizes)
-        _faiss().omp_set_num_threads(torch.get_num_threads())
-        wanted = queries.float()
-        if route.metric == "cosine":
-            wanted = torch.nn.functional.normalize(wanted)
-        # products with the rebuilt descriptors themselves: the scores are those of the map
-        found, index = map(torch.from_numpy, self._index.search(wanted.cpu().numpy(), n))
-        score = (1 - found if route.metric == "cosine" else found).masked_fill(index < 0, math.inf)
-        return merged(none_yet(queries.cpu().float(), n), Best(score, index))
-
-    def _check(self, queries: Tensor, found: Best) -> None:
-        """Compare with a scan until there is a sample."""
-        count = min(self.sample - self.told.sampled, math.ceil(len(queries) * CHECKED))
-        if count > 0:
-            some = torch.arange(count) * len(queries) // count
-            exact = scan(self.route, queries[some.to(queries.device)], 1)
-            right = exact.index.cpu() == found.index[some, :1]
-            sampled = self.told.sampled + count
-            hits = (self.told.recall or 0) * self.told.sampled + float(right.sum())
-            self.told = self.told._replace(recall=hits / sampled, sampled=sampled)
-
-
-def _visited(route: SpectralMap, lower: Tensor, queries: Tensor, n: int) -> tuple[Best, int]:
-    """The n best, from the chunks that may hold them by (Q,G) bounds, and how many were scored for a query.
-
-    The best chunk of each query comes first, then the others, that of the lowest bound of any query first.
-    """
-    rebuild, best, visits = route.rebuilds(len(queries)), none_yet(queries, n), 0
-    first = lower.argmin(1)
-    order = lower.amin(0).argsort().tolist()
-    seen = torch.zeros_like(lower, dtype=torch.bool)
-    for once in (True, False):
-        if once:
-            wanted = torch.nn.functional.one_hot(first, lower.shape[1]).bool()
-        else:
-            wanted = (lower <= best.score[:, -1:]) & ~seen
-        some = wanted.any(0).tolist()
-        for g in (g for g in order if some[g]):
-            (rows,) = (wanted[:, g] & (lower[:, g] <= best.score[:, -1])).nonzero(as_tuple=True)
-            if not len(rows):
-                continue
-            start, stop = route.chunks[g]
-            for begins, scores in route.score_blocks(queries[rows], start, stop, rebuild):
-                best = improved(best, scores, begins, rows)
-            seen[rows, g] = True
-            visits += len(rows)
-    return best, visits
-
-
-def part_of(route: SpectralMap, chunks: int) -> SpectralMap:
-    """The map of so many of its chunks, spread over the route; all of them where there are no more."""
-    count = len(route.chunks)
-    some = [g * count // min(chunks, count) for g in range(min(chunks, count))]
-    parts = [route.coefficients(range(g, g + 1)) for g in some]
-    return SpectralMap(
-        Coefficients(*(torch.cat(column) for column in zip(*parts, strict=True))),
-        route.lengths[some],
-        route.steps[some],
-        route.mean,
-        route.metric,
-        route.transform,
-        route.chunk,
-    )
-
-
-def inverted_lists(route: SpectralMap, lists: int | None = None, probes: int | None = None) -> Any:
-    """A faiss index of the rebuilt descriptors of a map, see `Searcher`; of cosine, scaled to length 1."""
-    faiss = _faiss()
-    faiss.omp_set_num_threads(torch.get_num_threads())
-    places, cosine = route.places, route.metric == "cosine"
-    most = max(1, places // TRAINED_PER_LIST)
-    lists = min(most, math.ceil(LISTS_PER_ROOT * math.sqrt(places))) if lists is None else lists
-    probes = min(lists, max(PROBED_AT_LEAST, math.ceil(lists * PROBED))) if probes is None else probes
-    if not 1 <= lists <= places or not 1 <= probes <= lists:
-        raise InputError(
-            f"{lists} lists and {probes} probes on {places} places; expected at most as many lists as "
-            "places, and as many probes as lists, at least one"
-        )
-    kind = faiss.METRIC_INNER_PRODUCT if cosine else faiss.METRIC_L2
-    index = faiss.index_factory(route.dimension, f"IVF{lists},Flat", kind)
-    index.nprobe = probes
-    every = max(1, places // (lists * TRAINED_PER_LIST))
-
-    def rebuilt(g: int) -> Tensor:
-        start, stop = route.chunks[g]
-        scale = route.per_norm(start, stop)[:, None] if cosine else 1
-        return (route.rebuilt(g) * scale).float().cpu().contiguous()
-
-    index.train(torch.cat([rebuilt(g)[::every] for g in range(len(route.chunks))]).numpy())
-    for g in range(len(route.chunks)):
-        index.add(rebuilt(g).numpy())
-    return index
 
 
 def check_search(method: str, route: PlaceMap | None = None) -> None:
@@ -451,17 +235,6 @@ def check_search(method: str, route: PlaceMap | None = None) -> None:
     """
     if method not in get_args(Search):
         raise InputError(f"search {method!r}; expected one of {', '.join(get_args(Search))}")
-    if route is None or method in ("auto", "scan"):
-        return
-    if not isinstance(route, SpectralMap):
-        raise InputError(f"search {method!r} on a map of kind {route.kind!r}; expected auto or scan")
-    if method == "bound" and route.chunk == "route":
-        raise InputError(
-            "search 'bound' on a map of one chunk, the route, of which it passes over none; expected auto or "
-            "scan, or a map learned with a chunk of so many places"
-        )
-    if method == "ivf":
-        _faiss()
 
 
 def check_scanned(method: Search) -> None:
@@ -474,16 +247,6 @@ def check_scanned(method: Search) -> None:
         raise InputError(
             f"search {method!r} of queries together, which takes all scores; expected auto or scan"
         )
-
-
-def _faiss() -> Any:
-    try:
-        import faiss
-    except ImportError as error:
-        raise InputError(
-            f"search 'ivf' needs faiss ({error}); expected it to be there: pip install 'dejavu_torch[bench]'"
-        ) from error
-    return faiss
 
 
 def _joined(parts: Iterable[Best]) -> Best:

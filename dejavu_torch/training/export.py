@@ -9,6 +9,7 @@ from typing import Any
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
+from dejavu_torch import growth
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.curves import Scores
@@ -134,7 +135,7 @@ def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
     if validated and len(frames.frame_shape) == 3:
         frames = fitted(frames, model.frame_shape or ())
     try:
-        model.calibrate_if_possible(data.reference, Views(frames, truth.positives[:, 0]))
+        growth.calibrate_if_possible(model, data.reference, Views(frames, truth.positives[:, 0]))
     except InputError as error:
         log.warning("the map is not calibrated: %s", error)
 

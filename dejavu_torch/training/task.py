@@ -513,7 +513,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             frames = batch.frames if self.trainer.testing else self.data.validated(batch)
             with torch.autocast(self.device.type, enabled=False):
                 match = best_match(self(frames))
-            index = self.data.apart(self.map.scored(match.index))
+            index = self.data.apart(self.map.table.scored(match.index))
             truth = batch.truth._replace(positives=self.data.apart(batch.truth.positives))
             self.metric.update(match._replace(index=index), truth)
 

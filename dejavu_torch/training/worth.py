@@ -70,5 +70,5 @@ def better(scores: Mapping[str, Scores]) -> list[str]:
 
 
 def _match(model: DejaVu, query: Traverse) -> Match:
-    found = model.found(model.extract_all(query), SINGLE).moved(model.map.scored)
+    found = model.found(model.extract_all(query), SINGLE).moved(model.map.table.scored)
     return Match(*(None if part is None else part.cpu() for part in found.match()))

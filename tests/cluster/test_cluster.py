@@ -17,13 +17,14 @@ import numpy as np
 import pytest
 import torch
 from command_line import fails, frames, run, write_images
+from dejavu_torch.cluster.learning import code_on
+from dejavu_torch.cluster.searching import ClusterSearcher, _map_of, _parts
+from dejavu_torch.cluster.session import Cluster
+from dejavu_torch.streaming.work import WorkFolder
 from helpers import Fixed, Stream, refused, template_model
 from torch import Tensor, nn
 
 from dejavu_torch.cluster import session
-from dejavu_torch.cluster.learning import code_on
-from dejavu_torch.cluster.searching import ClusterSearcher, _map_of, _parts
-from dejavu_torch.cluster.session import Cluster
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.views import Views
@@ -32,7 +33,6 @@ from dejavu_torch.maps import spectral
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
-from dejavu_torch.streaming.work import WorkFolder
 from dejavu_torch.types import FrequencyLayer, Traverse
 
 CHUNK, PLACES = 50, 620

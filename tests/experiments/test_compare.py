@@ -104,12 +104,6 @@ def test_refuses_a_negative_tolerance(model: DejaVu) -> None:
         compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=-1)
 
 
-def test_a_callable_metric() -> None:
-    model = template_model(periods=SpectrogramAnalysis(window=240), metric=torch.cdist)
-    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model)
-    assert result.report.as_json()["recall_at_1"] > 0
-
-
 def test_a_truth_without_any_right_answer_is_refused(model: DejaVu) -> None:
     with pytest.raises(InputError, match="no query has a right answer"):
         compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "1000", model)

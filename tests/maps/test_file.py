@@ -628,9 +628,9 @@ def test_what_could_not_be_read_is_not_written(path: Path) -> None:
 
 def test_an_argument_newer_than_the_file_has_its_default(saved: Path) -> None:
     recipe = contents(saved)[1]["header"]["features"]
-    older = {name: value for name, value in recipe["init_args"].items() if name != "gradient"}
+    older = {name: value for name, value in recipe["init_args"].items() if name != "bins"}
     craft(saved, features=recipe | {"init_args": older})
-    assert DejaVu.load(saved).features.gradient == "central"
+    assert DejaVu.load(saved).features.bins == "hard"
 
 
 def test_a_header_nested_without_end_is_refused(path: Path, whole_maps: list[Path]) -> None:

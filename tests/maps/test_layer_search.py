@@ -12,8 +12,8 @@ from helpers import Fixed, template_model
 from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
-from dejavu_torch.maps import layer_search
-from dejavu_torch.maps.layer_search import LayerSearch, sliding_minimum
+from dejavu_torch.maps import layer_search, template_map
+from dejavu_torch.maps.layer_search import _circles, lowest, sliding_minimum
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
 
@@ -49,16 +49,24 @@ def random_map(draw: random.Random, generator: torch.Generator) -> TemplateMap:
     return TemplateMap(tuple(plan), blocks, place + draw.choice([0, 0, 5]), 3, metric, reduction)
 
 
+@pytest.fixture
+def always(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Maps of any size are searched."""
+    monkeypatch.setattr(template_map, "PHASE_COST", 1)
+    monkeypatch.setattr(template_map, "SEARCH_COST", -(10**9))
+
+
 def check(route: TemplateMap, queries: Tensor) -> tuple[int, int]:
-    search, rows = LayerSearch(route), route.distances(queries)
-    score, place = search.lowest(rows)
-    expected = best_match(route.combine(rows))
-    assert torch.equal(score, expected.score)
-    assert torch.equal(place, expected.index)
-    return len(search.pairs), len(search.scanned)
+    found = route.lowest(queries)
+    assert found is not None
+    expected = best_match(route.scores(queries))
+    assert torch.equal(found[0], expected.score)
+    assert torch.equal(found[1], expected.index)
+    searched = sum(segment.searched for segment in route.segments)
+    return searched, len(route.segments) - searched
 
 
-@patch.multiple(layer_search, LOOK_UP=1, FIXED=0)
+@pytest.mark.usefixtures("always")
 @pytest.mark.parametrize("seed", range(4))
 def test_equals_the_scan_in_random_cases(seed: int) -> None:
     draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
@@ -71,6 +79,7 @@ def test_equals_the_scan_in_random_cases(seed: int) -> None:
     assert min(pairs, scanned) > 200
 
 
+@pytest.mark.usefixtures("always")
 @pytest.mark.parametrize("periods", [(210, 286), (286, 210), (200, 200), (64, 256), (199, 201), (1, 300)])
 @pytest.mark.parametrize("places", [5000, 30_030, 60_000])
 def test_equals_the_scan_below_and_above_the_common_period(periods: tuple[int, int], places: int) -> None:
@@ -87,7 +96,10 @@ def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan(value: floa
     rows = route.distances(torch.rand(3, 2, generator=generator))
     rows[0][0, 5], rows[1][1] = value, value
     expected = best_match(route.combine(rows))
-    score, place = LayerSearch(route).lowest(rows)
+    with patch.object(TemplateMap, "distances", return_value=rows):
+        found = route.lowest(torch.rand(3, 2))
+    assert found is not None
+    score, place = found
     assert torch.equal(place, expected.index)
     assert torch.equal(score.nan_to_num(-1, -2), expected.score.nan_to_num(-1, -2))
     assert place[1] == -1
@@ -124,27 +136,25 @@ def test_a_map_it_is_not_worth_for_has_no_such_way() -> None:
     assert TemplateMap(LONG, blocks, 60_000, 2).lowest(queries) is not None
 
 
-def test_many_queries_are_searched_a_few_at_a_time() -> None:
-    route = TemplateMap(LONG, [torch.rand(layer.phases, 1) for layer in LONG], 60_000, 2)
-    queries = torch.rand(9, 2)
-    whole = route.lowest(queries)
-    with patch.object(layer_search, "AT_ONCE", 2 * (210 + 286)):
-        route.loaded()
-        parts = route.lowest(queries)
-    assert whole is not None
-    assert parts is not None
-    assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
-
-
 def test_a_map_of_ten_million_places_holds_its_templates_alone() -> None:
     plan = tuple(FrequencyLayer(Fraction(p), p, 0, 10**7, (j,)) for j, p in enumerate((3163, 3164)))
     route = TemplateMap(plan, [torch.rand(layer.phases, 1) for layer in plan], 10**7, 2)
     assert route.lowest(torch.rand(1, 2)) is not None
     assert route.summary().covered == 10**7
-    search = route._search
-    assert search is not None
-    held = [*route.buffers(), search.places, *(part for pair in search.pairs for part in pair[-2:])]
+    held = [*route.buffers(), *_circles(3164, 3163, route.layers.device)]
     assert sum(tensor.nbytes for tensor in held) < 300_000
+
+
+@pytest.mark.parametrize("taus", [(3, 4), (4, 3), (6, 4), (5, 5), (7, 1)])
+def test_two_rows_are_searched_beyond_their_common_period(taus: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(sum(taus))
+    one, other = (torch.randint(0, 5, (6, tau), generator=generator).float() for tau in taus)
+    for places in (max(taus), 11, 30):
+        i = torch.arange(places)
+        sums = (one[:, i % taus[0]] + other[:, i % taus[1]]) / 3
+        score, place = lowest(one, other, places, 3)
+        assert torch.equal(score, sums.amin(1))
+        assert torch.equal(place, sums.min(1).indices)
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 12])

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 import torch
 from helpers import refused
-from hypothesis import given
-from hypothesis import strategies as st
-from test_spectral import held, route
+from test_spectral import held, levels_of, route
 from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.maps import quantisation
-from dejavu_torch.maps.quantisation import CLOSE, HALVINGS, RouteLines, _close_step
+from dejavu_torch.maps.quantisation import RouteLines
 from dejavu_torch.maps.spectral import SpectralMapper
 
 SETTINGS: list[dict[str, Any]] = [
@@ -33,9 +31,7 @@ SETTINGS: list[dict[str, Any]] = [
 @pytest.fixture
 def in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every route is a long one; its lines are in a file."""
-    monkeypatch.setattr(quantisation, "AT_ONCE", 0)
     monkeypatch.setattr(quantisation, "BLOCK", 1000)
-    monkeypatch.setattr(quantisation, "COLUMNS", 5000)
     monkeypatch.setattr(quantisation, "empty", lambda *size: memory.empty(*size, in_memory=0))
 
 
@@ -47,9 +43,9 @@ def test_in_blocks_a_map_of_a_step_holds_the_same(
     whole = SpectralMapper(None, step=0.1, **settings)(descriptors)
     request.getfixturevalue("in_blocks")
     parts = SpectralMapper(None, step=0.1, **settings)(descriptors)
-    assert torch.equal(parts.mean, whole.mean)
-    differ = (parts.levels != whole.levels).sum()  # sums of floats in another order
-    assert differ <= 1e-3 * (whole.levels != 0).sum()
+    assert torch.equal(parts.means, whole.means)
+    differ = (levels_of(parts) != levels_of(whole)).sum()  # sums of floats in another order
+    assert differ <= 1e-3 * (levels_of(whole) != 0).sum()
     assert torch.allclose(held(parts), held(whole), atol=0.02)
 
 
@@ -70,7 +66,7 @@ def test_descriptors_may_be_halves_in_a_file(tmp_path: Path) -> None:
     descriptors.numpy().tofile(tmp_path / "d")
     mapped = torch.from_numpy(np.memmap(tmp_path / "d", np.float16, "c", shape=(900, 24)))
     learned, own = SpectralMapper(3.0)(mapped), SpectralMapper(3.0)(descriptors.float())
-    assert torch.equal(learned.levels, own.levels)
+    assert torch.equal(levels_of(learned), levels_of(own))
     assert torch.equal(learned.steps, own.steps)
 
 
@@ -95,28 +91,8 @@ def test_lines_and_their_scale_are_those_of_each_chunk() -> None:
     centred = descriptors - lines.mean.float()
     assert torch.allclose(lines.lines[200:].square().sum(), centred[200:].square().sum())
     assert math.isclose(lines.scale, float(centred.square().mean().sqrt()), rel_tol=1e-5)
-    fine, coarse = lines.steps
-    assert lines.held(fine) > 0.999
-    assert not any(small.any() for small, _ in lines.levels(coarse))
-
-
-@given(st.floats(0.2, 3), st.floats(1e-3, 0.9), st.floats(0, 5))
-def test_a_close_step_is_found_in_few_tries(power: float, share: float, end: float) -> None:
-    """Of costs that fall by a power, and to nothing at the end, as those of lines do."""
-    tried = []
-
-    def cost(step: float) -> int:
-        tried.append(step)
-        return round(1e9 * max(0.0, step**-power - 100**-power) ** (1 + end / 5))
-
-    room = share * cost(1)
-    step = _close_step(cost, room, 1, 100)
-    assert CLOSE * room <= cost(step) <= room
-    assert len(tried) < 2 * HALVINGS
-
-
-def test_no_step_is_finer_than_the_finest() -> None:
-    assert _close_step(lambda step: round(1e6 / step), 2e6, 1, 100) == 1
+    assert lines.held(lines.scale / 64) > 0.999
+    assert not any(small.any() for small, _ in lines.levels(lines.coarsest))
 
 
 class TestRoomInAFile:

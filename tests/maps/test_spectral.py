@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +17,10 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.maps import spectral_map
 from dejavu_torch.maps.quantisation import dead_zone, quantise
-from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer, InputError
 
@@ -28,12 +33,33 @@ def route(places: int = 400, numbers: int = 12, seed: int = 0) -> Tensor:
 
 
 def held(learned: SpectralMap) -> Tensor:
-    return torch.cat([learned.rebuilt(g) for g in range(len(learned.chunks))])
+    return torch.cat([learned.decode(g) for g in range(len(learned.chunks))])
 
 
-def forced(learned: SpectralMap, rebuild: bool) -> SpectralMap:
-    learned.rebuilds = lambda queries: rebuild  # type: ignore[method-assign]
-    return learned
+def levels_of(learned: SpectralMap) -> Tensor:
+    """(N,K), all levels, zeros too."""
+    levels = torch.zeros(learned.places, learned.dimension, dtype=torch.int64)
+    for g, (start, stop) in enumerate(learned.chunks):
+        line, feature, value = learned.lines(g)
+        whole = levels[start:stop]
+        whole[line, feature] = (value / learned.steps[g]).round().long()
+    return levels
+
+
+def grow(learned: SpectralMap, descriptors: Tensor) -> None:
+    coding = learned.means[-1], learned.step, learned.transform, learned.resolution
+    learned.extend(code_chunk(part, *coding) for part in descriptors.split(learned.chunk))
+
+
+def copied(learned: SpectralMap, empty: SpectralMap) -> SpectralMap:
+    empty.load_packed(learned.packed(), learned.get_extra_state())
+    return empty
+
+
+@pytest.fixture(params=[True, False], ids=["csr", "scatter"])
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Products of queries with lines by either way."""
+    monkeypatch.setattr(spectral_map, "_has_csr", lambda: request.param)
 
 
 SETTINGS: list[dict[str, Any]] = [
@@ -46,10 +72,10 @@ SETTINGS: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
-@pytest.mark.parametrize("rebuild", [False, True])
-def test_scores_are_those_of_the_rebuilt_descriptors(settings: dict[str, Any], rebuild: bool) -> None:
+@pytest.mark.usefixtures("way")
+def test_scores_are_those_of_the_decoded_descriptors(settings: dict[str, Any]) -> None:
     descriptors = route(403)
-    learned = forced(SpectralMapper(**settings)(descriptors), rebuild)
+    learned = SpectralMapper(**settings)(descriptors)
     queries = descriptors[::7] + 0.1 * torch.randn(58, 12)
     own = held(learned)
     if settings.get("metric") == "l2":
@@ -61,9 +87,9 @@ def test_scores_are_those_of_the_rebuilt_descriptors(settings: dict[str, Any], r
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
-@pytest.mark.parametrize("rebuild", [False, True])
-def test_gradients_reach_the_queries(settings: dict[str, Any], rebuild: bool) -> None:
-    learned = forced(SpectralMapper(**settings)(route(170, 4)), rebuild).double()
+@pytest.mark.usefixtures("way")
+def test_gradients_reach_the_queries(settings: dict[str, Any]) -> None:
+    learned = SpectralMapper(**settings)(route(170, 4)).double()
     queries = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(learned.scores, queries, atol=1e-6)
 
@@ -75,7 +101,7 @@ def test_a_route_of_a_period_is_found() -> None:
 
 
 @pytest.mark.parametrize("budget", [0.8, 2.5, 5.0, 9.0])
-@pytest.mark.parametrize("chunk", ["route", 500])
+@pytest.mark.parametrize("chunk", [10_000, 500])
 def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_path: Path) -> None:
     descriptors = route(2000, 24)
     model = DejaVu(mapper=SpectralMapper(budget, chunk=chunk)).learn(descriptors)
@@ -131,7 +157,7 @@ def test_positions_leave_the_lines_half_of_what_mean_and_chunks_leave(
     """Of 5 bytes per place the chunks take over 2: with positions of 2 more next to nothing would fit."""
     mapper, features = SpectralMapper(5.0, chunk=12), route(400, 24)
     alone = mapper(features).summary()
-    beside = mapper.beside(800)(features).summary()
+    beside = mapper.with_overhead(800)(features).summary()
     assert "come on top" in caplog.messages[-1]
     assert beside.lines == alone.lines > 0
 
@@ -143,7 +169,7 @@ def test_the_budget_is_met_where_levels_are_nearly_all_different(numbers: int, s
     budget = numbers * share + 0.4
     for noise in (torch.randn(200, numbers), torch.randn(200, numbers) / torch.rand(200, numbers)):
         learned = SpectralMapper(budget)(noise)
-        finest = float(learned.steps) < 0.02 * float(learned.rebuilt(0).std())  # no finer step is tried
+        finest = float(learned.steps) < 0.02 * float(learned.decode(0).std())  # no finer step is tried
         assert learned.summary().route_bytes <= budget * 200
         assert learned.summary().route_bytes >= 0.97 * budget * 200 or finest
 
@@ -161,7 +187,7 @@ def test_a_budget_that_no_line_fits_in_is_refused() -> None:
 
 @pytest.mark.parametrize("places", [2, 3, 5, 8, 12])
 @pytest.mark.parametrize("numbers", [1, 2, 6, 300])
-@pytest.mark.parametrize("chunk", ["route", 4])
+@pytest.mark.parametrize("chunk", [10_000, 4])
 def test_on_a_short_route_the_default_budget_gives_way(
     places: int, numbers: int, chunk: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -173,7 +199,7 @@ def test_on_a_short_route_the_default_budget_gives_way(
     assert all(f"{places} places" in line for line in caplog.messages)
     if not caplog.messages:
         return
-    rebuilt = torch.cat([learned.rebuilt(g) for g in range(len(learned.chunks))])
+    rebuilt = torch.cat([learned.decode(g) for g in range(len(learned.chunks))])
     apart = (rebuilt - descriptors).square().sum() / (descriptors - descriptors.mean(0)).square().sum()
     assert apart < 0.2  # at least .85 of the variance, but for the last step of the search
     # where the budget is given it is refused, and what the line names works
@@ -223,7 +249,7 @@ def test_whole_cycles_take_the_same_lines_however_many_they_are() -> None:
     kept = {}
     for cycles in (10, 1000):
         series = waves(cycles)
-        learned = SpectralMapper(None, step=0.5)(series)
+        learned = SpectralMapper(None, step=0.5, chunk=10**6)(series)
         rows, features, _ = learned.lines(0)
         kept[cycles] = {
             (int((r + 1) // 2) // cycles, int(r) % 2, int(f)) for r, f in zip(rows, features, strict=True)
@@ -240,7 +266,7 @@ def test_whole_cycles_take_the_same_lines_however_many_they_are() -> None:
 def test_at_equal_error_the_file_grows_by_the_logarithm_of_the_cycles() -> None:
     sizes, counts = {}, {}
     for cycles in (10, 1000):
-        learned = SpectralMapper(None, step=0.02 * math.sqrt(20 * cycles))(waves(cycles))
+        learned = SpectralMapper(None, step=0.02 * math.sqrt(20 * cycles), chunk=10**6)(waves(cycles))
         sizes[cycles], counts[cycles] = learned.summary().route_bytes, learned.summary().lines
     assert counts[10] == counts[1000] == 24
     assert sizes[1000] <= sizes[10] + 64 + 24 * math.log2(1000 * 20) / 8 * 2
@@ -277,14 +303,13 @@ def test_resolution_is_kept_and_extends_alike() -> None:
     descriptors = route(300)
     mapper = SpectralMapper(None, step=0.3, chunk=100, resolution=6.0)
     grown = mapper(descriptors[:200])
-    again = mapper.empty()
-    again.load_state_dict({**again.unpacked(grown.packed()), "_extra_state": grown.get_extra_state()})
-    again.extend(descriptors[200:])
+    again = copied(grown, mapper.empty())
+    grow(again, descriptors[200:])
     assert again.resolution == 6.0
-    assert torch.equal(again.levels[:200], grown.levels)
-    lines = spectrum((descriptors[200:] - grown.mean.float()).T).T
-    levels = [quantise(lines, 0.3, dead_zone(lines, [100], r, "dft")).to(torch.int8) for r in (6.0, 0.0)]
-    assert torch.equal(again.levels[200:], levels[0])
+    assert torch.equal(levels_of(again)[:200], levels_of(grown))
+    lines = spectrum((descriptors[200:] - grown.means[0].float()).T).T
+    levels = [quantise(lines, 0.3, dead_zone(lines, [100], r, "dft")).long() for r in (6.0, 0.0)]
+    assert torch.equal(levels_of(again)[200:], levels[0])
     assert not torch.equal(levels[0], levels[1])
 
 
@@ -300,20 +325,19 @@ def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period() -> None:
         assert torch.allclose(from_spectrum(harmonics).T, means.repeat(cycles, 1), atol=1e-12)
 
 
+@pytest.mark.usefixtures("way")
 def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
     descriptors = torch.cat([torch.eye(4)[[0, 1]], torch.zeros(1, 4), -torch.eye(4)[[0, 1]]]).repeat(20, 1)
     learned = SpectralMapper(None, step=3e-7)(descriptors)
-    assert learned.silent == 20
     assert learned.summary().covered == 80
     queries = torch.randn(3, 4, requires_grad=True)
-    for rebuild in (False, True):
-        scores = forced(learned, rebuild).scores(queries)
-        assert torch.equal(scores[:, 2::5], torch.ones(3, 20))
-        (gradient,) = torch.autograd.grad(scores[:, 2::5].sum(), queries)
-        assert torch.equal(gradient, torch.zeros(3, 4))
-        nothing = torch.zeros(2, 4, requires_grad=True)
-        (gradient,) = torch.autograd.grad(learned.scores(nothing).sum(), nothing)
-        assert gradient.isfinite().all()
+    scores = learned.scores(queries)
+    assert torch.equal(scores[:, 2::5], torch.ones(3, 20))
+    (gradient,) = torch.autograd.grad(scores[:, 2::5].sum(), queries)
+    assert torch.equal(gradient, torch.zeros(3, 4))
+    nothing = torch.zeros(2, 4, requires_grad=True)
+    (gradient,) = torch.autograd.grad(learned.scores(nothing).sum(), nothing)
+    assert gradient.isfinite().all()
 
 
 def test_large_levels_escape() -> None:
@@ -321,9 +345,7 @@ def test_large_levels_escape() -> None:
     learned = SpectralMapper(None, step=1.0)(series)
     assert learned.level.abs().max() > 127
     assert (held(learned) - series).abs().max() < 5
-    packed = learned.packed()
-    again = SpectralMapper(None, step=1.0).empty()
-    again.load_state_dict({**again.unpacked(packed), "_extra_state": learned.get_extra_state()})
+    again = copied(learned, SpectralMapper(None, step=1.0).empty())
     assert torch.equal(held(again), held(learned))
 
 
@@ -331,7 +353,7 @@ def test_chunks_are_added_without_touching_others() -> None:
     descriptors = route(500)
     learned = SpectralMapper(chunk=100)(descriptors[:250])
     before, table = held(learned), learned.packed()["stream_table"]
-    learned.extend(descriptors[250:])
+    grow(learned, descriptors[250:])
     assert learned.places == 500
     assert learned.lengths.tolist() == [100, 100, 50, 100, 100, 50]
     assert torch.equal(held(learned)[:250], before)
@@ -341,12 +363,14 @@ def test_chunks_are_added_without_touching_others() -> None:
 
 
 def test_what_cannot_be_extended_is_refused() -> None:
-    with refused("whole route", "chunk"):
-        SpectralMapper()(route()).extend(route())
-    with refused("no map yet"):
-        SpectralMapper(chunk=50).empty().extend(route())
-    with refused("(400, 12)", "(N, 5)"):
-        SpectralMapper(chunk=50)(route(60, 5)).extend(route())
+    learned = SpectralMapper(chunk=50)(route(60, 5))
+    with refused("(50, 12)", "(N, 5)"):
+        grow(learned, route())
+    altered = learned.coded()[0]
+    altered.stream.bytes[9] ^= 1
+    with refused("truncated or altered"):
+        learned.extend([altered])
+    assert (learned.places, len(learned.chunks)) == (60, 2)
 
 
 def test_summary() -> None:
@@ -390,7 +414,7 @@ def test_the_map_is_exported(transform: Any) -> None:
         ({"route_bytes_per_place": None, "step": 0.0}, ("step is 0", "above 0")),
         ({"route_bytes_per_place": None, "step": math.inf}, ("step is inf", "above 0")),
         ({"chunk": 1}, ("chunk is 1", "at least 2")),
-        ({"chunk": "all"}, ("'all'", "'route'")),
+        ({"chunk": "route"}, ("'route'", "10000")),
         ({"transform": "fft"}, ("'fft'", "'dct'")),
         ({"metric": "l1"}, ("'l1'", "'cosine' or 'l2'")),
         ({"resolution": -1.0}, ("resolution is -1.0", "0 or more")),
@@ -439,7 +463,7 @@ def damaged(tensors: dict[str, Tensor], change: str) -> dict[str, Tensor]:
     elif change == "step":
         tensors["steps"][0] = 0
     elif change == "mean":
-        tensors["mean"] = tensors["mean"][:-1]
+        tensors["means"] = tensors["means"][:, :-1]
     else:
         tensors["escapes"] = torch.ones(3, dtype=torch.int32)
     return tensors
@@ -452,8 +476,7 @@ def test_a_damaged_map_is_refused(change: str) -> None:
     learned = SpectralMapper(chunk=100)(route())
     other = SpectralMapper(chunk=100).empty()
     with refused("expected") if change != "truncated" else refused("bytes", "claims"):
-        state = other.unpacked(damaged(learned.packed(), change))
-        other.load_state_dict({**state, "_extra_state": learned.get_extra_state()})
+        other.load_packed(damaged(learned.packed(), change), learned.get_extra_state())
     assert other.places == 0
 
 
@@ -467,15 +490,29 @@ def test_a_map_is_that_of_its_chunks_coded_one_by_one(settings: tuple[Any, ...])
     features = route(200) * torch.tensor([50.0, *[1.0] * 11])
     metric, transform, chunk, resolution = settings
     learned = SpectralMapper(None, 0.002, chunk, transform, metric, resolution)(features)
-    step = float(learned.steps[0])
-    alone = [code_chunk(part, learned.mean, step, transform, resolution) for part in features.split(64)]
-    for made in (
-        SpectralMap.of_chunks(alone, learned.mean, *settings),
-        SpectralMap.of_chunks(learned.coded(), learned.mean, *settings),
-    ):
+    coding = learned.means[0], learned.step, transform, resolution
+    alone = [code_chunk(part, *coding) for part in features.split(64)]
+    for made in (learned.of_chunks(alone), learned.of_chunks(learned.coded())):
         for name, tensor in learned.packed().items():
             assert torch.equal(made.packed()[name], tensor)
         assert torch.equal(made.scores(features[:5]), learned.scores(features[:5]))
     assert len(learned.packed()["escapes"]) > 0
-    with refused("no chunks", "at least one"):
-        SpectralMap.of_chunks([], learned.mean)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_a_copy_and_other_precisions_score_alike(settings: dict[str, Any]) -> None:
+    learned = SpectralMapper(**settings)(route(170))
+    queries, expected = route(20, seed=1), learned.scores(route(20, seed=1))
+    assert torch.equal(copy.deepcopy(learned).scores(queries), expected)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(learned.scores(queries), expected)
+    assert torch.allclose(learned.scores(queries.half()), expected, atol=1e-2)
+    compiled = torch.compile(learned.scores, fullgraph=True, backend="eager")
+    assert torch.allclose(compiled(queries), expected, atol=1e-5)
+
+
+def test_nothing_is_written_to_stderr_when_a_map_scores() -> None:
+    program = "import torch; from dejavu_torch import SpectralMapper; w = torch.rand(90, 5).cumsum(0); "
+    program += "SpectralMapper()(w).scores(w[:3])"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert found.stderr == ""

@@ -192,7 +192,7 @@ def test_a_plan_without_layers_has_no_templates() -> None:
         ({"period": Fraction(5, 2)}, r"period 5/2 and no phases; expected phases"),
         ({"period": 3, "stop": 11}, r"chunk \[0, 11\); expected it inside 10 frames"),
         ({"period": 3, "start": 5, "stop": 5}, r"covers \[5, 5\); expected 0 <= start < stop"),
-        ({"period": 3, "start": -1}, r"covers \[-1, 10\); expected 0 <= start < stop"),
+        ({"period": 3, "start": -1}, r"covers \[-1, 0\); expected 0 <= start < stop"),
         ({"period": 0}, r"period 0 .*expected period > 0"),
         ({"period": -3, "phases": 3}, r"period -3 .*expected period > 0"),
         ({"period": 3, "phases": 0}, r"0 phases; expected .*phases >= 1"),
@@ -212,8 +212,8 @@ def test_layers_name_each_feature_once_in_order(features: tuple[int, ...]) -> No
 @pytest.mark.parametrize(
     ("layer", "message"),
     [
-        (whole(3, stop=11), r"covers \[0, 11\) and feature 0; expected it inside 10 frames of 2 features"),
-        (whole(3, 10, (0, 2)), r"feature 2; expected it inside 10 frames of 2 features"),
+        (whole(3, stop=11), r"covers \[0, 11\) and feature 0; expected it inside 10 places of 2 features"),
+        (whole(3, 10, (0, 2)), r"feature 2; expected it inside 10 places of 2 features"),
     ],
 )
 def test_a_layer_beyond_the_traverse_is_refused(layer: FrequencyLayer, message: str) -> None:

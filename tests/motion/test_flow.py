@@ -123,7 +123,7 @@ def test_wrong_input_is_refused() -> None:
     for first, second in ((two, two[:1]), (two.expand(2, 3, 64, 64),) * 2, (two[:, 0],) * 2):
         with refused(str(tuple(second.shape)), "the same (B,1,h,w)"):
             flow_shift(first, second, "lk")
-    with refused("(64, 31)", "at least 32"):
+    with refused("(2, 1, 64, 31)", "at least 32"):
         flow_shift(two[..., :31], two[..., :31], "dis")
     with refused("'farneback'", "lk, dis"):
         flow_shift(two, two, "farneback")

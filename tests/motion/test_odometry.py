@@ -181,15 +181,15 @@ def test_corners_that_are_no_region_are_refused(corners: tuple, words: tuple[str
 
 
 def test_patches_and_frames_of_wrong_size_are_refused() -> None:
-    with refused("(1, 96)", "at least 2"):
+    with refused("(1, 96)", "at least 2 x 2"):
         ground_patch(torch.rand(1, 1, 60, 80), size=(1, 96))
     with refused("2 x 1000000 x 1000000 pixels takes", "GB free"):
         ground_patch(torch.rand(2, 1, 60, 80), size=(10**6, 10**6))
-    with refused("1 x 80", "at least 2 x 2"):
+    with refused("1 x 80 pixels", "at least 2 x 2"):
         ground_patch(torch.rand(1, 1, 1, 80))
     with refused("(31, 96)", "at least 32"):
         GroundOdometry(size=(31, 96))
-    with refused("(40, 31)", "at least 32"):
+    with refused("(2, 1, 40, 31)", "at least 32"):
         shift_between(torch.rand(2, 1, 40, 31), torch.rand(2, 1, 40, 31))
     two = torch.rand(2, 1, 64, 64)
     for first, second in ((two, two[:1]), (two.expand(2, 3, 64, 64),) * 2, (two[:, 0],) * 2):

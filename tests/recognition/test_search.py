@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 import torch
+from dejavu_torch.maps.coefficients import coefficients_of
+from dejavu_torch.maps.merged import MergedMap
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,8 +20,6 @@ from torch import Tensor
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
 from dejavu_torch.maps import spectral
 from dejavu_torch.maps.codec import to_int8
-from dejavu_torch.maps.coefficients import coefficients_of
-from dejavu_torch.maps.merged import MergedMap
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper

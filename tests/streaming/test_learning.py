@@ -12,6 +12,9 @@ import pytest
 import safetensors.torch
 import torch
 from command_line import frames, write_images
+from dejavu_torch.streaming.coder import ChunkCoder, code_here, joined
+from dejavu_torch.streaming.sample import sample_of
+from dejavu_torch.streaming.work import WorkFolder, all_chunks, work_folder_of
 from helpers import Stream, refused
 from torch import Tensor
 
@@ -26,9 +29,6 @@ from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper, code_chunk
 from dejavu_torch.model import DejaVu
 from dejavu_torch.streaming import coder, sample
-from dejavu_torch.streaming.coder import ChunkCoder, code_here, joined
-from dejavu_torch.streaming.sample import sample_of
-from dejavu_torch.streaming.work import WorkFolder, all_chunks, work_folder_of
 from dejavu_torch.types import Traverse
 
 CHUNK, PLACES = 50, 1030

@@ -1,4 +1,4 @@
-"""A connection to Ray, which runs functions of ours on other processes and machines."""
+"""Chunks of a route coded, and parts of a map searched, by the workers of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -17,19 +17,23 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from torch import nn
+from tqdm import tqdm
 
 from dejavu_torch.data.output import SIGNALS
+from dejavu_torch.learning import ChunkCoder, in_one_thread
+from dejavu_torch.maps.spectral_map import Chunk
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 AUTO = "auto"
 RETRIES = 3  # of a task whose worker died
-AHEAD = 2  # tasks for each processor that are handed out at a time
+AHEAD = 2  # tasks for each processor that are submitted at a time
+TASK = 1024  # places at least, whose chunks one task makes
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}  # no telemetry, no advice
 
 
 class Failure(NamedTuple):
-    """Why a task ended early, and on which host; None where its worker died, and took that along."""
+    """Why a task ended early, and on which host; None if its worker died, and took that along."""
 
     why: str
     host: str | None
@@ -52,14 +56,13 @@ class Cluster:
 
     def __init__(self, address: str = AUTO) -> None:
         os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
-        self.address = address
-        self.ray: Any = _ray()
+        self.ray: Any = check_installed()
         logging.getLogger("ray").setLevel(logging.ERROR)
         quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
         try:
             if address == AUTO:
-                self.ray.init(num_cpus=processors(), include_dashboard=False, address="local", **quiet)
+                self.ray.init(num_cpus=_processors(), include_dashboard=False, address="local", **quiet)
             else:
                 self.ray.init(address=address, **quiet)
         except Exception as error:  # of any type
@@ -82,13 +85,8 @@ class Cluster:
         """End the connection, and the workers that `auto` started."""
         self.ray.shutdown()
 
-    def put(self, *values: object) -> list[Any]:
-        """Values for all tasks, sent to a worker once: what `run` takes as `shared`."""
-        with _by_value(self.ray, values):
-            return [self.ray.put(values)]
-
     def run(
-        self, function: Callable[..., Iterable[Any]], shared: list[Any], tasks: Sequence[Any]
+        self, function: Callable[..., Iterable[Any]], tasks: Sequence[Any], *shared: object
     ) -> Generator[tuple[Any, list[Any], Failure | None], None, None]:
         """Go through `function(task, *shared)` for all tasks: each with its results, as tasks are finished.
 
@@ -98,13 +96,14 @@ class Cluster:
             A task, what the function gave, and what ended it early, if anything did.
         """
         remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_run)
-        here, waiting = os.getcwd(), deque(tasks)
-        running: dict[Any, Any] = {}
+        with _by_value(self.ray, shared):
+            sent = [self.ray.put(shared)]
+        waiting, running = deque(tasks), dict[Any, Any]()
         try:
             while waiting or running:
                 while waiting and len(running) < AHEAD * self.workers:
                     task = waiting.popleft()
-                    running[remote.remote(function, shared, task, here)] = task
+                    running[remote.remote(function, sent, task, os.getcwd())] = task
                 done, _ = self.ray.wait(list(running))
                 for one in done:
                     yield running.pop(one), *self._results(one)
@@ -120,32 +119,65 @@ class Cluster:
         except self.ray.exceptions.RayTaskError:  # an error of ours
             raise
         except self.ray.exceptions.RayError as error:
-            seen = f"its worker died, {RETRIES + 1} times ({error_line(error)})"
+            seen = f"its worker died, {RETRIES + 1} times ({_brief(error)})"
             return [], Failure(f"{seen}; expected workers that live, and memory for them", None)
 
 
-def error_line(error: Exception) -> str:
-    """What Ray says of itself at length, in few words."""
-    return one_line(error)[:100]
+def code_on(
+    cluster: Cluster,
+    coder: ChunkCoder,
+    traverse: Traverse,
+    first: int,
+    progress: str | None = None,
+    together: int = 0,
+) -> Iterator[Chunk]:
+    """As `code_here`, by a cluster: the same bytes in the same order.
+
+    A traverse that cannot seek is read from its beginning by every worker, so that its chunks are divided
+    into few tasks.
+
+    Args:
+        together: chunks of a task; 0 is those of `TASK` places.
+
+    Raises:
+        InputError: chunks that came to nothing; all before them have been yielded.
+    """
+    together = together or max(1, TASK // coder.chunk)
+    if not traverse.seeks:
+        together = max(together, -(-(coder.total - first) // cluster.workers))
+    tasks = [
+        range(start, min(start + together, coder.total)) for start in range(first, coder.total, together)
+    ]
+    total = len(range(*coder.span(range(first, coder.total))))
+    done: dict[int, Chunk] = {}
+    following = first
+    with tqdm(
+        total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False
+    ) as bar:
+        for task, made, failure in cluster.run(_coded, tasks, coder, traverse):
+            done |= zip(task, made, strict=False)
+            bar.update(sum(chunk.places for chunk in made))
+            while following in done:
+                yield done.pop(following)
+                following += 1
+            if failure is not None:
+                start, stop = coder.span(range(task.start + len(made), task.stop))
+                read = "" if failure.host is None else f", read on {failure.host}"
+                raise InputError(f"frames {start} to {stop - 1}{read}: {failure.why}")
 
 
-def processors() -> int:
-    """Processors that this process may use."""
-    with suppress(AttributeError):  # of Linux
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def _coded(task: range, coder: ChunkCoder, traverse: Traverse) -> Iterator[Chunk]:
+    """Chunks, by a worker."""
+    with in_one_thread():
+        yield from coder.chunks(traverse, task)
 
 
-def check_installed() -> None:
-    """Refuse early to work without Ray.
+def check_installed() -> Any:
+    """Ray, or a line that it is not there.
 
     Raises:
         InputError: it is not installed.
     """
-    _ray()
-
-
-def _ray() -> Any:
     try:
         return importlib.import_module("ray")
     except ImportError as error:
@@ -154,21 +186,33 @@ def _ray() -> Any:
         ) from error
 
 
+def _brief(error: Exception) -> str:
+    """What Ray says of itself at length, in few words."""
+    return one_line(error)[:100]
+
+
+def _processors() -> int:
+    """Processors that this process may use."""
+    with suppress(AttributeError):  # of Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 _shared: dict[str, Any] = {}  # of a worker process: what it was sent last
 
 
 def _run(
-    function: Callable[..., Iterable[Any]], shared: list[Any], task: Any, folder: str
+    function: Callable[..., Iterable[Any]], sent: list[Any], task: Any, folder: str
 ) -> tuple[list[Any], Failure | None]:
     """A task, in a worker."""
     import ray
 
     with suppress(OSError):
         os.chdir(folder)
-    key = shared[0].hex()
+    key = sent[0].hex()
     if key not in _shared:
         _shared.clear()
-        _shared[key] = ray.get(shared[0])
+        _shared[key] = ray.get(sent[0])
     results: list[Any] = []
     try:
         for result in function(task, *_shared[key]):

@@ -1,1 +1,0 @@
-"""Learning and localizing on many machines, by Ray."""

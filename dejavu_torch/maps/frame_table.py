@@ -1,0 +1,84 @@
+"""Places, frames of the reference and routes: which belong together."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.positions import borders, look_up, place_of, shown_frames
+from dejavu_torch.types import InputError
+
+
+class Route(NamedTuple):
+    """A route of a map that has several: its name, and how many places and frames."""
+
+    name: str
+    places: int
+    frames: int
+
+
+class FrameTable(NamedTuple):
+    """Which frames the places of a map show, and on which route they are.
+
+    places: N, of the map. positions: (F,) float, how many even steps each frame lies from the first place of
+    its route; (0,) where place i is frame i. routes: of a merged map, in order, else ().
+
+    Convention: places and frames count through all routes. -1, no place or frame, stays -1.
+    """
+
+    places: int
+    positions: Tensor
+    routes: tuple[Route, ...] = ()
+
+    @property
+    def frames(self) -> int:
+        """F, of the reference."""
+        return len(self.positions) or self.places
+
+    @property
+    def steps(self) -> Tensor:
+        """(F,) of each frame, through all routes; of several in double, as float32 would lose places."""
+        if len(self.routes) < 2 or not len(self.positions):
+            return self.positions
+        parts = self.positions.double().clamp(min=0).split([route.frames for route in self.routes])
+        starts = accumulate((route.places for route in self.routes), initial=0)
+        return torch.cat([part + start for part, start in zip(parts, starts, strict=False)])
+
+    @property
+    def borders(self) -> Tensor:
+        """(N+1,) int64, the frame with which each place begins, and the number of frames."""
+        return borders(self.steps) if len(self.positions) else torch.arange(self.places + 1)
+
+    def frame_of(self, places: Tensor) -> Tensor:
+        """The frame that each place shows; int64 of any shape."""
+        return look_up(shown_frames(self.steps), places) if len(self.positions) else places
+
+    def place_of(self, frames: Tensor) -> Tensor:
+        """The place nearest to each frame, -1 for one before the first place; int64 of any shape.
+
+        Raises:
+            InputError: a frame that the reference does not have.
+        """
+        if frames.numel() and int(frames.max()) >= self.frames:
+            raise InputError(
+                f"frame {int(frames.max())} of the reference; expected frames from 0 to {self.frames - 1}"
+            )
+        return place_of(self.steps, frames) if len(self.positions) else frames
+
+    def scored(self, places: Tensor) -> Tensor:
+        """Of the places that show one frame, the nearest to it, which a ground truth in frames means."""
+        return self.place_of(self.frame_of(places))
+
+    def route_of(self, places: Tensor) -> Tensor:
+        """The number of the route that each place is on; int64 of any shape."""
+        ends = torch.tensor([route.places for route in self.routes], device=places.device).cumsum(0)
+        return torch.where(places >= 0, torch.searchsorted(ends, places.contiguous(), right=True), -1)
+
+    def own_frame_of(self, places: Tensor) -> Tensor:
+        """As `frame_of`, each frame counted on its own route; int64 of any shape."""
+        counts = torch.tensor([0, *(route.frames for route in self.routes)], device=places.device)
+        before = look_up(counts.cumsum(0), self.route_of(places))
+        return torch.where(places >= 0, self.frame_of(places) - before, -1)

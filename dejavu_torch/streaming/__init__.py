@@ -1,1 +1,0 @@
-"""Long routes, learned chunk by chunk: in bounded memory, again after a kill, on many machines."""

@@ -1,0 +1,149 @@
+"""Six small runs of `dejavu compare`: report.json, matches.csv and the bytes of the map."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+from dejavu_torch.cli import main
+
+HERE = Path(__file__).parent
+SMALL = "size=32"
+
+
+def _visits(route: str) -> tuple[str, str]:
+    return f"sim:{route}", f"sim:{route}&traverse=1"
+
+
+# {data} is DEJAVU_TEST_DATA. Of 4 bits a whitening multiplies what rounds otherwise with another number of threads
+RUNS: dict[str, tuple[str, ...]] = {
+    "demo": (*_visits("aerial?seed=0&frames=600"), "--whitening.bits", "16"),
+    "paper": (*_visits(f"aerial?frames=200&{SMALL}"), "--config", "paper", "--mapper.periods.window", "100"),
+    "templates": (
+        *_visits(f"aerial?seed=1&frames=256&{SMALL}"),
+        *("--config", "local_maxima", "--mapper.periods.window", "128", "--leave_out", "5"),
+    ),
+    "corridor": (
+        "{data}/corridor/ref?width=64&height=48",
+        "{data}/corridor/query?width=64&height=48",
+        *("--truth", "{data}/corridor/truth.csv"),
+    ),
+    "sequence": (
+        *_visits(f"aerial?seed=3&frames=200&noise=0.05&{SMALL}"),
+        *("--sequence", "5", "--speeds", "[0.8,1,1.25]", "--whitening", "none", "--mapper.chunk", "80"),
+        *("--calibration", "none", "--top", "2"),
+    ),
+    "filter": (*_visits(f"aerial?seed=2&frames=200&{SMALL}"), "--filter", "--whitening.views", "1"),
+}
+
+# keys of report.json whose values are times, versions, or the place where the data lies
+UNTOLD = {"seconds_learn", "seconds_localize", "version", "torch", "l1_backend", "spectrogram_backend"}
+PATHS = {"reference", "query", "truth"}
+BYTES = {"map_bytes", "route_bytes", "fixed_bytes", "bytes_per_place", "route_bytes_per_place"}
+MORE = 1.005  # times the bytes of the golden run: at most
+RELATIVE = 2e-3  # of sizes of other methods, and of what is no share of the queries
+# counts of queries; shares of them are within the same, divided by the queries
+COUNTED = {"accepted", "accepted_right", "0.9", "0.5"}
+EXACT = {
+    "queries",
+    "frames",
+    "judged",
+    "with_answer",
+    "tolerance",
+    "sequence",
+    "start",
+    "stop",
+    "k",
+    "unknown",
+}
+LOOSE = {"lines": 0.02, "noise_over_map": 0.02, "null_over_map": 0.1, "threshold_of_full_precision": 0.02}
+SCORE = 1e-4  # of scores and probabilities in matches.csv
+SAME = 0.995  # of the places in it
+
+
+def run(name: str, out: Path, data: Path | None) -> None:
+    """Run one of them; its pictures are of few pixels."""
+    words = [word.replace("{data}", str(data)) for word in RUNS[name]]
+    with matplotlib.rc_context({"savefig.dpi": 10}):
+        main(["compare", *words, "--out", str(out)])
+
+
+def write(name: str, out: Path, data: Path | None) -> None:
+    """Run it, and keep what it made."""
+    run(name, out, data)
+    text = (out / "report.json").read_text().replace(str(data), "{data}")
+    (HERE / f"{name}.report.json").write_text(text)
+    shutil.copyfile(out / "matches.csv", HERE / f"{name}.matches.csv")
+
+
+def golden_report(name: str) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((HERE / f"{name}.report.json").read_text())
+    return report
+
+
+def report_of(out: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((out / "report.json").read_text())
+    return report
+
+
+def golden_matches(name: str) -> list[dict[str, str]]:
+    return read_matches(HERE / f"{name}.matches.csv")
+
+
+def read_matches(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def keys(value: object, path: str = "") -> Iterator[str]:
+    """Every key of a report, with those above it; the parts of a list by their numbers."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield f"{path}/{name}"
+            yield from keys(part, f"{path}/{name}")
+    elif isinstance(value, list) and not path.endswith("/null_over_map"):  # as many as the null reaches
+        for number, part in enumerate(value):
+            yield f"{path}/{number}"
+            yield from keys(part, f"{path}/{number}")
+
+
+def differences(seen: Any, golden: Any, queries: int, path: str = "") -> Iterator[str]:
+    """Where a report differs from the golden one by more than rounding, a line each.
+
+    Args:
+        queries: of the run; figures may differ by two of them.
+    """
+    name = next((part for part in reversed(path.split("/")) if not part.isdigit()), "")
+    if isinstance(golden, dict) and isinstance(seen, dict):
+        for key in golden:
+            if key in seen and not (path == "" and key in UNTOLD | PATHS):
+                yield from differences(seen[key], golden[key], queries, f"{path}/{key}")
+    elif isinstance(golden, list) and isinstance(seen, list):
+        for number, (one, other) in enumerate(zip(seen, golden, strict=False)):
+            yield from differences(one, other, queries, f"{path}/{number}")
+    elif not _close(seen, golden, name, path, queries):
+        yield f"{path} is {seen}; golden {golden}"
+
+
+def _close(seen: Any, golden: Any, name: str, path: str, queries: int) -> bool:
+    numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in (seen, golden))
+    if not numbers or name in EXACT:
+        return bool(seen == golden)
+    if path.startswith("/storage") and name == "route_bytes_per_place":
+        return math.isclose(seen, golden, rel_tol=0.02)
+    if name in BYTES:
+        return bool(seen <= golden * MORE)
+    if name in COUNTED:
+        return abs(seen - golden) <= 2
+    if name in LOOSE:
+        return math.isclose(seen, golden, rel_tol=LOOSE[name], abs_tol=SCORE)
+    if 0 <= golden <= 1:
+        return abs(seen - golden) <= 2 / queries
+    return math.isclose(seen, golden, rel_tol=RELATIVE)

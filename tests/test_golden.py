@@ -1,0 +1,112 @@
+"""The goldens of tests/golden: six small runs, simulated frames, and the options of every command.
+
+`python -m tests.golden` writes them anew, see CONTRIBUTING.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from golden import frames, options, runs
+
+ROOT = Path(__file__).parents[1]
+REAL = {"corridor"}  # runs on real data
+
+
+@pytest.fixture(scope="module", params=list(runs.RUNS))
+def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """The name of a run, and the folder of its report."""
+    name: str = request.param
+    data = request.getfixturevalue("data_dir") if name in REAL else None
+    out = tmp_path_factory.mktemp("golden") / name
+    runs.run(name, out, data)
+    return name, out
+
+
+def test_report_has_the_keys(ran: tuple[str, Path]) -> None:
+    name, out = ran
+    seen, golden = (set(runs.keys(report)) for report in (runs.report_of(out), runs.golden_report(name)))
+    assert seen - golden == set(), "new keys"
+    assert golden - seen == set(), "missing keys"
+
+
+def test_figures_are_those_of_the_report(ran: tuple[str, Path]) -> None:
+    name, out = ran
+    golden = runs.golden_report(name)
+    found = list(runs.differences(runs.report_of(out), golden, golden["queries"]))
+    assert not found, "\n".join(found)
+
+
+def test_map_takes_no_more_bytes(ran: tuple[str, Path]) -> None:
+    name, out = ran
+    size = (out / "map.safetensors").stat().st_size
+    assert size == runs.report_of(out)["map_bytes"]
+    assert size <= runs.MORE * runs.golden_report(name)["map_bytes"]
+
+
+def test_matches_are_those_of_the_golden_run(ran: tuple[str, Path]) -> None:
+    name, out = ran
+    seen, golden = runs.read_matches(out / "matches.csv"), runs.golden_matches(name)
+    assert [row.keys() for row in seen] == [row.keys() for row in golden]
+    for column in ("query", "query_name", "rank"):
+        assert [row.get(column) for row in seen] == [row.get(column) for row in golden]
+    first = [row.get("rank", "1") == "1" for row in golden]
+    for column in ("place", "accepted", "place_name"):
+        same = [one[column] == other[column] for one, other in zip(seen, golden, strict=True)]
+        assert np.mean(same) >= runs.SAME, f"{column} differs"
+        assert np.mean(np.array(same)[first]) >= runs.SAME, f"{column} differs"
+    for column in ("score", "probability"):
+        told = [one.get(column, "") != "" for one in golden]
+        assert [one.get(column, "") != "" for one in seen] == told
+        values = [[float(row.get(column) or "0") for row in rows] for rows in (seen, golden)]
+        # where another place of the same score is best, that of the next candidate is another
+        same = [one["place"] == other["place"] for one, other in zip(seen, golden, strict=True)]
+        np.testing.assert_allclose(*(np.array(one)[same] for one in values), rtol=runs.SCORE, atol=runs.SCORE)
+
+
+@pytest.mark.parametrize("route", frames.ROUTES)
+def test_simulated_frames_are_the_same(route: str) -> None:
+    assert frames.differs(route, frames.golden()[route]) == ""
+
+
+def test_checksums_see_small_changes_and_no_rounding() -> None:
+    drawn = frames.drawn(frames.ROUTES[0])
+    left_out = frames.unsure(drawn)
+    assert len(left_out) < 0.01 * drawn.size
+    known = frames.checksum(drawn, left_out)
+    noise = np.random.default_rng(0).uniform(-1, 1, drawn.shape)
+    assert frames.checksum(drawn + 0.9 * frames.NEAR * noise, left_out) == known
+    assert frames.checksum(drawn + 2e-3, left_out) != known
+    assert frames.checksum(np.roll(drawn, 1, axis=-1), left_out) != known
+
+
+def test_another_process_draws_the_same_frames() -> None:
+    code = (
+        "from golden import frames; print([frames.differs(r, frames.golden()[r]) for r in frames.ROUTES[:2]])"
+    )
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == "['', '']"
+
+
+def test_commands_have_the_options() -> None:
+    seen, golden = options.read(), json.loads(options.FILE.read_text())
+    found = [
+        f"{words} {name}: {seen.get(words, {}).get(name)}; golden {golden.get(words, {}).get(name)}"
+        for words in {**golden, **seen}
+        for name in {**golden.get(words, {}), **seen.get(words, {})}
+        if seen.get(words, {}).get(name) != golden.get(words, {}).get(name)
+    ]
+    assert not found, "\n".join(found)
