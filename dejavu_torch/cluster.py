@@ -12,16 +12,20 @@ import sysconfig
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import reduce
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from dejavu_torch.data.output import SIGNALS
 from dejavu_torch.learning import ChunkCoder, in_one_thread
-from dejavu_torch.maps.spectral_map import Chunk
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
+from dejavu_torch.recognition.search import Best, empty_topk, merge_topk, search
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse
 
@@ -170,6 +174,72 @@ def _coded(task: range, coder: ChunkCoder, traverse: Traverse) -> Iterator[Chunk
     """Chunks, by a worker."""
     with in_one_thread():
         yield from coder.chunks(traverse, task)
+
+
+class ClusterSearch:
+    """As `search`, consecutive chunks of a spectral map being scored by one worker each.
+
+    Args:
+        cluster: its workers hold the chunks; one that dies is started again.
+
+    Shape: queries (Q,K), n -> (Q,n) scores and places.
+
+    Convention: places are those of a search here, scores up to rounding, which depends on the processor.
+
+    Raises:
+        InputError: a map of another kind; a worker that does not come back.
+    """
+
+    def __init__(self, cluster: Cluster, route: PlaceMap) -> None:
+        if not isinstance(route, SpectralMap):
+            raise InputError(
+                f"a map of kind {route.kind!r} is not divided among workers; expected a spectral one"
+            )
+        actor = cluster.ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Searcher)
+        self.cluster, self.actors, first = cluster, [], 0
+        for worker in range(cluster.workers):
+            stop = next(
+                (
+                    g
+                    for g, (start, _) in enumerate(route.chunks)
+                    if start * cluster.workers >= route.places * (worker + 1)
+                ),
+                len(route.chunks),
+            )
+            if stop > first:
+                part = cluster.ray.put(route.between(first, stop).cpu())
+                self.actors.append(actor.remote(part, route.chunks[first][0]))
+            first = max(first, stop)
+
+    @torch.no_grad()
+    def __call__(self, queries: Tensor, n: int) -> Best:
+        """The n lowest scores of queries."""
+        try:
+            answers = self.cluster.ray.get(
+                [actor.search.remote(queries.cpu().numpy(), n) for actor in self.actors]
+            )
+        except self.cluster.ray.exceptions.RayError as error:
+            seen = f"a worker died with its part of the map ({_brief(error)})"
+            raise InputError(f"{seen}; expected workers that live, and memory for it") from error
+        found = [(torch.from_numpy(score.copy()), torch.from_numpy(place.copy())) for score, place in answers]
+        return reduce(merge_topk, found[1:], merge_topk(empty_topk(queries.cpu(), n), found[0]))
+
+
+class _Searcher:
+    """Holds a part of a map, whose first place is that one of the whole."""
+
+    def __init__(self, part: SpectralMap, first: int) -> None:
+        torch.set_num_threads(1)
+        self.part, self.first = part, first
+
+    def process(self) -> int:
+        """The number of this process."""
+        return os.getpid()
+
+    def search(self, queries: Any, n: int) -> tuple[Any, Any]:
+        """See `search`: scores and places as arrays."""
+        score, place = search(self.part, torch.from_numpy(queries.copy()), n, "scan")
+        return score.numpy(), torch.where(score.isfinite(), place + self.first, place).numpy()
 
 
 def check_installed() -> Any:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
+from time import monotonic
 from typing import Any, NamedTuple, NoReturn
 
 import torch
@@ -19,7 +19,7 @@ from dejavu_torch.features.extract import check_alone, feature_batches, warn_of_
 from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
-from dejavu_torch.maps.file import part_of, read_map, write_map
+from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
@@ -378,7 +378,7 @@ class Checkpoint:
     def __init__(self, path: Path) -> None:
         self.path = path.with_name(f"{path.name}.part")
         self.key: Mapping[str, str] = {}
-        self.written, self.kept = time.monotonic(), 0
+        self.written, self.kept = monotonic(), 0
         self.opened = False
 
     def open(self, key: Mapping[str, str]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
@@ -416,7 +416,7 @@ class Checkpoint:
         Raises:
             InputError: the system refuses it; what was there before stays.
         """
-        if not route.places or not (now or time.monotonic() - self.written > SAVED):
+        if not route.places or not (now or monotonic() - self.written > SAVED):
             return
         tensors = {f"map.{name}": tensor for name, tensor in route.packed().items()}
         if whitening is not None:
@@ -425,7 +425,7 @@ class Checkpoint:
         write_map(
             self.path, tensors, {"run": dict(self.key), "state": {"map": route.get_extra_state(), **extra}}
         )
-        self.written, self.kept = time.monotonic(), route.places
+        self.written, self.kept = monotonic(), route.places
 
     def remove(self) -> None:
         """Remove the file, if it is of this run."""
@@ -435,6 +435,13 @@ class Checkpoint:
     def _refuse(self, why: str = "") -> NoReturn:
         seen = f"{self.path} has finished chunks of another run{why}"
         raise InputError(f"{seen}; expected the command that began it, or the file removed")
+
+
+def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """The tensors of one part of a file, by their own names."""
+    return {
+        name.removeprefix(f"{part}."): one for name, one in tensors.items() if name.startswith(f"{part}.")
+    }
 
 
 def learn(
@@ -555,11 +562,13 @@ def extend(
     Raises:
         InputError: frames that cannot be read, or a full disk; what is finished is kept.
     """
+    if len(route.chunks) == coder.total:  # as after a kill at the end
+        return
     try:
         for chunk in code(coder, traverse, len(route.chunks), progress):
             route.extend([chunk])
             if checkpoint is not None:
-                checkpoint.save(route, coder.describer.whitening)
+                checkpoint.save(route, coder.describer.whitening, now=route.places == coder.frames)
     except InputError as error:
         if checkpoint is None:
             raise

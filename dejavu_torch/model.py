@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -41,11 +41,10 @@ from dejavu_torch.model_file import (
 )
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
-from dejavu_torch.recognition.calibration import Calibration
-from dejavu_torch.recognition.candidates import Candidates, check_candidates
-from dejavu_torch.recognition.matching import Found, Matching, joined
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Search, Searcher, check_scanned, check_search
-from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance
+from dejavu_torch.recognition.calibration import Calibration, Platt
+from dejavu_torch.recognition.localizer import Localizer, Matcher, Matching
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, Best, Search, check_search
+from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
 from dejavu_torch.types import (
     BATCH_NUMBERS,
@@ -155,13 +154,10 @@ class DejaVu(nn.Module):
         self.frame_names: list[str] = []  # of the reference's frames; empty where they have none
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
-        self._searcher: Searcher | None = None
+        self._find: Callable[[Tensor, int], Best] | None = None  # finds places in place of `search`
         self._reduces = False  # whether `_reduce` has set the whitening
         self._told: set[tuple[str, str]] = set()  # lines that are said once
         self._bright: set[str] = set()  # traverses that were said to be bright
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_searcher": None}  # which can hold more than the map, and is soon made again
 
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
@@ -258,9 +254,8 @@ class DejaVu(nn.Module):
         header |= {"batch_size": self.describer.batch_size, "sample": learning.SAMPLE}
         header |= {"version": __version__, "torch": torch.__version__}
         fixed = self.whitening is not None and self.whitening.fixed
-        sums = checksums(
-            weights_of(self, "features") | (weights_of(self, "whitening") if fixed else {}), header
-        )
+        weights = weights_of(self, "features") | (weights_of(self, "whitening") if fixed else {})
+        sums = checksums(weights, header)
         sources = {
             name: views and [views.traverse.identity(), views.places.tolist()]
             for name, views in (("second", second), ("visits", visits))
@@ -382,7 +377,7 @@ class DejaVu(nn.Module):
         self.step = traverse.step if isinstance(traverse, ResampledTraverse) else None
         frames = len(positions) or route.places
         self.frame_names = [] if traverse is None else names_of(source_of(traverse), frames)
-        self.map, self._searcher, self.frame_shape = route, None, shape or None
+        self.map, self._find, self.frame_shape = route, None, shape or None
         self.trained = self.calibration = None
         return self.eval()
 
@@ -456,7 +451,7 @@ class DejaVu(nn.Module):
             progress: text of a progress bar on a terminal; None is no bar.
             sequence: scores consecutive queries together, as `SequenceMatcher` and `PlaceFilter` do; None
                 takes each by itself.
-            search: how the best place of a single query is searched for, see `Searcher`.
+            search: how the best place of a single query is searched for, see `recognition.search`.
 
         Shape: -> Match of (Q,) on the CPU.
 
@@ -465,8 +460,7 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        matches = self.matches(queries, progress, sequence, search)
-        return Match.joined(matches)
+        return Match.joined(self.matches(queries, progress, sequence, search))
 
     def localize_descriptors(
         self,
@@ -480,13 +474,26 @@ class DejaVu(nn.Module):
         Args:
             order: (N,) which frame each place of a shuffled map is; the match then counts frames.
         """
-        found = self.found(descriptors, self.matching(sequence, search), order)
-        return found.match(self.acceptance(sequence))
+        return self.found(descriptors, self.matching(sequence, search), order)
 
-    def found(self, descriptors: Tensor, matching: Matching, order: Tensor | None = None) -> Found:
-        """All that a matching finds, of descriptors and in an order as of `localize_descriptors`."""
+    def found(self, descriptors: Tensor, matching: Matching, order: Tensor | None = None) -> Match:
+        """What a matching finds, of descriptors and in an order as of `localize_descriptors`."""
+        localizer = self.localizer(matching)
+        if order is None:
+            return localizer(descriptors)
+        matcher, place = Matcher(matching), order.argsort()
+        parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
+        scores = (self.map.scores(part.to(self.map.positions.device)) for part in parts)
+        with torch.no_grad():
+            return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
+
+    def localizer(self, matching: Matching) -> Localizer:
+        """What matches descriptors on the map, a batch of consecutive queries after the other."""
         self._require_map()
-        return joined(self._found([descriptors], matching, order))
+        check_search(matching.search)
+        if matching.sequence is not None:
+            matching.sequence.check(None, self.map.places)
+        return Localizer(self.map, matching, self._find)
 
     def matches(
         self,
@@ -494,31 +501,17 @@ class DejaVu(nn.Module):
         progress: str | None = None,
         sequence: SequenceModel | None = None,
         search: Search = "auto",
+        k: int | None = None,
+        apart: int = 5,
     ) -> Iterator[Match]:
-        """As `localize`, one batch of queries at a time: memory does not grow with the queries."""
+        """As `localize`, or with k as `candidates`, one batch of queries at a time: memory does not grow with
+        the queries."""
         self._require_map()
-        if sequence is not None:
-            check_scanned(search)
-        check_search(search, self.map)
-        yield from self.matches_of(self._checked(queries, progress, sequence), sequence, search=search)
-
-    def matches_of(
-        self,
-        descriptors: Iterable[Tensor],
-        sequence: SequenceModel | None = None,
-        look: Callable[[Tensor], None] | None = None,
-        search: Search = "auto",
-    ) -> Iterator[Match]:
-        """As `matches`, of batches of descriptors (B,K); each is asked for when its match is.
-
-        Args:
-            look: is given the scores (B,N) of each batch, as for a picture.
-        """
-        self._require_map()
+        if k is not None:
+            check_candidates(k, apart, self.map.places)
         self.check_precision(sequence)
-        rule, matching = self.acceptance(sequence), self.matching(sequence, search)
-        for part in self._found(descriptors, matching._replace(look=look)):
-            yield part.match(rule)
+        localizer = self.localizer(self.matching(sequence, search)._replace(k=k, radius=apart))
+        yield from map(localizer, self._checked(queries, progress, sequence))
 
     def candidates(
         self,
@@ -527,7 +520,7 @@ class DejaVu(nn.Module):
         apart: int = 5,
         sequence: SequenceModel | None = None,
         search: Search = "auto",
-    ) -> Candidates:
+    ) -> Match:
         """The k best places of each query, no two of them near each other; the first is `localize`'s.
 
         Args:
@@ -535,7 +528,7 @@ class DejaVu(nn.Module):
             k: how many, from 1 to the number of places.
             apart: places, at least 0: any two candidates of a query differ by more.
 
-        Shape: -> Candidates of (Q,k) on the CPU.
+        Shape: -> Match of (Q,k) on the CPU.
 
         Raises:
             InputError: as `localize`, or k or apart out of range.
@@ -545,28 +538,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        return joined(self.candidate_batches(queries, k, apart, sequence=sequence, search=search)).candidates
-
-    def candidate_batches(
-        self,
-        queries: Traverse | Tensor,
-        k: int,
-        apart: int = 5,
-        progress: str | None = None,
-        sequence: SequenceModel | None = None,
-        search: Search = "auto",
-    ) -> Iterator[Found]:
-        """As `candidates`, one batch of queries at a time: memory does not grow with the queries.
-
-        On a calibrated map with the probability of the first candidate of each.
-        """
-        self._require_map()
-        check_candidates(k, apart, self.map.places)
-        if sequence is not None:
-            check_scanned(search)
-        check_search(search, self.map)
-        matching = self.matching(sequence, search)._replace(ranks=k, apart=apart)
-        yield from self._found(self._checked(queries, progress, sequence), matching)
+        return Match.joined(self.matches(queries, None, sequence, search, k, apart))
 
     def _checked(
         self, queries: Traverse | Tensor, progress: str | None, sequence: SequenceModel | None
@@ -587,9 +559,10 @@ class DejaVu(nn.Module):
 
     def matching(self, sequence: SequenceModel | None, search: Search = "auto") -> Matching:
         """A way to match queries, with probabilities where the map is calibrated for it."""
-        calibration = self.calibration
-        platt = None if calibration is None else calibration.of(sequence)
-        return Matching(sequence, platt=platt, search=search)
+        return Matching(sequence, rule=self.acceptance(sequence), platt=self._platt(sequence), search=search)
+
+    def _platt(self, sequence: SequenceModel | None) -> Platt | None:
+        return None if self.calibration is None else self.calibration.of(sequence)
 
     def check_precision(self, sequence: SequenceModel | None) -> None:
         """Refuse a precision that nothing tells of.
@@ -597,7 +570,7 @@ class DejaVu(nn.Module):
         Raises:
             InputError: the map is not calibrated, or not for this way of matching.
         """
-        if self.precision is None or self.matching(sequence).platt is not None:
+        if self.precision is None or self._platt(sequence) is not None:
             return
         if self.calibration is None:
             seen = "the map is not calibrated"
@@ -621,55 +594,13 @@ class DejaVu(nn.Module):
             return Acceptance(threshold)
         if self.precision is not None:
             return Acceptance(precision=self.precision)
-        if self.matching(sequence).platt is not None:
+        if self._platt(sequence) is not None:
             return Acceptance(precision=PROBABLE, given=False)
         return Acceptance(None if sequence is None else sequence.likely, given=False)
 
-    def _found(
-        self, batches: Iterable[Tensor], matching: Matching, order: Tensor | None = None
-    ) -> Iterator[Found]:
-        """What a matching finds of batches of descriptors, as many queries at a time as memory allows.
-
-        Args:
-            order: as of `localize_descriptors`.
-        """
-        if matching.sequence is not None:
-            matching.sequence.check(None, self.map.places)
-        at_once = max(1, SCORES_AT_ONCE // max(1, self.map.places))
-        device = self.map.positions.device  # many descriptors lie in a file
-        if matching.searches and order is None:  # no score of most other places is needed
-            searcher = self.searcher(matching.search)
-            parts = (part for descriptors in batches for part in descriptors.split(ROWS))
-            return (matching.search_for(part.to(device), searcher) for part in parts)
-        check_scanned(matching.search)
-        parts = (part.to(device) for descriptors in batches for part in descriptors.split(at_once))
-        sequence = matching.sequence
-        alone = not matching.lengths and matching.platt is None and order is None
-        if sequence is not None and alone:  # not all scores may be needed
-            best = sequence.best(parts, self.map) if matching.ranks == 1 and matching.look is None else None
-            if best is not None:
-                return (
-                    Found(Candidates(place[:, None].cpu(), score[:, None].cpu())) for score, place in best
-                )
-            return matching._replace(sequence=None).stream(sequence.follow(parts, self.map))
-        scores: Iterator[Tensor] = map(self.map.scores, parts)
-        if order is not None:
-            place = order.argsort()
-            scores = (part[:, place.to(part.device)] for part in scores)
-        return matching.stream(scores)
-
-    def searcher(self, method: Search = "auto") -> Searcher:
-        """What finds the best places on the map; kept, with what it made of the map, until that changes.
-
-        Its `told` says how the queries so far were searched for.
-        """
-        if self._searcher is None or not self._searcher.fits(self.map, method):
-            self._searcher = Searcher(self.map, method)
-        return self._searcher
-
-    def search_by(self, searcher: Searcher) -> None:
-        """Find best places by a searcher of the map that is made already, such as one of a cluster."""
-        self._searcher = searcher
+    def search_by(self, find: Callable[[Tensor, int], Best] | None) -> None:
+        """Find the lowest scores by another way than `search`, such as one of a cluster."""
+        self._find = find
 
     @property
     def _resize(self) -> tuple[int, int] | None:

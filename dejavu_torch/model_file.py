@@ -23,22 +23,13 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.maps.file import (
-    checked,
-    checked_fields,
-    json_values,
-    map_size,
-    part_of,
-    read_map,
-    write_map,
-)
+from dejavu_torch.maps.file import checked, checked_fields, json_values, map_size, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.maps.weights import is_rounded, packed, unpacked
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.periods.finder import ForeignPeriods
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration
@@ -94,8 +85,6 @@ HEADER = {name: kind for name, (_, kind) in PARTS.items()} | SETTINGS | STATE | 
 
 def recipe_of(module: nn.Module) -> Recipe:
     """Recipe of a module, without arguments if it is not of this package."""
-    if isinstance(module, ForeignPeriods):
-        return Recipe(module.class_path, module.init_args)
     cls = type(module)
     if REGISTRY.get(cls.__name__) is not cls:
         return Recipe(f"{cls.__module__}.{cls.__qualname__}", {})
@@ -166,10 +155,16 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
     count = len(with_parts(recipe))
     if count > MOST_PARTS:
         raise InputError(f"the map's {name} is made of {count} parts; expected at most {MOST_PARTS}")
-    for key, part in _parts(recipe).items():
-        foreign = key == "periods" and part.class_path not in REGISTRY  # which only learning needs
-        arguments[key] = ForeignPeriods(*part) if foreign else build(part, nn.Module, given)
-    return cls(**arguments)
+    # only learning needs what found the periods: without a finder of this package the mapper has none
+    parts = {
+        key: part for key, part in _parts(recipe).items() if key != "periods" or part.class_path in REGISTRY
+    }
+    arguments |= {key: build(part, nn.Module, given) for key, part in parts.items()}
+    if "periods" not in recipe.init_args or "periods" in parts:
+        return cls(**arguments)
+    module: Any = cls(**arguments | {"periods": None})
+    module.periods = None
+    return module  # type: ignore[no-any-return]
 
 
 def weights_of(model: Any, part: str) -> dict[str, Tensor]:
@@ -324,11 +319,15 @@ def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> A
 def _fill(route: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
     """Give an empty map what a file holds of it; nothing if there is only a descriptor."""
     checked(state, route.state, "its map")
-    own = part_of(tensors, "map")
+    own = _below(tensors, "map.")
     if own or state["places"]:
         route.load_packed(own, state)
     else:
         route.set_extra_state(state)
+
+
+def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
 def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:

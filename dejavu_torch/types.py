@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +25,7 @@ LONGEST_MESSAGE = 2000  # characters
 class InputError(ValueError):
     """Bad input. Its message is one line: what was seen and what was expected.
 
-    Names in it may hold anything: what is not printable is escaped, and of a long text the middle left out.
+    Names in it may hold anything: what is not printable is escaped, and a long text loses its middle.
     """
 
     def __init__(self, message: object) -> None:
@@ -37,17 +38,16 @@ class InputError(ValueError):
 class Traverse(ABC):
     """Frames along a route, in order, read in batches: never all of them in memory.
 
-    A traverse can be iterated any number of times and yields the same values each time,
-    whatever the batch size.
+    A traverse can be iterated any number of times and yields the same values each time, whatever the batch
+    size.
 
     Attributes:
-        name: what to call it in messages, a path or a `sim:` address; see `printable`.
-        length: number of frames N, or None where only reading to the end can tell.
-        place: (N,) float64, the true position of each frame in units of reference frames,
-            or None where it is unknown.
+        name: in messages, a path or a `sim:` address; see `printable`.
+        length: number of frames N, or None if only reading to the end can tell.
+        place: (N,) float64, the true position of each frame in reference frames, or None if unknown.
         cut: how the frames were cut out of one long image, and which of all such cuts they are: two traverses
-            that were cut alike show the same places. None where they were not cut out of one.
-        seeks: whether `between` reads nothing ahead of the first frame that is asked for.
+            that were cut alike show the same places. None if they were not.
+        seeks: whether `between` reads nothing before the first frame asked for.
         sized: whether the size of the frames was asked for, as by `width=` of a video.
     """
 
@@ -62,15 +62,11 @@ class Traverse(ABC):
     def batches(self, size: int) -> Iterator[Tensor]:
         """Yield the frames in order, at most `size` at a time.
 
-        Shape: each batch is (B,C,H,W) float32 in [0,1], or (B,D) float where the traverse
-        holds ready-made features.
+        Shape: each batch is (B,C,H,W) float32 in [0,1], or (B,D) float if the traverse holds features.
         """
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        """The frames [start, stop), as `batches` gives them; those ahead of them are read as well.
-
-        A traverse that can begin anywhere does so.
-        """
+        """The frames [start, stop), as `batches` gives them; those before may be read as well."""
         seen = 0
         for batch in self.batches(self.batch_size()):
             if seen >= stop:
@@ -83,13 +79,13 @@ class Traverse(ABC):
     def select(self, frames: range, size: int) -> Iterator[Tensor]:
         """The frames of an increasing range, `size` at a time; a traverse may end before it does.
 
-        Only the last batch is smaller: what is drawn for each batch must not hang on how frames are read.
+        Only the last batch is smaller: random numbers drawn per batch must not depend on how frames are read.
         """
-        ahead = 0  # of the next frame that is wanted
+        offset = 0  # of the next frame of the range
         held: list[Tensor] = []
         for part in self.between(frames.start, frames.stop):
-            held.append(part[ahead :: frames.step])
-            ahead = (ahead - len(part)) % frames.step
+            held.append(part[offset :: frames.step])
+            offset = (offset - len(part)) % frames.step
             if sum(map(len, held)) >= size:
                 *whole, last = torch.cat(held).split(size)
                 yield from whole
@@ -99,7 +95,7 @@ class Traverse(ABC):
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
-        """Shape of one frame: (C,H,W), or (D,) where the traverse holds ready-made features.
+        """Shape of one frame: (C,H,W), or (D,) if the traverse holds features.
 
         Raises:
             InputError: there are no frames.
@@ -109,28 +105,28 @@ class Traverse(ABC):
         raise InputError(f"{self.name} holds no frames; expected at least one")
 
     def frame_name(self, i: int) -> str:
-        """What frame i is called where it comes from: a file name, the time in a video; "" for no name."""
+        """Name of frame i in its source, such as a file name or the time in a video; "" for none."""
         return ""
 
     def frame_time(self, i: int) -> float:
-        """When frame i was taken, in seconds; NaN where that is not known."""
+        """When frame i was taken, in seconds; NaN if unknown."""
         return math.nan
 
     def identity(self) -> str:
-        """What tells these frames from others, as far as the way they are asked for does."""
+        """Distinguishes these frames from others, as far as the way they are asked for does."""
         return f"{self.name} {self.length}"
 
     def state(self, start: int, stop: int) -> str:
-        """What tells whether the frames [start, stop) were changed, as far as can be told without reading
-        them; such as the times of their files."""
+        """Changes if the frames [start, stop) do, as far as can be told without reading them; such as the
+        times of their files."""
         return ""
 
     def count(self) -> int:
-        """Number of frames, read through where the traverse does not know its length."""
+        """Number of frames, read through if the traverse does not know its length."""
         return sum(map(len, self.batches(self.batch_size()))) if self.length is None else self.length
 
     def batch_size(self, most: int = AT_ONCE) -> int:
-        """How many frames to read at a time: `most`, or fewer where frames are large.
+        """How many frames to read at a time: `most`, or fewer if frames are large.
 
         Raises:
             InputError: a frame of more than 2^28 numbers.
@@ -153,9 +149,8 @@ class FrequencyLayer:
         start, stop: the chunk [start, stop) in places.
         features: the indices of the features that take part, increasing.
 
-    Convention: a place is a frame of the reference, or an even step where frames were resampled
-    (section IV-B). phase(i) = floor((i mod period) * phases / period) counts from absolute place 0,
-    not from the start of the chunk.
+    Convention: a place is a frame of the reference, or an even step if frames were resampled (section IV-B).
+        phase(i) = floor((i mod period) * phases / period) counts from absolute place 0.
     """
 
     period: Fraction
@@ -166,27 +161,26 @@ class FrequencyLayer:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "period", Fraction(self.period))
-        if self.period <= 0 or self.phases < 1:
+        a, b = self.period.as_integer_ratio()
+        if a <= 0 or self.phases < 1:
             raise InputError(
                 f"a layer has period {self.period} and {self.phases} phases; expected period > 0, phases >= 1"
             )
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
-        a, b = self.period.as_integer_ratio()
         if max(self.stop * b, a * self.phases) >= 2**63:
             raise InputError(
                 f"a layer has period {self.period}, {self.phases} phases and the end {self.stop}; "
                 "expected numbers whose products are below 2^63"
             )
-        ascending = all(a < b for a, b in pairwise(self.features))
-        if not self.features or self.features[0] < 0 or not ascending:
+        if not self.features or not all(i < j for i, j in pairwise((-1, *self.features))):
             raise InputError(
                 "a layer's feature indices must be non-empty, non-negative and strictly increasing"
             )
 
     def phase(self, places: Tensor) -> Tensor:
         """Phase of each place, in exact integer arithmetic. (n,) int64 -> (n,) int64 in 0..P-1."""
-        a, b = self.period.numerator, self.period.denominator
+        a, b = self.period.as_integer_ratio()
         return (places * b).remainder(a) * self.phases // a
 
     @property
@@ -198,45 +192,56 @@ class FrequencyLayer:
 Plan = tuple[FrequencyLayer, ...]
 
 
-class _Reported(NamedTuple):
+class _Columns(NamedTuple):
     index: Tensor  # type: ignore[assignment]  # the field shadows tuple.index
     score: Tensor
     accepted: Tensor
 
 
-class Match(_Reported):
+class Match(_Columns):
     """Where each query was found (eq. 5) and whether to believe it (eq. 6): index, score, accepted.
 
-    index: (Q,) int64, the reported place, -1 where no place has a finite score.
-    score: (Q,) float, the lowest S; lower is better, +inf where nothing covers.
-    accepted: (Q,) bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
-    probability: (Q,) float64, of being right, where the map is calibrated; else None. It goes along with the
-        three, but is none of the tuple's.
+    index: (Q,) int64, the reported place, -1 where no place has a finite score; (Q,k) candidates, best first.
+    score: float, the lowest S; lower is better, +inf where nothing covers.
+    accepted: bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
+    probability: float64, of being right, where the map is calibrated, else None; of candidates only the first
+        has one, the others NaN. sequences: by T, the matches (Q,) by sequences of T queries, where wanted.
+        Both are outside the tuple.
     """
 
     probability: Tensor | None = None
+    sequences: Mapping[int, Match] = MappingProxyType({})
 
-    def with_probability(self, probability: Tensor | None) -> Match:
-        """The same with other probabilities."""
+    def with_probability(
+        self, probability: Tensor | None, sequences: Mapping[int, Match] | None = None
+    ) -> Match:
+        """The same with another probability, and other sequences unless None."""
         match = Match(*self)
         match.probability = probability
+        match.sequences = self.sequences if sequences is None else sequences
         return match
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
-        """The same of every column."""
-        sure = None if self.probability is None else change(self.probability)
-        return Match(*map(change, self)).with_probability(sure)
+        """The same change of every column; `sequences` stay."""
+        probability = None if self.probability is None else change(self.probability)
+        return Match(*map(change, self)).with_probability(probability, self.sequences)
+
+    def renumbered(self, place: Callable[[Tensor], Tensor]) -> Match:
+        """Places by other numbers, in `sequences` too; -1 must stay."""
+        sequences = {T: match.renumbered(place) for T, match in self.sequences.items()}
+        return self._replace(index=place(self.index)).with_probability(self.probability, sequences)
 
     @staticmethod
     def joined(parts: Iterable[Match]) -> Match:
-        """Matches of queries one behind the other as one."""
+        """Concatenate matches of consecutive queries."""
         parts = list(parts)
-        sure = [part.probability for part in parts if part.probability is not None]
-        match = Match(*map(torch.cat, zip(*parts, strict=True)))
-        return match.with_probability(torch.cat(sure) if len(sure) == len(parts) else None)
+        known = [part.probability for part in parts if part.probability is not None]
+        probability = torch.cat(known) if len(known) == len(parts) else None
+        sequences = {T: Match.joined(part.sequences[T] for part in parts) for T in parts[0].sequences}
+        return Match(*map(torch.cat, zip(*parts, strict=True))).with_probability(probability, sequences)
 
     def _replace(self, **changes: Tensor) -> Match:
-        return Match(*super()._replace(**changes)).with_probability(self.probability)
+        return Match(*super()._replace(**changes)).with_probability(self.probability, self.sequences)
 
 
 class Training(NamedTuple):
@@ -262,53 +267,38 @@ class GroundTruth(NamedTuple):
     ignored: Tensor
 
 
-class Scorer(Protocol):
-    """The part of a map that a `SequenceModel` uses."""
-
-    places: int
-
-    def scores(self, queries: Tensor) -> Tensor:
-        """Scores of all places: (Q,D) -> (Q,N), lower is better."""
-
-    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
-        """Scores of the places [start, stop): (Q,D) -> (Q,stop - start)."""
-
-
 class SequenceModel(nn.Module, ABC):
     """Scores of places from consecutive queries, not from one: what `sequence` of `DejaVu.localize` takes.
 
-    Convention: causal; the score of a query tells of the place of that query. Memory does not grow with the
+    Convention: causal; the score of a query is for the place of that query. Memory does not grow with the
     queries.
     """
 
-    likely: float | None = None  # a score below it is more likely right than not, where scores tell that
-
-    @property
-    def shifts(self) -> tuple[tuple[int, ...], ...]:
-        """The trajectories, of a model whose score is the best mean along some: a map may add them up itself.
-
-        Of each trajectory, how many places it lies behind its end 0, 1, .., T - 1 queries before the latest.
-        () for a model that scores otherwise.
-        """
-        return ()
+    likely: float | None = None  # a score below it is more likely right than not, where scores say that
 
     @abstractmethod
+    def start(self, places: int, fixed: bool = False) -> Tensor:
+        """The state before the first query.
+
+        Args:
+            fixed: of the shape that it keeps, as an exported graph needs.
+        """
+
+    @abstractmethod
+    def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+        """Scores (B,N) of the next queries, one or more, and the state -> scores (B,N) and the next state.
+
+        Args:
+            firsts: the first place of each route of the map.
+        """
+
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Scores of batches (B,N) that come one behind the other, from those of single queries."""
-
-    def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
-        """Scores of batches of descriptors (B,D) that come one behind the other: (B,N) each.
-
-        A subclass that needs no scores of most places does not ask for them.
-        """
-        return self.stream(map(route.scores, batches))
-
-    def best(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[tuple[Tensor, Tensor]] | None:
-        """What is best by the scores of `follow`, where that takes less than scores of all places, else None.
-
-        Shape: batches (B,D) -> (B,) scores and (B,) int64 places, -1 for none, each.
-        """
-        return None
+        """`step` over consecutive batches (B,N); no gradient passes from one to the next."""
+        state = None
+        for scores in batches:
+            state = self.start(scores.shape[1]).to(scores) if state is None else state
+            found, state = self.step(scores, state.detach())
+            yield found
 
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:

@@ -489,7 +489,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn sim:aerial?frames=many --map m.safetensors": ("frames is 'many'", "integer"),
     "localize m a.npy --out m.csv --top some": ("--top is some", "integer"),
     "localize m a.npy --out m.csv --speeds [fast]": ("--speeds is", "fast", "a list"),
-    "localize m a.npy --out m.csv --search fast": ("--search is fast", "auto, scan, bound or ivf"),
+    "localize m a.npy --out m.csv --search fast": ("--search is fast", "auto or scan"),
     "compare a.npy b.npy --out r --config paper": ("18 places", "1024", "--mapper.periods.short shrink"),
     "compare a.npy b.npy --out r --leave_out 3": ("leave_out is 3", "--config local_maxima"),
     "evaluate a.csv --truth 0 --out r --tolerance some": ("--tolerance is some", "integer"),

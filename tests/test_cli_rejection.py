@@ -138,8 +138,6 @@ def test_precisions_that_cannot_be_asked_for(
             "localize live",
         ),
         ("--search_every 9", ("--search_every 9", "--filter"), "localize"),
-        ("--filter --search bound", ("--filter", "--search bound"), "localize"),
-        ("--sequence 5 --search ivf", ("--sequence 5", "--search ivf"), "localize"),
     ],
 )
 def test_options_that_exclude_each_other_are_told_before_anything_is_read(

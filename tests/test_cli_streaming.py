@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,11 @@ import pytest
 import torch
 from command_line import fails, frames, run, write_images
 
-from dejavu_torch.cli import main
+from dejavu_torch.cli import commands, main
+from dejavu_torch.learning import ChunkCoder, code_here
+from dejavu_torch.maps.spectral_map import Chunk
 from dejavu_torch.model import DejaVu
+from dejavu_torch.types import Traverse
 
 # more than the sample, of which features are ready
 CHUNKED = ("--mapper.chunk", "250", "--mapper.route_bytes_per_place", "2")
@@ -39,32 +43,29 @@ def whole(route: Path) -> Path:
     return path
 
 
-def test_a_killed_run_goes_on_where_it_was(route: Path, whole: Path, tmp_path: Path) -> None:
-    out = tmp_path / "route.safetensors"
-    command = [sys.executable, "-m", "dejavu_torch.cli", "learn", str(route), "--map", str(out), *CHUNKED]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    folder = tmp_path / "route.safetensors.work"
+def test_a_killed_run_goes_on_where_it_was(
+    route: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, part = tmp_path / "route.safetensors", tmp_path / "route.safetensors.part"
+    words = ["learn", str(route), "--map", str(out), *CHUNKED]
+    program = "import sys; from dejavu_torch import learning; learning.SAVED = 0; "
+    program += f"from dejavu_torch.cli import main; main({words!r})"
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.DEVNULL)
     stop = time.monotonic() + 120
-    while len(list(folder.glob("chunks-*"))) < 3 and time.monotonic() < stop:
-        time.sleep(0.01)
+    while not part.exists() and time.monotonic() < stop:
+        time.sleep(0.001)
     process.kill()
     assert process.wait() == -signal.SIGKILL
     assert not out.exists()
-    kept = {file: file.stat().st_mtime_ns for file in folder.glob("chunks-*")}
-    assert 3 <= len(kept) < 13
-    # the state of each file when the map is about to be written
-    seen: dict[Path, int] = {}
-    save = DejaVu.save
+    began: list[int] = []
 
-    def noted(self: DejaVu, path: str | Path) -> None:
-        seen.update({file: file.stat().st_mtime_ns for file in folder.glob("chunks-*")})
-        save(self, path)
+    def noted(coder: ChunkCoder, traverse: Traverse, first: int, text: str | None = None) -> Iterator[Chunk]:
+        began.append(first)
+        return code_here(coder, traverse, first, text)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(DejaVu, "save", noted)
-        run("learn", route, "--map", out, *CHUNKED)
-    assert len(seen) == 13
-    assert {file: seen[file] for file in kept} == kept
+    monkeypatch.setattr(commands, "code_here", noted)
+    run(*words)
+    assert 0 < began[0] < LONG / 250
     assert out.read_bytes() == whole.read_bytes()
     assert sorted(file.name for file in tmp_path.iterdir()) == [out.name]
 
@@ -75,22 +76,22 @@ def test_another_command_does_not_take_over_what_is_finished(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "full")
 
-    out = tmp_path / "route.safetensors"
-    folder = tmp_path / "route.safetensors.work"
+    out, part = tmp_path / "route.safetensors", tmp_path / "route.safetensors.part"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DejaVu, "save", full)
         assert "full" in fails(capsys, "learn", route, "--map", out, *CHUNKED)
-    kept = sorted(folder.iterdir())
+    kept = part.read_bytes()
     error = fails(capsys, "learn", route, "--map", out, *CHUNKED[:2], "--mapper.route_bytes_per_place", "3")
-    assert str(folder) in error
+    assert str(part) in error
     assert "settings" in error
     assert "removed" in error
     error = fails(capsys, "learn", f"{route}?stop=600", "--map", out, *CHUNKED)
-    assert str(folder) in error
+    assert str(part) in error
     assert "another run" in error
-    assert sorted(folder.iterdir()) == kept
+    assert part.read_bytes() == kept
     run("learn", route, "--map", out, *CHUNKED)
     assert out.read_bytes() == whole.read_bytes()
+    assert not part.exists()
 
 
 def test_several_sources_are_one_route(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,7 +30,7 @@ from dejavu_torch import (
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.place_map import Mapper
-from dejavu_torch.recognition.candidates import best_candidates
+from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import SequenceModel
 
 SEQUENCES = [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3), None]
@@ -62,7 +62,7 @@ def test_a_frame_stays_on_its_device(kind: str, frames: Tensor, monkeypatch: pyt
     with torch.no_grad():
         scores = model(torch.empty(4, 3, 64, 64, device="meta"))
         descriptors = model.whitened(model.describe(torch.empty(4, 3, 64, 64, device="meta")))
-        (together,) = model.map.sequences([descriptors], PlaceFilter())
+        together = PlaceFilter()(model.map.scores(descriptors))
         assert (together.device.type, together.shape) == ("meta", (4, 60))
         assert best_candidates(scores, 3, 5).index.device.type == "meta"
     with pytest.raises(RuntimeError, match="device"):

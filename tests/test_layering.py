@@ -65,11 +65,8 @@ def room_of(file: Path) -> str:
     return file.parts[0].removesuffix(".py")
 
 
-def rooms_imported(source: str, file: Path) -> Iterator[tuple[int, str]]:
-    """Every import of the package in a file, wherever it stands: (line, room).
-
-    A name of the front door itself, such as `__version__`, counts as the room "".
-    """
+def imported(source: str, file: Path) -> Iterator[tuple[int, str]]:
+    """Every import in a file, in functions and under TYPE_CHECKING too: (line, dotted name)."""
     package = ["dejavu_torch", *file.parent.parts]
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -80,10 +77,36 @@ def rooms_imported(source: str, file: Path) -> Iterator[tuple[int, str]]:
             targets = [f"{module}.{alias.name}" for alias in node.names]
         else:
             continue
-        for target in targets:
-            name, *rest = target.split(".")
-            if name == "dejavu_torch":
-                yield node.lineno, rest[0] if rest and rest[0] in RANK else ""
+        yield from ((node.lineno, target) for target in targets)
+
+
+def rooms_imported(source: str, file: Path) -> Iterator[tuple[int, str]]:
+    """Every import of the package in a file: (line, room).
+
+    A name of the front door itself, such as `__version__`, counts as the room "".
+    """
+    for line, target in imported(source, file):
+        name, *rest = target.split(".")
+        if name == "dejavu_torch":
+            yield line, rest[0] if rest and rest[0] in RANK else ""
+
+
+def circles(sources: dict[Path, str]) -> list[str]:
+    """Files that import one another, if through others: of each circle the names of its files."""
+    named = {".".join(("dejavu_torch", *file.with_suffix("").parts)): file for file in sources}
+    named |= {name.removesuffix(".__init__"): file for name, file in named.items()}
+    del named["dejavu_torch"]  # the front door opens lazily
+    reached: dict[Path, set[Path]] = {}
+    for file, source in sources.items():
+        targets = [target for _, target in imported(source, file)]
+        names = {name if name in named else name.rpartition(".")[0] for name in targets}
+        reached[file] = {named[name] for name in names & named.keys()} - {file}
+    for middle in sources:  # Warshall: all that can be reached through any file
+        for file in sources:
+            if middle in reached[file]:
+                reached[file] |= reached[middle]
+    found = {frozenset(other for other in reached[file] if file in reached[other]) for file in sources}
+    return [", ".join(sorted(map(str, circle))) for circle in found if circle]
 
 
 def front_door_rank() -> int:
@@ -121,6 +144,37 @@ def arrows() -> dict[str, set[str]]:
 
 def test_the_arrows_between_rooms_are_these() -> None:
     assert arrows() == {room: set(rooms.split()) for room, rooms in ARROWS.items()}
+
+
+def test_no_files_import_one_another() -> None:
+    assert circles({file: (PACKAGE / file).read_text(encoding="utf-8") for file in FILES}) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from dejavu_torch.maps.one import f",
+        "import dejavu_torch.maps.one",
+        "from . import one",
+        "def f():\n    from dejavu_torch.maps import one",
+        "if TYPE_CHECKING:\n    from .one import f",
+        "from dejavu_torch.maps.three import f",
+        "from dejavu_torch import maps",
+    ],
+)
+def test_a_circle_is_caught(source: str) -> None:
+    sources = {
+        "__init__.py": "from dejavu_torch.maps.one import f",
+        "maps/__init__.py": "from dejavu_torch.maps import two",
+        "maps/one.py": "from dejavu_torch.maps.two import f",
+        "maps/three.py": "from dejavu_torch import maps\nfrom dejavu_torch.maps.one import f",
+        "types.py": "import torch",
+    }
+    assert (
+        circles({Path(name): text for name, text in {**sources, "maps/two.py": "import torch"}.items()}) == []
+    )
+    (circle,) = circles({Path(name): text for name, text in {**sources, "maps/two.py": source}.items()})
+    assert "maps/two.py" in circle
 
 
 @pytest.mark.parametrize("file", FILES, ids=NAMES)

@@ -59,8 +59,8 @@ def test_the_first_candidate_is_what_localize_finds(
     monkeypatch: pytest.MonkeyPatch, model: DejaVu, at_once: int
 ) -> None:
     queries = torch.rand(40, 6, generator=torch.Generator().manual_seed(1))
-    index, score = model.candidates(queries, 5, apart=3)
-    monkeypatch.setattr("dejavu_torch.recognition.search.SCORES_AT_ONCE", at_once)
+    index, score, _ = model.candidates(queries, 5, apart=3)
+    monkeypatch.setattr("dejavu_torch.recognition.localizer.SCORES_AT_ONCE", at_once)
     match = model.localize(queries)
     found = model.candidates(ArrayTraverse(queries), 5, apart=3)
     assert torch.equal(found.index, index)
@@ -75,7 +75,8 @@ def test_the_first_candidate_is_what_localize_finds(
 
 
 def test_behind_the_last_covered_place_there_is_none(model: DejaVu) -> None:
-    index, score = model.candidates(waves()[:7], 4, apart=30)
+    index, score, accepted = model.candidates(waves()[:7], 4, apart=30)
+    assert torch.equal(accepted, index >= 0)
     assert (index[:, -1] == -1).all()
     assert score[:, -1].isinf().all()
     assert index.max() < 80
@@ -230,7 +231,7 @@ def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp
     assert torch.equal(candidates.index[:, 0], model.localize(query).index)
     assert (candidates.index[:, :, None] - candidates.index[:, None]).abs().add(99 * torch.eye(5)).min() > 6
     path = tmp_path / "m.csv"
-    write_matches(path, [candidates.as_match()], steps.frame, model.map.frame_of, ranks=5)
+    write_matches(path, [candidates.map(torch.Tensor.flatten)], steps.frame, model.map.frame_of, ranks=5)
     read = read_matches(path)
     assert torch.equal(read.query, steps.frame)
     assert torch.equal(read.candidates, model.map.frame_of(candidates.index))

@@ -36,10 +36,9 @@ from dejavu_torch.model_file import NO_MAP, REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.recognition.calibration import NEVER
-from dejavu_torch.recognition.candidates import check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.matching import Found
-from dejavu_torch.recognition.search import Search, check_search
+from dejavu_torch.recognition.search import Search
+from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
@@ -51,7 +50,6 @@ if TYPE_CHECKING:
 NO_CALIBRATION = "none"
 UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
 COMPARED = ("map.safetensors", "matches.csv")  # beside a report of them
-SAMPLE = 64  # queries for which an inexact search is compared with a scan
 APART = 5  # places: any two candidates of a query are further apart
 
 
@@ -251,10 +249,8 @@ def run_localize(
             if not given
         search_every: of the filter, queries from one search of all places to the next; in between only those
             near the last place are scored; 1 if not given
-        search: of single queries: scan scores all places; bound, of a map with chunks, passes over those that
-            cannot be best, and finds the same; ivf, with faiss, scores the places of one list
-            in 32, but at least 32, of 2 sqrt(places), and may miss the best; auto takes scan or bound, by
-            what the first queries show
+        search: of single queries: scan scores all places; auto also, unless the map has a faster way to the
+            same places
         cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
         device: what computes: cpu, cuda, cuda:1 or mps
         features: class of the map's features, if not ours
@@ -266,16 +262,10 @@ def run_localize(
     _check_accepting(threshold, precision, matcher)
     if top is not None:
         check_candidates(top, APART)
-    if matcher is not None and search in ("bound", "ivf"):
-        together = "--filter" if filter else f"--sequence {sequence}"
-        raise InputError(
-            f"--search {search} and {together}, which needs the scores of all places; expected one of them"
-        )
     if cluster is not None:
         _check_cluster(cluster, device)
-        if filter or sequence != 1 or search not in ("auto", "scan"):
-            together = "--filter" if filter else f"--search {search}"
-            together = f"--sequence {sequence}" if sequence != 1 else together
+        if filter or sequence != 1:
+            together = "--filter" if filter else f"--sequence {sequence}"
             raise InputError(f"--cluster {cluster} and {together}; expected one of them")
     model = _load_map(map, features).to(where)
     if corners is not None:
@@ -295,15 +285,11 @@ def run_localize(
         _print_steps(query)
     if matcher is not None:
         matcher.check(None, model.map.places)
-    else:
-        check_search(search, model.map)
-        model.searcher(search).sample = SAMPLE
     model.check_precision(matcher)
     rule = model.acceptance(matcher)
-    matches = model.matches(query, "localizing", matcher, search)
+    matches = model.matches(query, "localizing", matcher, search, top, APART)
     if top is not None:
-        found = model.candidate_batches(query, top, APART, "localizing", matcher, search)
-        matches = (part.ranked(rule) for part in found)
+        matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()
     with _searching(cluster, model):
         total, accepted = _write_matches(out, _counted(matches, counts), query, model, top)
@@ -311,9 +297,6 @@ def run_localize(
         print("the map holds no layers: no place can be reported")
     elif not rule.given:
         print(rule)
-    told = model.searcher(search).told
-    if matcher is None and told.method in ("bound", "ivf"):
-        print(told)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
         steps = next_steps(matcher is not None, rule.given)
@@ -838,10 +821,10 @@ def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
     if cluster is None:
         yield
         return
-    from dejavu_torch.cluster import Cluster, ClusterSearcher
+    from dejavu_torch.cluster import Cluster, ClusterSearch
 
     with Cluster(cluster) as workers:
-        model.search_by(ClusterSearcher(workers, model.map))
+        model.search_by(ClusterSearch(workers, model.map))
         yield
 
 
@@ -1144,8 +1127,7 @@ def _publish(
         print(rule)
     match = run.match
     if top is not None:
-        found = Found(result.candidates, probability=match.probability)
-        match = found.first(top).ranked(rule)
+        match = result.candidates.map(lambda column: column[:, :top].flatten())
     with report_folder(out) as folder:
         if given is None or given.resolve() != kept.resolve():
             run.model.save(folder / kept.name)

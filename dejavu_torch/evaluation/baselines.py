@@ -16,13 +16,11 @@ from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.maps.template_map import TemplateMap
+from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.periods.finder import ForeignPeriods
-from dejavu_torch.recognition.candidates import Candidates
-from dejavu_torch.recognition.matching import SINGLE, Found, Matching
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.recognition.localizer import SINGLE, Matcher, Matching
+from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -37,7 +35,7 @@ class Baseline(NamedTuple):
     """
 
     name: str
-    found: Found
+    found: Match
     bytes: int | None = None
     k: int | None = None
     fixed: int = 0
@@ -67,7 +65,7 @@ def nearest_frames(
     metric: Metric = "l1",
     progress: str | None = None,
     matching: Matching = SINGLE,
-) -> Found:
+) -> Match:
     """Nearest stored frame of each query, where every k-th reference frame is stored.
 
     Args:
@@ -92,17 +90,18 @@ def nearest_frames(
     scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
     if k > 1:
         scores = (part[:, nearest] for part in scores)
-    found, nearest = matching.found(scores), nearest.cpu()
+    matcher, nearest = Matcher(matching), nearest.cpu()
+    found = Match.joined(map(matcher.match, scores))
 
     def of_one(frame: Tensor) -> Tensor:
         return torch.where(frame >= 0, k * nearest[frame], -1)
 
-    candidates, sequences = found.candidates, dict(found.sequences)
-    if matching.single:
-        candidates = candidates._replace(index=of_one(candidates.index))
+    sequences = dict(found.sequences)
     if 1 in sequences:
-        sequences[1] = sequences[1]._replace(index=of_one(sequences[1].index))
-    return Found(candidates, sequences)
+        sequences[1] = sequences[1].renumbered(of_one)
+    if matching.single:
+        found = found._replace(index=of_one(found.index))
+    return found.with_probability(None, sequences)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
@@ -152,7 +151,7 @@ def baselines_of(
         control, order = null_model(model, reference, seed, same_plan)
         return Baseline(f"null: {name}", control.found(query, matching, order))
 
-    foreign = isinstance(getattr(model.mapper, "periods", None), ForeignPeriods)
+    foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
         log.warning("no null control learned anew: what found the map's periods is not of this package")
     if isinstance(model.map, SpectralMap):
@@ -166,7 +165,7 @@ def baselines_of(
             found["null"] = null(f"templates of shuffled {one}s", same_plan=True)
     if leave_out is not None:
         index, score, *_ = leave_out_match(model, reference, leave_out)
-        itself = Found(Candidates(index[:, None], score[:, None]))
+        itself = Match(index, score, score.isfinite())
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     return found
 

@@ -53,7 +53,7 @@ from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.matching import SINGLE, Matching
+from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, SequenceModel, Traverse

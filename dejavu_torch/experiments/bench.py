@@ -33,6 +33,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
 from dejavu_torch.types import FrequencyLayer, InputError
@@ -107,7 +108,8 @@ def bench_matcher(
         frames: grey frames to describe, of each size in `images` (height, width in pixels).
         repeats: timed runs of each contender, in turn; the best counts.
         distances: queries, features and templates of each case of L1.
-        sequences: queries, queries of a sequence and places of each case of sequences on a template map.
+        sequences: queries, queries of a sequence and places of each case of a template map whose sequences
+            are matched in one batch, beside a query at a time.
         filters: queries and places of each case of a filter that searches all places for every 50th query,
             beside one that does for every query; the difference is one of probabilities.
         exports: frames, their height and width, and places of each case of single frames, found one behind
@@ -263,11 +265,12 @@ def _sequence_case(
     blocks = [templates[:tau, j, None] for j, tau in enumerate(PERIODS)]
     route, matcher = TemplateMap(plan, blocks, places, len(plan)), SequenceMatcher(length)
 
-    def run() -> Tensor:
-        scores: Tensor = matcher(route.scores(query))
-        return scores[:, length:]  # before it some are +inf
+    def drive(size: int) -> Tensor:
+        scores = route.scores(query).split(size)
+        return torch.cat([*matcher.stream(scores)])[:, length:]  # before it some are +inf
 
-    return benchmark(case, _ours(run), repeats)
+    one_by_one = Program("dejavu (a query at a time)", torch.get_num_threads(), lambda: partial(drive, 1))
+    return benchmark(case, [*_ours(partial(drive, len(query))), one_by_one], repeats)
 
 
 def _smooth(steps: Tensor) -> Tensor:
@@ -284,8 +287,12 @@ def _filter_case(case: str, route: Tensor, noise: Tensor, repeats: int) -> list[
 
     def drive(every: int) -> Tensor:
         with torch.no_grad():
-            scores = spectral.sequences(queries, PlaceFilter(search_every=every))
-            return torch.cat([(-part).exp() for part in scores])
+            rows: list[Tensor] = []
+            matching = Matching(PlaceFilter(search_every=every), on_scores=rows.append)
+            localizer = Localizer(spectral, matching)
+            for part in queries:
+                localizer(part)
+            return torch.cat([(-row).exp() for row in rows])
 
     beside = Program("dejavu (all places)", torch.get_num_threads(), lambda: partial(drive, 1))
     return benchmark(case, [*_ours(partial(drive, 50)), beside], repeats)

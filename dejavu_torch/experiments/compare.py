@@ -45,9 +45,9 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.stft import BACKEND
-from dejavu_torch.recognition.candidates import Candidates, check_candidates
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.matching import Found, Matching, lengths_beside
+from dejavu_torch.recognition.localizer import Matching, lengths_beside
+from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
@@ -68,7 +68,7 @@ class Comparison(NamedTuple):
     report: Report
     pictures: Mapping[str, Picture]
     run: Localization
-    candidates: Candidates
+    candidates: Match
 
     def __repr__(self) -> str:
         return f"{self.run!r}\n{self.report!r}\npictures: {', '.join(self.pictures)}"
@@ -160,9 +160,9 @@ def compare(
             sequence.check(len(queries), model.map.places)
         ranks = max(top, min(max(RANKS), model.map.places))
         matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
-        wanted = matching._replace(ranks=ranks, apart=tolerance, platt=model.matching(sequence).platt)
-        found = model.found(queries, wanted)
-    match, candidates = found.match(model.acceptance(sequence)), found.candidates
+        wanted = model.matching(sequence)._replace(lengths=matching.lengths, k=ranks, radius=tolerance)
+        candidates = model.found(queries, wanted)
+    match = candidates.map(lambda column: column[:, 0])
     off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
     if distractors and not off_map:
         log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
@@ -173,7 +173,7 @@ def compare(
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
     run = Localization(model, reference, query, places, queries, match, known, tolerance, matching)
-    contenders = _contenders(run, found, seed, leave_out, progress)
+    contenders = _contenders(run, match, seed, leave_out, progress)
     for key, (name, other) in (others or {}).items():
         if known is not None:
             contenders[key] = _learned_beside(run, name, other)
@@ -284,7 +284,7 @@ def of_shown_frames(match: Match, route: PlaceMap) -> Match:
 
 
 def _contenders(
-    run: Localization, found: Found, seed: int, leave_out: int | None, progress: bool
+    run: Localization, found: Match, seed: int, leave_out: int | None, progress: bool
 ) -> dict[str, Contender]:
     """The map and what it is set beside, by their keys in report.json; the map's own is `map`.
 
@@ -303,19 +303,19 @@ def _contenders(
     if run.sequence is not None:
         baselines |= seqslam_baseline(*traverses, size, progress, run.matching)
     for key, (name, answers, bytes, k, fixed) in baselines.items():
-        truth, answers = run.truth, answers.moved(model.map.table.scored)
+        truth, answers = run.truth, answers.renumbered(model.map.table.scored)
         if key == "leave_out":  # its queries are the places themselves
             own = model.map.frame_of(torch.arange(model.map.places))[:, None]
             truth = ground_truth_in_places(as_ground_truth(own), model.map.place_of)
-        contenders[key] = contend(name, answers.match(), truth, tolerance, bytes, k, fixed, answers.sequences)
+        contenders[key] = contend(name, answers, truth, tolerance, bytes, k, fixed, answers.sequences)
     return contenders
 
 
-def _contend(run: Localization, name: str, found: Found, model: DejaVu) -> Contender:
+def _contend(run: Localization, name: str, found: Match, model: DejaVu) -> Contender:
     """What a model found of the run's places."""
-    found, summary = found.moved(run.model.map.table.scored), model.summary()
+    found, summary = found.renumbered(run.model.map.table.scored), model.summary()
     sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
-    return contend(name, found.match(), run.truth, run.tolerance, **sizes, sequences=found.sequences)
+    return contend(name, found, run.truth, run.tolerance, **sizes, sequences=found.sequences)
 
 
 def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:

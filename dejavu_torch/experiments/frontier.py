@@ -27,9 +27,9 @@ from dejavu_torch.experiments.reproduce import paper_model
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
-from dejavu_torch.recognition.matching import LENGTHS, Found, Matching, lengths_beside
+from dejavu_torch.recognition.localizer import LENGTHS, Matching, lengths_beside
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import GroundTruth, InputError, Traverse
+from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
 SHOWN = (1.0, 1.6, 3.2, 5.0, 10.0)  # of the table
@@ -103,7 +103,7 @@ class Route(NamedTuple):
 class Answer(NamedTuple):
     """What a contender finds, and its bytes: those that grow with the route, and all others."""
 
-    found: Found
+    found: Match
     route: int
     fixed: int
 
@@ -374,7 +374,7 @@ def _among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer
 
 def _by_map(route: Route, model: DejaVu, matching: Matching) -> Answer:
     """A map on descriptors of its own."""
-    found = model.found(model.extract_all(route.query), matching).moved(model.map.table.scored)
+    found = model.found(model.extract_all(route.query), matching).renumbered(model.map.table.scored)
     summary = model.summary()
     return Answer(found, summary.route_bytes, summary.fixed_bytes)
 

@@ -195,12 +195,12 @@ def parts_of(model: DejaVu, video: Video, repeats: int = 30) -> dict[str, float]
     descriptor = whitening(features, unpacked)
     scores = model.map.scores(descriptor)
     assert localizer.sequence is not None
-    filtered = localizer.sequence.stream(scores for _ in iter(int, 1))
+    filter, state = localizer.sequence, localizer.sequence.start(model.map.places)
     works: dict[str, Callable[[], object]] = {
         "features": lambda: model.describe(frame),
         "whitening": lambda: whitening(features, unpacked),
         "scores": lambda: model.map.scores(descriptor),
-        "filter": lambda: next(filtered),
+        "filter": lambda: filter.step(scores, state),
     }
     for name, work in works.items():
         times = []

@@ -27,7 +27,6 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.calibration import MARGIN
 from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.recognition.steps import Step, step_of
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, SequenceModel
 
@@ -95,16 +94,16 @@ class Resized(nn.Module):
 class Graph(nn.Module):
     """A model as what is exported: frames (B,C,H,W), or features (B,D), -> scores (B,N).
 
-    With a step: one frame (1,C,H,W) and the state behind the one before -> scores (1,N) and the next state.
+    With a sequence: one frame (1,C,H,W) and the state before it -> scores (1,N) and the next state.
 
     Args:
-        step: see `step_of`; None takes each frame by itself.
+        sequence: None takes each frame by itself.
 
     Attributes:
         parts: what a frame goes through, by name, in order.
     """
 
-    def __init__(self, model: DejaVu, step: Step | None = None) -> None:
+    def __init__(self, model: DejaVu, sequence: SequenceModel | None = None) -> None:
         super().__init__()
         parts: dict[str, nn.Module] = {}
         shape = model.frame_shape or ()
@@ -118,12 +117,12 @@ class Graph(nn.Module):
             parts["whitening"] = whitening
         parts["map"] = Rebuilt(model.map) if isinstance(model.map, SpectralMap) else model.map
         self.parts = nn.ModuleDict(parts)
-        self.step = step
+        self.sequence = sequence
 
     def forward(self, frames: Tensor, state: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         for part in self.parts.values():
             frames = part(frames)
-        return frames if self.step is None or state is None else self.step(frames, state)
+        return frames if self.sequence is None or state is None else self.sequence.step(frames, state)
 
 
 def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None = None) -> Exported:
@@ -133,7 +132,7 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         model: with a map. A spectral map is rebuilt: the file holds the descriptors of all places, float32.
         path: of the file, written whole or not at all, and only if onnxruntime gives torch's scores with it.
         sequence: a `SequenceMatcher` or a `PlaceFilter`: the file then takes one frame at a time and the
-            state behind the one before, and gives the state behind it; see `SequenceStep` and `FilterStep`.
+            state before it, and gives the next state; see `SequenceModel.step`.
 
     Shape: `frames` (B,C,H,W) float32 in [0, 1] -> `scores` (B,N), for any B, H and W: frames of another size
         than the map's are resized to it. On a map of ready features the input is `features` (B,D). With a
@@ -162,7 +161,6 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         )
     if sequence is not None:
         sequence.check(None, model.map.places)
-    step = None if sequence is None else step_of(sequence)
     size = 4 * model.map.places * model.map.dimension if isinstance(model.map, SpectralMap) else 0
     if size > MOST_BYTES:
         raise InputError(
@@ -170,17 +168,17 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
             f"file holds {MOST_BYTES / 1e9:.1f} GB"
         )
     device = model.map.positions.device
-    graph = Graph(model, step)
+    graph = Graph(model, sequence)
     noise = torch.rand(TRIED, *model.frame_shape, generator=torch.Generator().manual_seed(0)).to(device)
     noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # what is flat, too
     facts = _facts(model, sequence)
     with torch.no_grad(), in_mode(graph, False), _quiet():
         inputs: tuple[Tensor, ...] = (noise[:2],)
-        if step is not None:
-            inputs = noise[:1], step.start(model.map.places).to(device)
+        if sequence is not None:
+            inputs = noise[:1], sequence.start(model.map.places, fixed=True).to(device)
         try:
             names = [*facts["inputs"]], [*facts["outputs"]]
-            free = {0: "batch"} if step is None else {}
+            free = {0: "batch"} if sequence is None else {}
             free |= {2: "height", 3: "width"} if noise.ndim == 4 else {}
             written = _serialised(_program(graph, inputs, names, free), facts)
             difference = _difference(written, graph, noise, facts)
@@ -247,7 +245,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
         "outputs": {"scores": ["batch", places]},
     }
     if sequence is not None:
-        first = step_of(sequence).start(places)
+        first = sequence.start(places, fixed=True)
         facts["inputs"] = {name: [1, *taken], "state": list(first.shape)}
         facts["outputs"] = {"scores": [1, places], "next_state": list(first.shape)}
         facts |= {
@@ -255,7 +253,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
             "sequence": str(sequence),
         }
     platt = model.matching(None).platt if sequence is None else None
-    if platt is not None:  # of `evidence_of`
+    if platt is not None:  # of `confidence_of`
         facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
         precision = model.acceptance().precision
         facts |= {} if precision is None else {"precision": precision}
@@ -337,10 +335,10 @@ def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
 
 def _difference(written: bytes, graph: Graph, frames: Tensor, facts: dict[str, Any]) -> float:
     """How far onnxruntime's scores are from torch's at most, relative above 1."""
-    if graph.step is None:
+    if graph.sequence is None:
         expected = graph(frames)
     else:
-        state, rows = graph.step.start(facts["places"]).to(frames.device), []
+        state, rows = graph.sequence.start(facts["places"], fixed=True).to(frames.device), []
         for frame in frames.split(1):
             scores, state = graph(frame, state)
             rows.append(scores)

@@ -33,7 +33,6 @@ from dejavu_torch.experiments.scale_contenders import (
     CONTENDERS,
     EF_SEARCH,
     FLOWN,
-    IVF,
     ONE_CHUNK,
     PLACED,
     PROBED_AT_LEAST,
@@ -176,19 +175,10 @@ def localize(task: Task, folder: Path) -> dict[str, Any]:
         "peak_bytes": peak,
         "recall_at_1": scores.recall_at_1,
         "auc": scores.auc,
-        "agrees": agreement(task, folder),
         "queries": len(queries),
         "device": opened.device,
         "bandwidth_share": None if scanned is None else scanned / seconds / bandwidth(opened.device),
     }
-
-
-def agreement(task: Task, folder: Path) -> float | None:
-    """Share of the queries whose place is that of the scan; None of what is no search beside one."""
-    scan = task._replace(contender=task.contender.removesuffix(IVF)).found(folder)
-    if not task.contender.endswith(IVF) or not scan.exists():
-        return None
-    return float((np.load(scan) == np.load(task.found(folder))).mean())
 
 
 def bandwidth(device: str) -> float:

@@ -17,13 +17,11 @@ from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.experiments.repeating import step_that_holds
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.search import Search
 
 ROWS = 8192  # descriptors read at a time
 CHUNK = 8192
 SHARE = 0.8  # of the variance of a repeating route
 OURS = "dejavu"
-IVF = ", ivf"  # behind the name of the map that is searched so
 TRAINED, ROTATED = 100_000, 20_000  # samples at most of an index of faiss, of its rotation
 CELLS_PER_PROBE, PROBED_AT_LEAST = 32, 32  # of an inverted file
 EF_SEARCH = 64  # candidates while a graph is searched
@@ -72,7 +70,7 @@ class Mapped(Contender):
 
     Args:
         budget: route bytes per place. chunk: places. step: in place of the budget.
-        shuffled: in random order, the null. search: as of `DejaVu.localize`.
+        shuffled: in random order, the null.
     """
 
     def __init__(
@@ -81,9 +79,8 @@ class Mapped(Contender):
         chunk: int,
         step: float | None = None,
         shuffled: bool = False,
-        search: Search = "auto",
     ) -> None:
-        self.mapper, self.shuffled, self.search = SpectralMapper(budget, step, chunk), shuffled, search
+        self.mapper, self.shuffled = SpectralMapper(budget, step, chunk), shuffled
 
     def prepare(self, route: IndexedTraverse) -> float | None:
         return self.mapper.step
@@ -105,16 +102,11 @@ class Mapped(Contender):
         order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
 
         def find(queries: Tensor) -> Found:
-            match = model.localize_descriptors(queries.to(device), search=self.search)
+            match = model.localize_descriptors(queries.to(device))
             index = match.index.cpu()
             return Found(match.score.cpu(), index if order is None else order[index])
 
-        def scanned() -> int | None:
-            if model.searcher(self.search).told.method != "scan":
-                return None
-            return sum(one.nbytes for one in model.map.buffers())
-
-        return Opened(find, device, scanned)
+        return Opened(find, device, lambda: sum(one.nbytes for one in model.map.buffers()))
 
 
 class Held(Mapped):
@@ -231,8 +223,6 @@ PLACED: dict[str, Callable[[float, float], Contender]] = {
     f"{OURS} 4 B": lambda *_: Mapped(4.0, CHUNK),
     f"{OURS} 1 B, one chunk": lambda *_: Mapped(1.0, WHOLE),
     f"{OURS} 4 B, one chunk": lambda *_: Mapped(4.0, WHOLE),
-    f"{OURS} 1 B{IVF}": lambda *_: Mapped(1.0, CHUNK, search="ivf"),
-    f"{OURS} 4 B{IVF}": lambda *_: Mapped(4.0, CHUNK, search="ivf"),
     "null 1 B": lambda *_: Mapped(1.0, CHUNK, shuffled=True),
     "null 4 B": lambda *_: Mapped(4.0, CHUNK, shuffled=True),
     "faiss flat": lambda *_: Faiss("Flat"),

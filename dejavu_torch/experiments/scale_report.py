@@ -25,10 +25,10 @@ class ScaleRow(NamedTuple):
     each in a process of its own. bytes: of the file. route_bytes: of ours all that grows with the route, mean
     and tables with it; of an index its codes and links alone, without identifiers and codebooks. step: of the
     lines of a map that is not learned to a budget. learn_rate: descriptors a second; ours codes chunks in
-    one thread, whatever `threads`, those that an index is trained and filled by. agrees: share of queries
-    whose place is that of the scan of the same map. ratio_to_ours: seconds over those of our fastest.
-    difference: largest to the places of the scan, of templates. device: that localized. bandwidth_share: of a
-    copy's, by the bytes that a scan goes through once for each batch; peak_bytes are those of the device.
+    one thread, whatever `threads`, those that an index is trained and filled by. ratio_to_ours: seconds over
+    those of our fastest. difference: largest to the places of the scan, of templates. device: that
+    localized. bandwidth_share: of a copy's, by the bytes that a scan goes through once for each batch;
+    peak_bytes are those of the device.
     """
 
     case: str
@@ -50,7 +50,6 @@ class ScaleRow(NamedTuple):
     skipped: str | None = None
     seconds_load: float | None = None
     step: float | None = None
-    agrees: float | None = None
     difference: float | None = None
     device: str | None = None
     bandwidth_share: float | None = None
@@ -141,7 +140,7 @@ def scale_tables(rows: Sequence[ScaleRow]) -> Iterator[tuple[str, list[list[str]
     def text(value: float | None, form: str, unit: float = 1.0) -> str:
         return "" if value is None else format(value * unit, form)
 
-    head = ["", "B/place", "recall@1", "AUC", "agrees", "ms one", "ms of 256", "bandwidth", "s load"]
+    head = ["", "B/place", "recall@1", "AUC", "ms one", "ms of 256", "bandwidth", "s load"]
     head += ["peak MB", "learn MB", "learned/s", ""]
     for case in dict.fromkeys(row.case for row in rows):
         yield (
@@ -153,7 +152,6 @@ def scale_tables(rows: Sequence[ScaleRow]) -> Iterator[tuple[str, list[list[str]
                     text(row.bytes_per_place, ".3g"),
                     text(row.recall_at_1, ".3f"),
                     text(row.auc, ".3f"),
-                    text(row.agrees, ".3f"),
                     text(row.seconds_one, ".3g", 1e3),
                     text(row.seconds, ".3g", 1e3),
                     text(row.bandwidth_share, ".1%"),

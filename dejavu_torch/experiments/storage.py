@@ -18,8 +18,7 @@ from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
-from dejavu_torch.recognition.matching import Found
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Match
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
 
@@ -60,8 +59,8 @@ def storage_curve(
     cases = [(key, budget) for key in kinds for budget in budgets]
     for key, budget in tqdm(cases, "storage", disable=None if progress else True, leave=False):
         for answers, size in kinds[key](budget):
-            answers = answers.moved(route.table.scored)
-            scores = evaluate(answers.match(), run.truth, run.tolerance)
+            answers = answers.renumbered(route.table.scored)
+            scores = evaluate(answers, run.truth, run.tolerance)
             beside = evaluate_each(answers.sequences, run.truth, run.tolerance)
             found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1, beside))
     return found
@@ -96,7 +95,7 @@ def _coded(
     budget: float,
     order: Tensor | None = None,
     resolution: float = 0.0,
-) -> Iterator[tuple[Found, int]]:
+) -> Iterator[tuple[Match, int]]:
     """What is found on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
     mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric, resolution)
     model = with_mapper(run.model, mapper)
@@ -108,7 +107,7 @@ def _coded(
     yield found, sum(tensor.nbytes for tensor in model.map.packed().values())
 
 
-def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Found, int]]:
+def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:
     """What is found among interpolated keyframes of at most so many bytes, and their bytes."""
     between, _, keys = interpolated(as_int8(run.reference_features), budget * route.places)
     size = keys * route.dimension

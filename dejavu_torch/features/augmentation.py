@@ -29,45 +29,38 @@ NO_BLUR = 1e-3  # sigma of a kernel that changes nothing
 
 
 class Augmentation(nn.Module):
-    """Light, lens and view of another day, drawn anew for every clip.
-
-    Every argument is the largest strength of one kind of change, which is drawn uniformly up to it; 0
-    switches the kind off. They act in the order below.
+    """Light, lens and view of another day, drawn anew for every clip, up to the strength of each kind of
+    change.
 
     Args:
         colour: per channel, (gain, offset), at most 1: x * (1 +- gain) +- offset.
-        rotation: degrees, in the plane of the frame. Rotation, shift, scale and perspective act together, on
-            9 clips of 10, and repeat the border.
+        rotation: degrees, in the plane of the frame.
         shift: (horizontal, vertical), fractions of the width and of the height, at most 1.
         scale: fraction, 1 +- scale, at most 0.9.
-        exposure: all channels alike, (gain, offset), at most 1: (x +- offset) * (1 +- gain), clamped to
-            [0, 1] after each step.
-        gamma: x ** g with g from 1 / (1 + gamma) to 1 + gamma, at most 10; on 7 clips of 10.
-        illumination: added or subtracted at one side of the frame, falling evenly to 0 at the opposite side;
-            at most 1; on 1 clip of 2.
-        blur: sigma of a Gaussian, pixels, at most 20, cut off at the nearest whole number of pixels (at least
-            1); on 1 clip of 2.
-        occlusion: fraction of the frame that a rectangle out of another clip covers, as a vehicle does on one
-            day only; its sides are in the ratio of 1:3 to 3:1. The frames of a clip are covered by those of
-            the other clip in order, a clip alone with black; on 7 clips of 10.
-        noise: standard deviation of Gaussian noise, at most 1; on 7 clips of 10.
-        perspective: degrees, at most 45, about the vertical and about the horizontal axis: the frame as a
-            plane, at a distance of its longer side, which is the focal length too, seen from another side.
+        exposure: all channels alike, (gain, offset), at most 1: (x +- offset) * (1 +- gain), clamped each
+            time.
+        gamma: x ** g with g from 1 / (1 + gamma) to 1 + gamma, at most 10.
+        illumination: added or subtracted at one side, falling evenly to 0 at the opposite side; at most 1.
+        blur: sigma of a Gaussian, pixels, at most 20, cut off at the nearest whole number of pixels.
+        occlusion: fraction of the frame that a rectangle of another clip covers, sides 1:3 to 3:1.
+        noise: standard deviation of Gaussian noise, at most 1.
+        perspective: degrees, at most 45, about the vertical and the horizontal axis: the frame as a plane, at
+            a distance of its longer side, which is the focal length too, seen from another side.
 
-    Shape: frames (B,C,H,W) or clips (B,T,C,H,W), float32 in [0, 1] -> the same, clamped to [0, 1].
+    Shape: frames (B,C,H,W) or clips (B,T,C,H,W), float32 in [0, 1] -> the same.
 
-    Convention: all frames of a clip get the same change, as one camera on one day does; only the noise
-        differs from frame to frame. Clips, and frames without T, differ. Random numbers come from torch's
-        generators. No gradient passes. In eval mode the input itself comes back. There is no state to save.
+    Convention: they act in this order; rotation, shift, scale and perspective together on 9 clips of 10, and
+        repeat the border; gamma, occlusion and noise on 7, illumination and blur on 5 of 10. All frames of a
+            clip
+        change alike, but for the noise; a clip alone is covered with black. Random numbers come from torch's
+        generators. No gradient passes. In eval mode the input itself comes back.
 
     Raises:
         InputError: a strength out of range; forward: frames of another shape or dtype, or too small to blur.
 
     Example:
-        >>> frames = torch.rand(4, 3, 32, 32)
-        >>> augmentation = Augmentation(occlusion=0.0)
-        >>> augmentation(frames).shape, augmentation.eval()(frames) is frames
-        (torch.Size([4, 3, 32, 32]), True)
+        >>> Augmentation(occlusion=0.0)(torch.rand(4, 3, 32, 32)).shape
+        torch.Size([4, 3, 32, 32])
     """
 
     def __init__(
@@ -96,9 +89,9 @@ class Augmentation(nn.Module):
     def stronger(self, factor: float) -> Augmentation:
         """The same with every strength times a factor, as far as it may go."""
         other = Augmentation()
-        for name, strength in self.strengths.items():
-            scaled = (min(factor * one, most) for one, most in zip(strength, LARGEST[name], strict=True))
-            other.strengths[name] = tuple(scaled)
+        for name, most in LARGEST.items():
+            scaled = (factor * one for one in self.strengths[name])
+            other.strengths[name] = tuple(map(min, scaled, most))
         return other
 
     @torch.no_grad()
@@ -107,14 +100,11 @@ class Augmentation(nn.Module):
             return frames
         (blur,) = self.strengths["blur"]
         radius = max(1, round(blur)) if blur else 0
-        shape = tuple(frames.shape)
-        if frames.ndim not in (4, 5) or frames.dtype != torch.float32:
+        shape, kind = tuple(frames.shape), frames.dtype
+        if len(shape) not in (4, 5) or kind != torch.float32 or min(shape) < 1 or min(shape[-2:]) <= radius:
             raise InputError(
-                f"the frames are {shape} {frames.dtype}; expected float32 (B,C,H,W) or clips (B,T,C,H,W)"
-            )
-        if min(shape) < 1 or min(shape[-2:]) <= radius:
-            raise InputError(
-                f"the frames are {shape}; expected some, of more than {radius} pixels a side to blur"
+                f"the frames are {shape} {kind}; expected some, float32 (B,C,H,W) or clips (B,T,C,H,W), of "
+                f"more than {radius} pixels a side to blur"
             )
         clips = frames if frames.ndim == 5 else frames[:, None]
         clips = self._lit(self._warped(self._coloured(clips)))
@@ -219,17 +209,15 @@ def _happens(clips: Tensor, chance: float) -> Tensor:
 def _homography(angle: Tensor, zoom: Tensor, shift: Tensor, tilt: Tensor) -> Tensor:
     """(B,3,3): from points of a warped frame to their source, in units of the longer side from its middle.
 
-    angle, zoom: (B,), radians and a factor. shift, tilt: (2,B), in those units, and radians of the plane of
-    the frame about its vertical and its horizontal axis.
+    angle, zoom: (B,). shift, tilt: (2,B), the latter about the vertical and the horizontal axis.
     """
     one, zero = torch.ones_like(angle), torch.zeros_like(angle)
     cos, sin = angle.cos() / zoom, angle.sin() / zoom
     (cos_u, cos_v), (sin_u, sin_v) = tilt.cos(), tilt.sin()
-    turned = [cos, -sin, zero, sin, cos, zero, zero, zero, one]
-    moved = [one, zero, -shift[0], zero, one, -shift[1], zero, zero, one]
+    x, y = -shift
+    turned = [cos, -sin, cos * x - sin * y, sin, cos, sin * x + cos * y, zero, zero, one]
     seen = [cos_u, sin_v * sin_u, zero, zero, cos_v, zero, -sin_u, sin_v * cos_u, one]
-    turn, move, see = (torch.stack(entries, 1).view(-1, 3, 3) for entries in (turned, moved, seen))
-    return turn @ move @ see
+    return torch.stack(turned, 1).view(-1, 3, 3) @ torch.stack(seen, 1).view(-1, 3, 3)
 
 
 def _blurred(clips: Tensor, most: float, radius: int) -> Tensor:
@@ -238,6 +226,5 @@ def _blurred(clips: Tensor, most: float, radius: int) -> Tensor:
     sigma = _uniform(clips, min(0.1, most), most)
     sigma = torch.where(_happens(clips, BLURRED), sigma, NO_BLUR).view(-1, 1).expand(-1, 2)
     size = (2 * radius + 1, 2 * radius + 1)
-    images = gaussian_blur2d(clips.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
-    blurred: Tensor = images.view(clips.shape)
-    return blurred
+    blurred: Tensor = gaussian_blur2d(clips.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
+    return blurred.view(clips.shape)

@@ -18,19 +18,15 @@ def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
     """Each pixel minus the mean around it, divided by the contrast around it.
 
     Mean and contrast are those of square cells, interpolated between the cells' centres, which is faster than
-    a window at every pixel (`normalise_patches`).
+    a window at every pixel (`normalise_patches`). All channels share the contrast.
 
     Args:
-        frames: in [0, 1]; all channels share the contrast, so that colours stay comparable.
         cell: side of a cell, pixels.
 
-    Shape: (B,C,H,W) -> (B,C,H,W), mean about 0.
+    Shape: (B,C,H,W) in [0, 1] -> (B,C,H,W), mean about 0.
 
-    Convention: a gain or an offset of brightness changes almost nothing; contrast below 2/255 is
-        not blown up.
-
-    Raises:
-        InputError: a cell below 1.
+    Convention: a gain or an offset of brightness changes almost nothing; contrast below 2/255 is not
+    amplified.
     """
     if cell < 1:
         raise InputError(f"local_contrast got a cell of {cell} pixels; expected at least 1")
@@ -54,10 +50,10 @@ class SmallCNN(nn.Module):
     Args:
         dimension: D, number of features.
         channels: of the frames; None is 3, until a training or loaded weights have others.
-        resize: (height, width) in pixels that frames are brought to, antialiased.
+        resize: (height, width) in pixels that frames are resized to, antialiased.
         widths: channels after each convolution; each halves height and width.
-        squeeze: channels ahead of the linear layer.
-        cell: of `local_contrast`, pixels; 0 leaves the contrast as it is.
+        squeeze: channels before the linear layer.
+        cell: of `local_contrast`, pixels; 0 leaves the contrast unchanged.
 
     Shape: (B,C,H,W) float in [0, 1] -> (B,D).
 
@@ -66,9 +62,8 @@ class SmallCNN(nn.Module):
 
     Example:
         >>> import torch
-        >>> net = SmallCNN(dimension=96)
-        >>> net(torch.rand(2, 3, 96, 96)).shape, sum(p.numel() for p in net.parameters())
-        (torch.Size([2, 96]), 193744)
+        >>> SmallCNN(dimension=96)(torch.rand(2, 3, 96, 96)).shape
+        torch.Size([2, 96])
     """
 
     def __init__(

@@ -1,17 +1,17 @@
-"""Any network as a backbone: its descriptor, and the whitening and the code behind it."""
+"""Any network as a backbone: its descriptor, and the whitening and the code after it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.features.layer import run, up_to
+from dejavu_torch.features.frames import settings_of
 from dejavu_torch.features.preprocess import select_channel
+from dejavu_torch.features.truncate import members_of, run, tensors_in, up_to
 from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
@@ -24,31 +24,21 @@ class Coder(nn.Module):
     """Whitens a descriptor and maps it, by one hidden layer, to the code of its place.
 
     The code of a place is arbitrary, so a descriptor that another day moved a little must still get the same
-    one. Training therefore adds noise to the whitened descriptor, in which no direction changes much more
-    than another: it stands in for the days that training does not see.
+    one. Training therefore adds noise to the whitened descriptor, in place of the days that it does not see.
 
     Args:
-        inputs: K, of a descriptor.
-        dimension: D, number of features, not standardised yet.
+        inputs: K, of a descriptor. dimension: D, of the code, not standardised yet.
         hidden: width of the hidden layer.
-        noise: its standard deviation beside components of about 1.
-        kept: number of components that whitening keeps; fewer where K is smaller.
+        noise: its standard deviation beside components of about 1, in training mode.
+        kept: number of components that whitening keeps; fewer if K is smaller.
 
     Shape: (B,K) -> (B,D).
 
-    Convention: before `whiten` the first components are taken as they are. They are brought to length
-        sqrt(components) before the noise, and after it. Noise is for training mode alone.
+    Convention: components are the first numbers of the descriptor until `whiten`. They are scaled to length
+        sqrt(components) before the noise, and after it.
 
     Raises:
         InputError: settings out of range.
-
-    Example:
-        >>> coder = Coder(inputs=8, dimension=4, hidden=16).eval()
-        >>> views, places = torch.randn(2, 32, 8)
-        >>> bool(coder.whitened), coder.whiten(views, places), bool(coder.whitened)
-        (False, None, True)
-        >>> coder(views).shape
-        torch.Size([32, 4])
     """
 
     mean: Tensor
@@ -72,15 +62,11 @@ class Coder(nn.Module):
         norm = nn.BatchNorm1d(hidden)
         # the scale of the units does not matter; with a small one AdamW reaches their thresholds sooner
         nn.init.constant_(norm.weight, 0.1)
-        self.layers = nn.Sequential(
-            nn.Linear(kept, hidden, bias=False),
-            norm,
-            nn.ReLU(inplace=True),
-            nn.Linear(hidden, dimension),
-        )
+        first, last = nn.Linear(kept, hidden, bias=False), nn.Linear(hidden, dimension)
+        self.layers = nn.Sequential(first, norm, nn.ReLU(inplace=True), last)
 
     def whiten(self, views: Tensor, places: Tensor) -> None:
-        """Take `learned_whitening` of (n,K) views and the (n,K) places that they show."""
+        """Set `learned_whitening` of (n,K) views and the (n,K) places that they show."""
         mean, projection = learned_whitening(views, places, self.projection.shape[1])
         self.mean.copy_(mean)
         self.projection.copy_(projection)
@@ -89,8 +75,7 @@ class Coder(nn.Module):
     def forward(self, descriptors: Tensor) -> Tensor:
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
-            components = (descriptors.to(self.mean.dtype) - self.mean) @ self.projection
-            components = to_length(components)
+            components = to_length((descriptors.to(self.mean.dtype) - self.mean) @ self.projection)
             if self.training and self.noise:
                 components = to_length(components + self.noise * torch.randn_like(components))
         coded: Tensor = self.layers(components)
@@ -106,40 +91,32 @@ class Embedding(nn.Module):
     """The output of a network, pooled to a coarse grid and projected to D standardised features.
 
     Args:
-        network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K) or vectors (B,K), such as
-            `kornia.feature.HardNet()`, which takes 1 channel of 32 x 32. Of a tuple, list or dict the first
-            vectors (B,K) are taken, or its only tensor.
+        network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K), which are averaged, or vectors
+            (B,K), such as `kornia.feature.HardNet()` with 1 channel of 32 x 32. Of several outputs the first
+            vectors count.
         dimension: D, number of features; None gives the pooled output itself.
-        channels: that the network takes, 3 or 1; grey frames are repeated, colours become luminance.
-        resize: (height, width) in pixels that frames are brought to, antialiased.
+        channels: of the network's input, 3 or 1; grey frames are repeated, colours become luminance.
+        resize: (height, width) in pixels that frames are resized to, antialiased.
         grid: cells along each side that maps are averaged over.
-        cell: of `local_contrast` ahead of the network, pixels; 0 leaves the contrast as it is.
+        cell: of `local_contrast` before the network, pixels; 0 leaves the contrast unchanged.
         hidden: width of the hidden layer of a `Coder`, which replaces the linear layer; 0 has none.
         noise, kept: of the `Coder`.
-        layer: name of the submodule of the network, as in `named_modules`, whose output is taken for that of
-            the network; what lies behind it is neither computed nor kept, see `up_to`. None is all of it.
+        layer: name of the submodule, as in `named_modules`, that the network ends at, see `up_to`.
         mean, std: of each channel, or one number for all, subtracted from the frames in [0, 1] and divided
-            out last ahead of the network; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet
-            trained. None is 0, and 1.
-        output: index of what to take of a tuple, list or dict instead, negative from its end.
+            out last; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet trained. None is 0, and
+            1.
+        output: index of the member of a tuple, list or dict that counts instead.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
-    Convention: tokens (B,T,K), as transformers give, are averaged. The network's output shape is found by
-        running it once on a frame, in eval mode.
-
     Raises:
-        InputError: settings out of range, a network that cannot take such frames, has no such layer or
-            output, gives neither maps nor vectors, or several maps or tokens and no vectors; forward: frames
-            that are neither grey nor colour, a network that gives another number of channels than before.
+        InputError: settings out of range, a network that cannot take such frames, or has no such layer or
+            output; forward: frames that are neither grey nor colour, an output of another size than before.
 
     Example:
-        >>> net = Embedding(nn.Conv2d(1, 4, 3), dimension=8, channels=1, resize=(16, 16), grid=2)
-        >>> net(torch.rand(2, 3, 32, 32)).shape
-        torch.Size([2, 8])
         >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
-        >>> Embedding(blocks, dimension=None, layer="0", mean=0.5, std=0.5)(torch.rand(2, 1, 32, 32)).shape
-        torch.Size([2, 4])
+        >>> Embedding(blocks, dimension=8, grid=2)(torch.rand(2, 3, 32, 32)).shape
+        torch.Size([2, 8])
     """
 
     offset: Tensor
@@ -165,23 +142,16 @@ class Embedding(nn.Module):
         if not isinstance(network, nn.Module):
             raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
         check_size(resize, 1, "Embedding got resize")
-        least = min(grid, 1 if dimension is None else dimension)
-        if least < 1 or grid > WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
+        coded = hidden == 0 if dimension is None else dimension >= 1
+        if not coded or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
             raise InputError(
                 f"Embedding got dimension={dimension}, channels={channels}, grid={grid}, cell={cell}, "
-                f"hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 or more, a grid of 1 to "
-                f"{WIDEST}, a dimension of at least 1"
+                f"hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 or more (with no dimension "
+                f"hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
             )
-        if dimension is None and hidden:
-            raise InputError(f"Embedding got hidden={hidden}, but no dimension; expected both, or neither")
-        self.dimension = dimension
-        self.channels = channels
+        self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell
         self.resize = (int(resize[0]), int(resize[1]))  # a map gives a list
-        self.grid = grid
-        self.cell = cell
-        self.hidden = hidden
-        self.noise = noise
-        self.kept = kept
+        self.hidden, self.noise, self.kept = hidden, noise, kept
         self.layer, self.mean, self.std, self.output = layer, mean, std, output
         # the settings say the same
         self.register_buffer("offset", _of_channels("mean", mean, channels, 0.0), persistent=False)
@@ -191,67 +161,49 @@ class Embedding(nn.Module):
         try:
             self.network = network if layer is None else up_to(network, layer, frame)
             with torch.no_grad(), in_mode(self.network, False):
-                made = run(self.network, frame)
+                self.inputs = self._pooled(run(self.network, frame)).shape[1]
         except InputError:
             raise
         except Exception as error:  # a network may raise anything
             raise InputError(
                 f"{type(network).__name__} does not take frames {size}: {' '.join(str(error).split())}"
             ) from error
-        self.inputs = inputs = self._pooled(made).shape[1]
         self.linear: nn.Module = nn.Identity()
         self.standardise: nn.Module = nn.Identity()
         if dimension is not None:
-            coded = Coder(inputs, dimension, hidden, noise, kept) if hidden else nn.Linear(inputs, dimension)
-            self.linear = coded
+            sizes = (self.inputs, dimension)
+            self.linear = Coder(*sizes, hidden, noise, kept) if hidden else nn.Linear(*sizes)
             self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
     def _pooled(self, made: object) -> Tensor:
         """What the network made, one row per frame."""
-        output = self._chosen(made)
-        if output.ndim == 4:
-            return nn.functional.adaptive_avg_pool2d(output, self.grid).flatten(1)
-        if output.ndim == 3:
-            return output.mean(1)
-        if output.ndim == 2:
-            return output
-        seen = tuple(output.shape)
-        raise InputError(
-            f"{type(self.network).__name__} made {seen}; expected maps (B,K,h,w) or vectors (B,K)"
-        )
-
-    def _chosen(self, made: object) -> Tensor:
-        """The tensor that counts of what the network made."""
         name = type(self.network).__name__
         if self.output is not None:
-            parts = _parts(made)
-            if not -len(parts) <= self.output < len(parts):
+            members = members_of(made)
+            if not -len(members) <= self.output < len(members):
                 raise InputError(
-                    f"output is {self.output}, but {name} made {len(parts)}; expected one of them"
+                    f"output is {self.output}, but {name} made {len(members)}; expected one of them"
                 )
-            made = parts[self.output]
-        tensors = [*_tensors(made)]
-        if len(tensors) == 1:
-            return tensors[0]
-        for tensor in tensors:
-            if tensor.ndim == 2:
-                return tensor
-        if not tensors:
-            raise InputError(
-                f"{name} made {type(made).__name__}; expected maps (B,K,h,w) or vectors (B,K), or an output "
-                "that is of this kind"
-            )
-        seen = ", ".join(str(tuple(tensor.shape)) for tensor in tensors[:SHOWN]) + ", .." * (
-            len(tensors) > SHOWN
-        )
+            made = members[self.output]
+        tensors = tensors_in(made)
+        chosen = tensors if len(tensors) == 1 else [tensor for tensor in tensors if tensor.ndim == 2]
+        if chosen and chosen[0].ndim == 2:
+            return chosen[0]
+        if chosen and chosen[0].ndim == 3:
+            return chosen[0].mean(1)
+        if chosen and chosen[0].ndim == 4:
+            return nn.functional.adaptive_avg_pool2d(chosen[0], self.grid).flatten(1)
+        seen = ", ".join(str(tuple(tensor.shape)) for tensor in tensors[:SHOWN]) or type(made).__name__
+        if len(tensors) > 1:
+            seen = f"{len(tensors)} tensors, {seen}{', ..' * (len(tensors) > SHOWN)}, none of them vectors"
         raise InputError(
-            f"{name} made {len(tensors)} tensors, {seen}, none of them vectors (B,K); expected output, the "
-            "index of one, or layer, where the network is to end"
+            f"{name} made {seen}; expected maps (B,K,h,w) or vectors (B,K), or output, the index of one, or "
+            "layer, where the network is to end"
         )
 
     @property
     def coder(self) -> Coder | None:
-        """The whitening and the code, where there is a hidden layer."""
+        """The whitening and the code, if there is a hidden layer."""
         return self.linear if isinstance(self.linear, Coder) else None
 
     def without_code(self) -> Embedding:
@@ -265,8 +217,7 @@ class Embedding(nn.Module):
             raise InputError(f"Embedding got frames {tuple(frames.shape)}; expected (B,1,H,W) or (B,3,H,W)")
         if self.channels == 1:
             frames = select_channel(frames, "grey")
-        frames = frames.expand(-1, self.channels, -1, -1)
-        frames = resize_frames(frames, self.resize)
+        frames = resize_frames(frames.expand(-1, self.channels, -1, -1), self.resize)
         weight = next(self.network.parameters(), frames)
         frames = frames.to(weight.dtype) if weight.is_floating_point() else frames
         if self.cell:
@@ -276,47 +227,26 @@ class Embedding(nn.Module):
         descriptors = self._pooled(run(self.network, frames))
         if descriptors.shape[1] != self.inputs:
             raise InputError(
-                f"{type(self.network).__name__} made {descriptors.shape[1]} numbers of each of "
-                f"{len(frames)} frames; expected {self.inputs}, as of the frame that it was tried out with"
+                f"{type(self.network).__name__} made {descriptors.shape[1]} numbers for each of "
+                f"{len(frames)} frames; expected {self.inputs}, as for the frame that it was tried with"
             )
         return descriptors
 
     def code(self, descriptors: Tensor) -> Tensor:
         """Features of descriptors: (B,K) -> (B,D)."""
-        features: Tensor = self.linear(descriptors)
-        standardised: Tensor = self.standardise(features.float())
-        return standardised
+        features: Tensor = self.standardise(self.linear(descriptors).float())
+        return features
 
     def forward(self, frames: Tensor) -> Tensor:
         return self.code(self.describe(frames))
 
     def extra_repr(self) -> str:
-        return (
-            f"dimension={self.dimension}, channels={self.channels}, resize={self.resize}, grid={self.grid}, "
-            f"cell={self.cell}, hidden={self.hidden}, layer={self.layer}, mean={self.mean}, std={self.std}, "
-            f"output={self.output}"
-        )
-
-
-def _parts(made: object) -> list[object]:
-    """The members of a tuple, list or dict; anything else is one of its own."""
-    if isinstance(made, dict):
-        return [*made.values()]
-    return [*made] if isinstance(made, (tuple, list)) else [made]
-
-
-def _tensors(made: object) -> Iterator[Tensor]:
-    """The tensors of what a network made, in order."""
-    if isinstance(made, Tensor):
-        yield made
-    elif isinstance(made, (tuple, list, dict)):
-        for part in _parts(made):
-            yield from _tensors(part)
+        return settings_of(self, "network")
 
 
 def _of_channels(name: str, given: float | list[float] | None, channels: int, default: float) -> Tensor:
-    """(channels,1,1), of numbers, or one number for all."""
-    numbers = [default if given is None else given] if not isinstance(given, (list, tuple)) else [*given]
+    """(channels,1,1), from a number for each channel or one for all."""
+    numbers = [*given] if isinstance(given, (list, tuple)) else [default if given is None else given]
     # numbers that float32 holds, and their inverse
     least, most = (-1e38, 1e38) if name == "mean" else (1e-37, 1e37)
     if len(numbers) not in (1, channels) or not all(least <= number <= most for number in numbers):

@@ -17,7 +17,7 @@ log = logging.getLogger("dejavu_torch")
 
 BRIGHTEST = 1.5  # of a frame in [0, 1], whatever was done to it
 APART = 1e-3  # of its length: by how much the features of a frame may differ alone and among others
-ULPS = 4  # and where numbers are coarser than that
+ULPS = 4  # and of the coarsest numbers
 TF32 = 2**-10  # what it rounds by
 
 
@@ -32,12 +32,11 @@ def feature_batches(
     """Features of the frames of a traverse, in order, without gradients.
 
     Args:
-        traverse: frames (B,C,H,W), or ready features (B,D), which are passed on.
+        traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
-        batch_size: frames in memory at a time; fewer where they are large.
-        progress: what to call this work on stderr, see `shown`; None shows nothing. Frames that are looked at
-            several times, as those of an AugmentedTraverse, count once.
-        look: is given the first batch and its features.
+        batch_size: frames in memory at a time; fewer if they are large.
+        progress: what to call this work on stderr, see `shown`. Copies of an AugmentedTraverse count once.
+        look: called with the first batch and its features.
 
     Shape: yields (B,D) float.
 
@@ -68,61 +67,17 @@ def feature_batches(
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
 
 
-def warn_of_bright(frames: Tensor, name: str) -> bool:
-    """Whether frames (B,C,H,W) are no numbers in [0, 1], and then a line; ready features (B,D) may be any."""
-    most = float(frames.detach().amax()) if frames.ndim == 4 and len(frames) else 0.0
-    if most > BRIGHTEST:
-        log.warning(
-            "%s has frames with values up to %.4g; expected floats in [0, 1], such as frames / 255",
-            name,
-            most,
-        )
-    return most > BRIGHTEST
-
-
-def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
-    """Refuse a network whose features of a frame depend on the other frames of the batch.
-
-    Args:
-        module: in eval mode. frames: (B,C,H,W), or ready features (B,D), which nothing describes.
-        features: (B,D) that it made of the frames.
-
-    Raises:
-        InputError: the first frame's differ by over 1e-3 of their length, or more where a part of the network
-            computes in 16 bits.
-    """
-    if frames.ndim != 4 or len(frames) < 2:
-        return
-    with torch.no_grad():
-        alone = features_of(frames[:1].to(features.device), module, name).to(features)
-    apart = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
-    if apart > max(APART, ULPS * _rounding(module, features.device.type)):
-        raise InputError(
-            f"frame 0 of {name} has other features alone than in a batch with {len(frames) - 1} others, by "
-            f"{apart:.2g} of their length; expected --batch_size 1, where every frame is alone"
-        )
-
-
-def _rounding(module: nn.Module, device: str) -> float:
-    """Of the coarsest numbers that a network computes with."""
-    kinds = {one.dtype for one in module.parameters() if one.is_floating_point()}
-    if torch.is_autocast_enabled(device):
-        kinds.add(torch.get_autocast_dtype(device))
-    fast = 0.0 if device == "cpu" else TF32  # which a GPU may compute with in one batch and not in another
-    return max([fast, *(torch.finfo(kind).eps for kind in kinds)])
-
-
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
-    """Features of one batch: (B,C,H,W) frames are described, (B,D) features stay as they are."""
+    """Features of one batch: (B,C,H,W) frames are described, (B,D) features stay unchanged."""
     if not isinstance(batch, Tensor):
         raise InputError(f"{name} is a {type(batch).__name__}; expected a tensor of frames or features")
-    if batch.ndim == 2 and batch.is_floating_point():
-        return batch
-    if batch.ndim != 4 or not batch.is_floating_point():
+    if batch.ndim not in (2, 4) or not batch.is_floating_point():
         raise InputError(
             f"{name} gives batches {tuple(batch.shape)} {batch.dtype}; "
             "expected float frames (B,C,H,W) in [0, 1] or float features (B,D)"
         )
+    if batch.ndim == 2:
+        return batch
     features = describe(batch)
     if features.ndim != 2 or features.shape[0] != batch.shape[0]:
         maker = describe[-1] if isinstance(describe, nn.Sequential) else describe
@@ -133,6 +88,40 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
             f"expected features ({len(batch)}, D)"
         )
     return features
+
+
+def warn_of_bright(frames: Tensor, name: str) -> bool:
+    """Whether frames (B,C,H,W) exceed [0, 1] by far, and then a line; ready features (B,D) may be any."""
+    most = float(frames.detach().amax()) if frames.ndim == 4 and len(frames) else 0.0
+    if most > BRIGHTEST:
+        seen = f"{name} has frames with values up to {most:.4g}"
+        log.warning("%s; expected floats in [0, 1], such as frames / 255", seen)
+    return most > BRIGHTEST
+
+
+def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
+    """Refuse a network, in eval mode, whose features of a frame depend on the other frames of the batch.
+
+    Raises:
+        InputError: those of the first frame differ by over 1e-3 of their length, or what its numbers round
+            by.
+    """
+    if frames.ndim != 4 or len(frames) < 2:
+        return
+    with torch.no_grad():
+        alone = features_of(frames[:1].to(features.device), module, name).to(features)
+    apart = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
+    device = features.device.type
+    kinds = {one.dtype for one in module.parameters() if one.is_floating_point()}
+    if torch.is_autocast_enabled(device):
+        kinds.add(torch.get_autocast_dtype(device))
+    coarsest = 0.0 if device == "cpu" else TF32  # which a GPU may use in one batch and not in another
+    coarsest = max([coarsest, *(torch.finfo(kind).eps for kind in kinds)])
+    if apart > max(APART, ULPS * coarsest):
+        raise InputError(
+            f"frame 0 of {name} has other features alone than in a batch with {len(frames) - 1} others, by "
+            f"{apart:.2g} of their length; expected --batch_size 1, where every frame is alone"
+        )
 
 
 def check_queries(
@@ -146,10 +135,9 @@ def check_queries(
     """Refuse queries that do not fit a map, and warn of frames of another size that do.
 
     Args:
-        shape: of one query, (C,H,W) or (D,). dimension: how many features it gives.
-        reference: shape of a frame of the reference, None where unknown. expected: features of the map.
-        resized: whether the features are made of frames brought to one size.
-        name: of the queries, for the message.
+        shape: of one query, (C,H,W) or (D,). dimension: of its features.
+        reference: shape of a frame of the reference, None if unknown. expected: features of the map.
+        resized: whether the features resize frames to one size.
     """
     if reference is None or len(shape) != 3:
         return
@@ -158,17 +146,14 @@ def check_queries(
             f"{name} holds frames, but the map was learned from ready features; "
             f"expected features (Q, {expected})"
         )
+    own, other = (" x ".join(map(str, one)) for one in (shape, reference))
     if dimension != expected:
         raise InputError(
-            f"{name}: frames of {_by(shape)} give {dimension} features; the map expects "
-            f"{expected}, as frames of {_by(reference)} give"
+            f"{name}: frames of {own} give {dimension} features; the map expects {expected}, as frames of "
+            f"{other} give"
         )
     if shape[1:] != reference[1:] and not resized:
-        log.warning("%s has frames of %s, the map was learned from %s", name, _by(shape), _by(reference))
-
-
-def _by(shape: tuple[int, ...]) -> str:
-    return " x ".join(map(str, shape))
+        log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
 
 
 @contextmanager

@@ -23,15 +23,15 @@ class HOG(nn.Module):
         cell: side of a square cell, pixels. Pixels beyond the last whole cell only feed gradients.
         block: side of a square block, cells. Blocks overlap: they move by one cell.
         resize: (height, width) in pixels to resize to first, antialiased; None keeps the size.
-        bins: "hard": a pixel votes for the bin of its orientation, as in skimage; only the magnitude carries
-            gradient to the frames. "linear", the trainable form: it shares its vote between the two nearest
-            bin centres, (k + 0.5) * 180 / orientations degrees, cyclic over 180.
+        bins: "hard": a pixel votes for the bin of its orientation, as in skimage. "linear", the trainable
+            form, in which the orientation carries gradient: it shares its vote between the two nearest bin
+            centres, (k + 0.5) * 180 / orientations degrees, cyclic over 180.
 
     Shape: (B,C,H,W) -> (B,D) with D = (ny - block + 1) * (nx - block + 1) * block**2 * orientations,
-        ny = H // cell, nx = W // cell; ordered as skimage orders its feature vector.
+        ny = H // cell, nx = W // cell; ordered as in skimage.
 
     Convention: each pixel of a colour image has the gradient of its strongest channel. Blocks are normalised
-        by L2-Hys. Gradients with respect to the frames are finite everywhere, also on a flat image.
+        by L2-Hys. Gradients with respect to the frames are finite everywhere.
 
     Raises:
         InputError: settings out of range; forward: not (B,C,H,W) float, or smaller than one block.
@@ -99,9 +99,8 @@ def hog(
 
 
 def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Differences f(x + 1) - f(x - 1) along rows and columns, 0 at the border, of the strongest channel.
-
-    Shape: (B,C,H,W) -> two of (B,H,W).
+    """Differences f(x + 1) - f(x - 1) along rows and columns, 0 at the border, of the strongest channel:
+    (B,C,H,W) -> two of (B,H,W).
     """
     rows, columns = torch.zeros_like(frames), torch.zeros_like(frames)
     rows[:, :, 1:-1] = frames[:, :, 2:] - frames[:, :, :-2]
@@ -119,10 +118,7 @@ def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
 def cell_histograms(
     rows: Tensor, columns: Tensor, orientations: int, cell: int, bins: Bins = "hard"
 ) -> Tensor:
-    """Mean gradient magnitude per cell and orientation bin.
-
-    Shape: (B,H,W), (B,H,W) -> (B, H // cell, W // cell, orientations).
-    """
+    """Mean gradient magnitude per cell and bin: two of (B,H,W) -> (B, H // cell, W // cell, orientations)."""
     batch, height, width = rows.shape
     ny, nx = height // cell, width // cell
     rows, columns = rows[:, : ny * cell, : nx * cell], columns[:, : ny * cell, : nx * cell]

@@ -21,24 +21,19 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: boo
 
     Args:
         batches: each (B,D), one number type.
-        in_memory: about how many bytes to keep in memory. More spill to a temporary file, which the
-            tensor then maps: rows are read when they are used. The file has no name and goes with the
-            tensor or the process.
+        in_memory: about how many bytes to keep in memory. More spill to a temporary file without a name,
+            which the tensor then maps: rows are read when they are used.
         half: whether the file holds float16.
 
-    Shape: (B,D), ... -> (N,D); on the CPU where it spilled.
+    Shape: (B,D), ... -> (N,D); on the CPU if it spilled.
 
     Raises:
         InputError: batches of different D or number type, none at all, or no room for the file.
-
-    Example:
-        >>> concatenate(torch.arange(6.0).view(3, 2).split(2)).tolist()
-        [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]
     """
     parts: list[Tensor] = []
-    blocks: list[Tensor] = []  # of the parts before these
     file: IO[bytes] | None = None
-    like, held, joined, rows = None, 0, 0, 0
+    like, rows, held = None, 0, 0
+    joined, loose = 0, 0  # parts that are blocks already, and bytes of the others
     for batch in batches:
         like = batch[:0] if like is None else like
         if batch.shape[1:] != like.shape[1:] or batch.dtype != like.dtype:
@@ -47,31 +42,30 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: boo
                 f"expected {like.shape[1]} of {like.dtype} as before"
             )
         parts.append(batch)
-        rows += len(batch)
-        held += batch.numel() * batch.element_size()
+        rows, held, loose = rows + len(batch), held + batch.nbytes, loose + batch.nbytes
         if held > in_memory:
-            file = _spill([*blocks, *parts], file, half)
-            parts, blocks, held, joined = [], [], 0, 0
-        elif held - joined > BLOCK:
-            blocks.append(torch.cat(parts))
-            parts, joined = [], held
+            file = _spilled(parts, file, half)
+            parts, held, joined, loose = [], 0, 0, 0
+        elif loose > BLOCK:
+            parts[joined:] = [torch.cat(parts[joined:])]
+            joined, loose = len(parts), 0
     if like is None:
         raise InputError("there are no features; expected at least one batch")
     if file is None:
         whole, start = like.new_empty(rows, like.shape[1]), 0  # torch.cat would hold all of them twice
-        while blocks or parts:
-            part = (blocks or parts).pop(0)
+        while parts:
+            part = parts.pop(0)
             whole[start : start + len(part)] = part
             start += len(part)
         return whole
-    _spill([*blocks, *parts], file, half)
-    kind = np.dtype(np.float16) if half else like.cpu().numpy().dtype
+    _spilled(parts, file, half)
+    kind = np.float16 if half else like.cpu().numpy().dtype
     # copy on write: the tensor may be written to, the file never is
     return torch.from_numpy(np.memmap(file, kind, "c", shape=(rows, like.shape[1])))
 
 
-def _spill(parts: list[Tensor], file: IO[bytes] | None, half: bool = False) -> IO[bytes]:
-    """Write the parts to the end of the file, a new one without a name if there is none."""
+def _spilled(parts: list[Tensor], file: IO[bytes] | None, half: bool) -> IO[bytes]:
+    """The file, a new one if there is none, with the parts at its end."""
     try:
         file = tempfile.TemporaryFile() if file is None else file  # noqa: SIM115, it goes with the tensor
         for part in parts:

@@ -30,34 +30,10 @@ def channel_name(channel: str) -> str:
     return name
 
 
-def check_patch(patch: int) -> None:
-    """Refuse a patch without a middle pixel, or without neighbours."""
-    if patch < 3 or patch % 2 == 0:
-        raise InputError(f"patch is {patch}; expected an odd number of pixels, at least 3")
-
-
-def check_clahe(clip_limit: float, grid: tuple[int, int]) -> None:
-    """Refuse a limit or a grid that makes no sense."""
-    if not 0 <= clip_limit <= MOST_CLIP:
-        raise InputError(
-            f"clip_limit is {clip_limit}; expected a number of at least 0 (no limit), at most {MOST_CLIP:g}"
-        )
-    if len(grid) != 2 or any(tiles < 1 or tiles != int(tiles) for tiles in grid):
-        raise InputError(f"grid is {tuple(grid)}; expected (rows, columns), whole numbers of at least 1")
-
-
 def select_channel(frames: Tensor, channel: str) -> Tensor:
     """One channel of colour frames, see `Preprocess`; grey frames pass unchanged as "grey".
 
     Shape: (B,C,H,W) -> (B,1,H,W); a difference lies in [-1, 1].
-
-    Raises:
-        InputError: not (B,C,H,W) float, an unknown channel, or frames that do not have it.
-
-    Example:
-        >>> sky = torch.tensor([0.25, 0.5, 1.0]).view(1, 3, 1, 1)
-        >>> select_channel(sky, "R-B").item()
-        -0.75
     """
     check_frames(frames, "preprocess")
     name, count = channel_name(channel), frames.shape[1]
@@ -92,15 +68,12 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
 
     Shape: (B,C,H,W) -> (B,C,H,W), mean about 0, unbounded.
 
-    Convention: the patch slides with the pixel, so that there are no edges between patches; at the border
-        only pixels inside the frame count. The standard deviation divides by the number of pixels, and is at
-        least 1/255, so that noise in a flat sky is not amplified. Above that floor a gain and an offset of
-        brightness change nothing. Gradients are finite everywhere.
+    Convention: the patch slides with the pixel; at the border only pixels inside the frame count. The
+        standard deviation divides by their number, and is at least 1/255, so that noise in a flat sky is not
+        amplified; above that a gain and an offset of brightness change nothing. Gradients are finite
+        everywhere.
 
     Source: Milford and Wyeth, SeqSLAM, ICRA 2012; there in patches side by side.
-
-    Raises:
-        InputError: not (B,C,H,W) float, a bad patch, or a frame smaller than it.
 
     Example:
         >>> checks = (torch.arange(8)[:, None] + torch.arange(8)).remainder(2)[None, None]
@@ -109,7 +82,6 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
         (-1.0, 1.0)
     """
     check_frames(frames, "preprocess")
-    check_patch(patch)
     height, width = frames.shape[-2:]
     if min(height, width) < patch:
         raise InputError(
@@ -131,26 +103,15 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
 
     Shape: (B,C,H,W) in [0, 1] -> the same.
 
-    Convention: a table of 256 grey levels has no gradient: it is passed straight through, as if the output
-        followed the input one to one. Kornia's differentiable form gives other values (up to 0.3 away).
-
-    Raises:
-        InputError: not (B,C,H,W) float, a bad clip limit or grid, values outside [0, 1], or no more pixels
-            than tiles along one side.
-
-    Example:
-        >>> dull = 0.4 + 0.2 * torch.rand(1, 1, 64, 64)
-        >>> bool(equalise(dull, grid=(2, 2)).std() > dull.std())
-        True
+    Convention: a table of 256 grey levels has no gradient: it passes as if the output followed the input one
+        to one. Kornia's differentiable form gives other values (up to 0.3 away).
     """
     check_frames(frames, "preprocess")
-    check_clahe(clip_limit, grid)
     if torch.compiler.is_exporting():
         raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")
     from kornia.enhance import equalize_clahe
 
-    rows, columns = int(grid[0]), int(grid[1])
-    height, width = frames.shape[-2:]
+    (height, width), (rows, columns) = frames.shape[-2:], grid
     if height <= rows or width <= columns:
         raise InputError(
             f"clahe got frames of {height} x {width} pixels for a grid of {rows} x {columns} tiles; "
@@ -160,7 +121,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     if not ((fixed >= 0) & (fixed <= 1)).all():
         low, high = fixed.min().item(), fixed.max().item()
         raise InputError(f"clahe got values from {low:g} to {high:g}; expected values in [0, 1]")
-    even = in_parts(lambda part: equalize_clahe(part, float(clip_limit), (rows, columns)), fixed)
+    even = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), fixed)
     return frames + (even - fixed) if frames.requires_grad else even
 
 
@@ -176,13 +137,13 @@ class Preprocess(nn.Module):
             and at least once, as all do in tiles under 256 / clip_limit pixels; 0 is no limit.
         grid: (rows, columns) of tiles for "clahe"; they need not divide the frame.
         size: pixels that the longer side of a traverse's frames is reduced to if it has more, but no further
-            than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so as frames are
-            read; forward does not.
+            than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so, forward does
+            not.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
     Convention: without channel and contrast the input itself is returned, whatever it is. Before "clahe"
-        a difference of channels d in [-1, 1] becomes (d + 1) / 2, in [0, 1].
+        a difference of channels d in [-1, 1] becomes (d + 1) / 2.
 
     Raises:
         InputError: settings out of range; forward: frames that do not fit them.
@@ -206,8 +167,14 @@ class Preprocess(nn.Module):
             raise InputError(f"size is {size!r}; expected pixels of the longer side, at least 1, or null")
         if contrast is not None and contrast not in get_args(Contrast):
             raise InputError(f"contrast {contrast!r} is unknown; expected 'patch', 'clahe' or None")
-        check_patch(patch)
-        check_clahe(clip_limit, grid)
+        if patch < 3 or patch % 2 == 0:
+            raise InputError(f"patch is {patch}; expected an odd number of pixels, at least 3")
+        if not 0 <= clip_limit <= MOST_CLIP:
+            raise InputError(
+                f"clip_limit is {clip_limit}; expected at least 0 (no limit), at most {MOST_CLIP:g}"
+            )
+        if len(grid) != 2 or any(tiles < 1 or tiles != int(tiles) for tiles in grid):
+            raise InputError(f"grid is {tuple(grid)}; expected (rows, columns), whole numbers of at least 1")
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size

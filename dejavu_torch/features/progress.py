@@ -1,4 +1,4 @@
-"""How far long work has come: a bar on a terminal, elsewhere a line now and then."""
+"""Progress of long work: a bar on a terminal, elsewhere a line now and then."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ FIRST, EVERY = 30.0, 60.0  # seconds before the first line, and from one to the 
 
 @contextmanager
 def shown(text: str | None, total: int | None, unit: str = "frame") -> Iterator[Callable[[int], object]]:
-    """What is to be told how much more of some work is done, and shows it on stderr.
+    """A function to call with how much more of some work is done, which shows it on stderr.
 
     Args:
-        text: what the work is; None shows nothing.
-        total: how much of it there is, None where that is not known. unit: of what.
+        text: what the work is; None shows nothing. total: how much of it there is, if known, in `unit`.
     """
     if text is not None and sys.stderr.isatty():
         with tqdm(total=total, desc=text, unit=unit, leave=False) as bar:

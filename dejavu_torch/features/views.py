@@ -31,11 +31,7 @@ class Views(NamedTuple):
 
 
 class _Augmented(Traverse):
-    """Blocks of frames of a traverse, each augmented several times.
-
-    Raises:
-        InputError: ready features, or strengths that `Augmentation` refuses.
-    """
+    """Blocks of frames of a traverse, each augmented several times."""
 
     def __init__(
         self,
@@ -45,11 +41,13 @@ class _Augmented(Traverse):
         strengths: Mapping[str, Any],
         seed: int,
     ) -> None:
+        if len(traverse.frame_shape) != 3:
+            raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
         try:
             self.augmentation = Augmentation(**strengths)
         except TypeError as error:
-            expected = ", ".join(LARGEST)
-            raise InputError(f"the strengths of whitening are {strengths}; expected {expected}") from error
+            names = ", ".join(LARGEST)
+            raise InputError(f"the strengths of whitening are {strengths}; expected {names}") from error
         self.traverse, self.copies, self.seed = traverse, copies, seed
         self.places = torch.cat([block.repeat(copies) for block in blocks])
         self.length = len(self.places)
@@ -84,11 +82,8 @@ class AugmentedTraverse(_Augmented):
     """Augmented copies of a traverse's frames: one of each frame of a block, another of each, and so on.
 
     Args:
-        traverse: frames (B,C,H,W).
-        frames: their number N.
+        traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
         copies: of each frame. most: in all; frames are drawn evenly if there would be more.
-        strengths: arguments of `Augmentation`.
-        seed: of the copies.
 
     Raises:
         InputError: ready features, or strengths that `Augmentation` refuses.
@@ -103,7 +98,6 @@ class AugmentedTraverse(_Augmented):
         strengths: Mapping[str, Any],
         seed: int = 0,
     ) -> None:
-        _require_frames(traverse)
         self.shown = range(0, frames, max(1, -(-frames * copies // most)))
         self.block = traverse.batch_size(BLOCK)  # whatever the batch size: the same copies
         super().__init__(traverse, torch.tensor(self.shown).split(self.block), copies, strengths, seed)
@@ -121,17 +115,14 @@ class AugmentedTraverse(_Augmented):
 class Stretches(_Augmented):
     """Stretches of a traverse, each frame as it may look on another visit, by which a map is calibrated.
 
-    Every 10th stretch of 20 frames is used, shorter ones of a short traverse; several times if that is
-    little, and fewer of a long one: 1200 frames of one of 10^5, down to 240 of longer ones. Each frame is
-    changed separately, 1.5 times as much as by `strengths`.
+    Every 10th stretch of 20 frames, shorter ones of a short traverse; several times if that is little, and
+    fewer of a long one: 1200 frames of one of 10^5, down to 240 of longer ones. Each frame changes
+    separately.
 
     Args:
-        traverse: frames (B,C,H,W). frames: their number N. strengths: arguments of `Augmentation`.
-        seed: of the changes. places: of the map, among which they are searched; None is N.
+        traverse, frames, strengths: see `AugmentedTraverse`; changes are 1.5 times as strong.
+        places: of the map, among which they are searched; None is N.
         starts: of stretches of 20 frames, increasing, in place of every 10th.
-
-    Raises:
-        InputError: ready features, or strengths that `Augmentation` refuses.
     """
 
     def __init__(
@@ -143,7 +134,6 @@ class Stretches(_Augmented):
         places: int | None = None,
         starts: Sequence[int] | None = None,
     ) -> None:
-        _require_frames(traverse)
         length = min(STRETCH, max(1, frames // EVERY)) if starts is None else STRETCH
         starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
         most = min(MOST, max(LEAST, SCORES // (places or frames)))
@@ -164,8 +154,3 @@ class Stretches(_Augmented):
         for start in self.starts:
             yield torch.stack(list(islice(frames, start - at, start - at + self.stretch)))
             at = start + self.stretch
-
-
-def _require_frames(traverse: Traverse) -> None:
-    if len(traverse.frame_shape) != 3:
-        raise InputError(f"{traverse.name} holds ready features; expected frames to augment")

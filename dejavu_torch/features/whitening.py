@@ -10,37 +10,31 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.features.frames import settings_of
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
 
 ROWS = 1024  # in double precision at a time
 SAMPLED = 4096  # rows that principal components are found in
-NUMBERS = 128  # of a descriptor, unless said otherwise
-WIDEST = 256  # of one that is not whitened
-PLACES_PER_NUMBER = 4  # a short route does not fill as many numbers
+NUMBERS = 128  # dimensions, unless said otherwise
+WIDEST = 256  # dimensions without whitening
+PLACES_PER_NUMBER = 4  # a short route does not fill as many dimensions
 COMPONENTS = 400  # that whitening works on
 VIEWS = 4  # of a frame, on a long route
-VIEWS_PER_COMPONENT = 30  # on any: what 4 views of each of 3000 frames are
-ENOUGH = 12  # views of a frame: more take time and change nothing
+VIEWS_PER_COMPONENT = 30  # on any: as 4 views of each of 3000 frames
+ENOUGH = 12  # views of a frame: more cost time and change nothing
 SHRINKAGE = 0.03  # at least
-SPARE = 32  # further directions of the randomised subspace, which make it near the true one
+SPARE = 32  # further directions of the randomised subspace, which make it accurate
 ROUNDS = 3  # of its iteration
 STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
-    "colour": [0.2, 0.05],
-    "rotation": 3.0,
-    "shift": [0.02, 0.04],
-    "scale": 0.05,
-    "exposure": [0.4, 0.3],
-    "gamma": 0.5,
-    "illumination": 0.25,
-    "blur": 1.2,
-    "occlusion": 0.4,
-    "noise": 0.03,
+    name: [*strength] if len(strength) > 1 else strength[0]
+    for name, strength in Augmentation().strengths.items()
+    if max(strength)
 }
-LEAST = 1e-12  # of a number that a power is taken of
-BITS = (4, 8, 16)  # that a number of the projection may take
-ROUNDING = 1e-7  # of the largest variance: what lies below it is none
+LEAST = 1e-12  # absolute value that a power is applied to
+ROUNDING = 1e-7  # of the largest variance: below it there is none
 
 
 def learned_whitening(
@@ -49,48 +43,34 @@ def learned_whitening(
     """The projection to what tells places apart and changes little between two views of one place.
 
     With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m] and
-    W = (1 - a) C + a tr(C) / K I (shrinkage: a few pairs say little about most directions), the columns of P
-    are the `kept` directions with the largest p^T B p / p^T W p, scaled to p^T W p = 1, the largest first
-    (learned whitening of Mikolajczyk and Matas, ICCV 2007; a linear discriminant analysis of pairs).
+    W = (1 - a) C + a tr(C) / K I, the columns of P are the `kept` directions with the largest
+    p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
 
     Args:
-        views, places: descriptors of one place each, K numbers.
-        kept: K', at most K.
         shrinkage: a, above 0 and at most 1; None is `oracle_shrinkage`, and at least 0.03.
 
-    Shape: (n,K), (n,K) -> mean (K,), P (K,K'), float32.
+    Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
 
     Raises:
-        InputError: shapes that do not fit, descriptors that are not finite, or views that equal their places
-            but for rounding.
-
-    Example:
-        >>> places = torch.tensor([[0.0, 3.0], [0.0, -3.0]])
-        >>> views = places + torch.tensor([[4.0, 0.0], [4.0, 0.0]])  # the first number is the weather's
-        >>> mean, projection = learned_whitening(views, places, 1)
-        >>> bool(projection[0].abs() < projection[1].abs())
-        True
+        InputError: views that equal their places but for rounding, or not finite.
     """
-    if views.ndim != 2 or views.shape != places.shape or not 1 <= kept <= views.shape[1]:
-        seen = f"{tuple(views.shape)}, {tuple(places.shape)} and {kept} to keep"
-        raise InputError(f"learned_whitening got {seen}; expected (n,K) twice, and 1 to K to keep")
-    k = views.shape[1]
+    n, k = views.shape
     within, second = views.new_zeros(2, k, k, dtype=torch.float64)
     mean = views.new_zeros(k, dtype=torch.float64)
     for view, place in zip(views.split(ROWS), places.split(ROWS), strict=True):
         change, middle = (view.double() - place.double()) / 2, (view.double() + place.double()) / 2
-        within += change.T @ change / len(views)
-        second += middle.T @ middle / len(views)
-        mean += middle.sum(0) / len(views)
+        within += change.T @ change / n
+        second += middle.T @ middle / n
+        mean += middle.sum(0) / n
     scale, size = within.diagonal().mean(), second.diagonal().mean()
     if not scale.isfinite() or not scale > 1e-10 * size:
         raise InputError(
-            f"the descriptors of {len(views)} views differ from those of their places by {scale.item():.2g} "
-            "in the mean square; expected a finite number, and more than rounding: an augmentation, or a "
-            "second traverse"
+            f"the descriptors of {n} views differ from those of their places by {scale.item():.2g} in the "
+            "mean square; expected a finite number, and more than rounding: an augmentation, or a second "
+            "traverse"
         )
     if shrinkage is None:
-        shrinkage = max(SHRINKAGE, oracle_shrinkage(within, len(views)))
+        shrinkage = max(SHRINKAGE, oracle_shrinkage(within, n))
     within = (1 - shrinkage) * within
     within.diagonal().add_(shrinkage * scale)
     # P = L^-T E, where W = L L^T and E holds the eigenvectors of L^-1 B L^-T
@@ -100,19 +80,9 @@ def learned_whitening(
 
 
 def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
-    """How much of a sample covariance to replace by a multiple of the identity that has its trace.
+    """How much of a covariance (K,K) of Gaussian samples to replace by a multiple of the identity, 0 to 1.
 
-    Args:
-        covariance: of Gaussian samples, about their known mean. samples: their number n.
-
-    Shape: (K,K) -> a number from 0 to 1, the larger the fewer samples and the more alike the variances.
-
-    Source: oracle approximating shrinkage: Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal
-        Processing 58 (2010), eq. 23.
-
-    Example:
-        >>> oracle_shrinkage(torch.diag(torch.tensor([3.0, 1.0])), 10)
-        0.8
+    Source: Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal Processing 58 (2010), eq. 23.
     """
     size, trace = len(covariance), float(covariance.trace())
     square = float(covariance.square().sum())
@@ -122,40 +92,36 @@ def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
 
 
 class Whitening(nn.Module):
-    """A descriptor of few numbers: what tells places apart, and changes little with light and view.
+    """A descriptor of few dimensions, which tells places apart and changes little with light and view.
 
-    `learn` finds it in closed form for one route: principal components, then `learned_whitening` of what the
-    views of one place change in them. A view is an augmented copy of a reference frame, or a frame of a
-    second traverse.
+    For one route: principal components, then `learned_whitening` by views of its places, which are augmented
+    copies of its frames, or frames of a second traverse.
 
     Args:
-        numbers: K. None is 128, fewer on a short route (a quarter of its places); without views 256;
-            at most the rank.
+        numbers: K. None is 128, on a short route a quarter of its places, without views 256; at most the
+            rank.
         components: principal components that are whitened, at least K.
-        shrinkage: of `learned_whitening`. None is 0.03, and more where there are few views.
-        views: augmented copies of each frame, 0 for none. None is 4, up to 12 on a short route: 30 for each
-            component. Frames are drawn evenly where there would be more than `most_views`.
-        most_views: copies in all.
+        shrinkage: of `learned_whitening`. None is 0.03, and more if there are few views.
+        views: augmented copies of each frame. None is 4, up to 12 on a short route: 30 for each component.
+        most_views: copies in all; frames are drawn evenly if there would be more.
         strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
         seed: of the copies.
         bits: of each number of the projection: 4, two to a byte, 8 or 16.
-        power: of the size of each number once it is whitened, above 0 and at most 1, its sign kept. Below 1 a
-            few large numbers, such as those of something new in the frame, count for less.
+        power: of the absolute value of each whitened number, above 0 and at most 1. Below 1 large ones, such
+            as those of something new in the frame, count for less.
 
     Shape: (B,D) -> (B,K).
 
-    Convention: descriptors have length 1. Without views, as for ready features, nothing is whitened: they are
-        the principal components of the centred features, with their variances, and one constant number behind
-        them, the root mean square of these numbers: where they are few, a cosine tells long from short by it.
-        Before `learn` there is no projection, and descriptors pass as they are.
+    Convention: descriptors have length 1. Without views they are the principal components, with their
+        variances, and a constant number, the root mean square of these. Before `learn` descriptors pass
+        unchanged.
 
     Raises:
         InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
             more `numbers` than the rank; forward: descriptors of another dimension.
 
     Example:
-        >>> route = torch.randn(400, 16)
-        >>> whitening = Whitening(numbers=4)
+        >>> route, whitening = torch.randn(400, 16), Whitening(numbers=4)
         >>> whitening.learn(route, [(route + 0.1 * torch.randn(400, 16), torch.arange(400))])
         >>> whitening(route).shape
         torch.Size([400, 4])
@@ -179,25 +145,21 @@ class Whitening(nn.Module):
         power: float = 1.0,
     ) -> None:
         super().__init__()
-        least = min(1 if count is None else count for count in (numbers, most_views))
-        if least < 1 or (views or 0) < 0 or components < (numbers or 1):
-            raise InputError(
-                f"Whitening got numbers={numbers}, components={components}, views={views}, "
-                f"most_views={most_views}; expected at least 1 each, 0 views or more, and no more numbers "
-                "than components"
-            )
-        if not (shrinkage is None or 0 < shrinkage <= 1) or not 0 < power <= 1 or bits not in BITS:
-            raise InputError(
-                f"Whitening got shrinkage={shrinkage}, power={power}, bits={bits}; expected a shrinkage and "
-                f"a power above 0 and at most 1, {', '.join(map(str, BITS))} bits"
-            )
         if not isinstance(strengths, Mapping | None):
             raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
         self.most_views, self.seed, self.bits, self.power = most_views, seed, bits, power
+        least, shares = 1 if numbers is None else numbers, (power, 1 if shrinkage is None else shrinkage)
+        counts = 1 <= least <= components and (views or 0) >= 0 and most_views >= 1
+        if not counts or bits not in (4, 8, 16) or not all(0 < share <= 1 for share in shares):
+            raise InputError(
+                f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected numbers of at least 1 and "
+                "at most components, 0 views or more, at least 1 in all, a shrinkage and a power above 0 "
+                "and at most 1, bits of 4, 8, 16"
+            )
         self.strengths = {**STRENGTHS, **(strengths or {})}
-        self.fixed = False  # learned elsewhere: it serves this route as it is
-        self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), as `stored`
+        self.fixed = False  # learned elsewhere: it serves this route unchanged
+        self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), see `_packed`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
         self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
         self.register_buffer("length", torch.zeros(0))  # (1,), the constant number, or (0,)
@@ -211,10 +173,7 @@ class Whitening(nn.Module):
         return halves[:, : self.scale.shape[0]].to(torch.int8) - 8
 
     def unpacked(self) -> Tensor:
-        """(D,K) float32, `whole` for a `forward` of single descriptors, which unpacking takes longer than.
-
-        It lies in memory by columns, as a product with one row is fastest.
-        """
+        """`whole` as float32, by columns in memory, for a fast `forward` of single descriptors."""
         return self.whole.T.float().contiguous().T
 
     @property
@@ -224,18 +183,16 @@ class Whitening(nn.Module):
 
     @property
     def dimension(self) -> int:
-        """Numbers of a whitened descriptor, once there is a projection."""
+        """Of a whitened descriptor, once there is a projection."""
         return len(self.scale) + len(self.length)
 
     def forward(self, descriptors: Tensor, unpacked: Tensor | None = None) -> Tensor:
-        """Descriptors (B,D) -> (B,K); `unpacked` is what the method of that name gave, if it is kept."""
+        """Descriptors (B,D) -> (B,K); `unpacked`: the result of that method, if it is kept."""
         if not self.learned:
             return descriptors
         if descriptors.ndim != 2 or descriptors.shape[1] != len(self.projection):
-            raise InputError(
-                f"the whitening got descriptors {tuple(descriptors.shape)}; "
-                f"expected (B, {len(self.projection)})"
-            )
+            seen = f"the whitening got descriptors {tuple(descriptors.shape)}"
+            raise InputError(f"{seen}; expected (B, {len(self.projection)})")
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
@@ -243,17 +200,22 @@ class Whitening(nn.Module):
             whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
                 whitened = torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
-            elif self.power < 1:
-                # the least size keeps gradients finite
+            elif self.power < 1:  # LEAST keeps gradients finite
                 whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
             return nn.functional.normalize(whitened, dim=1)
 
     def copies(self, frames: int, features: int) -> int:
-        """Augmented copies of each of so many frames, with so many features."""
+        """Augmented copies of each frame, by the numbers of frames and features."""
         if self.views is not None:
             return self.views
         components = min(frames, features, self.components)
         return min(ENOUGH, max(VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames)))
+
+    def kept(self, places: int, features: int, views: bool) -> int:
+        """Dimensions that are kept, unless the rank of the route is lower."""
+        if self.numbers is not None:
+            return self.numbers
+        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else WIDEST
 
     @torch.no_grad()
     def learn(self, places: Tensor, views: Iterable[tuple[Tensor, Tensor]] | None = None) -> None:
@@ -264,9 +226,9 @@ class Whitening(nn.Module):
             views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
         """
         kept = self.kept(len(places), places.shape[1], views is not None)
-        mean, basis, variances = principal_components(
-            places, kept if views is None else self.components, self.seed
-        )
+        found = principal_components(places, kept if views is None else self.components, self.seed)
+        # many descriptors lie in a file, wherever the model is
+        mean, basis, variances = (one.to(self.scale.device) for one in found)
         rank = int((variances > ROUNDING * variances[0]).sum())
         if kept > rank:
             if self.numbers is not None:
@@ -274,41 +236,29 @@ class Whitening(nn.Module):
             if views is not None:
                 log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
             kept = rank
-        # many descriptors lie in a file, wherever the model is
-        mean, basis, variances = (one.to(self.scale.device) for one in (mean, basis[:, :rank], variances))
         if views is None:
             self.take(mean, basis[:, :kept], variances[:kept].mean().sqrt())
             return
-        pairs = []
+        basis, pairs = basis[:, :rank], []
         for view, place in views:
             if view.shape[1] != len(mean):
                 raise InputError(
-                    f"the views have {view.shape[1]} features; expected {len(mean)}, as the route has"
+                    f"the views have {view.shape[1]} features; expected {len(mean)} as in the route"
                 )
-            pairs.append(((view - mean) @ basis, place))
+            own = places[place.to(places.device)].to(mean)
+            pairs.append(torch.stack([view - mean, own - mean]) @ basis)
         if not pairs:
             raise InputError("there are no views to whiten with; expected some, or None for none")
-        shown = torch.cat([place for _, place in pairs])
-        own = torch.cat(
-            [(places[part.to(places.device)].to(mean) - mean) @ basis for part in shown.split(ROWS)]
-        )
-        centre, projection = learned_whitening(
-            torch.cat([view for view, _ in pairs]), own, kept, self.shrinkage
-        )
+        shown, own = torch.cat(pairs, 1)
+        centre, projection = learned_whitening(shown, own, kept, self.shrinkage)
         self.take(mean + basis @ centre, basis @ projection, None)
 
-    def kept(self, places: int, features: int, views: bool) -> int:
-        """How many numbers are kept of so many features: K, unless the route turns out to have fewer."""
-        if self.numbers is not None:
-            return self.numbers
-        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else WIDEST
-
     def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
-        """Take over a projection in whole numbers, and its mean."""
+        """Set mean (D,), projection (D,K), rounded to `bits`, and the constant number, if any."""
         largest = 2 ** (self.bits - 1) - 1
         self.scale = projection.abs().amax(0) / largest
         whole = (projection / self.scale).round()
-        self.projection = stored(whole, self.bits)
+        self.projection = _packed(whole, self.bits)
         self.offset = (mean @ whole) * self.scale
         self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
 
@@ -321,27 +271,11 @@ class Whitening(nn.Module):
         super()._load_from_state_dict(state, prefix, *args)
 
     def extra_repr(self) -> str:
-        names = (
-            "numbers",
-            "components",
-            "shrinkage",
-            "views",
-            "most_views",
-            "strengths",
-            "seed",
-            "bits",
-            "power",
-        )
-        shown = [name for name in names if name != "strengths" or self.strengths != STRENGTHS]
-        return ", ".join(f"{name}={getattr(self, name)}" for name in shown)
+        return settings_of(self, *(["strengths"] if self.strengths == STRENGTHS else []))
 
 
-def stored(whole: Tensor, bits: int) -> Tensor:
-    """Whole numbers of so many bits as a buffer holds them.
-
-    Shape: (D,K) -> (D,K) int8 or int16; of 4 bits (D,ceil(K/2)) uint8, the first half of the columns in the
-        low bits and the others in the high ones, 8 added to each.
-    """
+def _packed(whole: Tensor, bits: int) -> Tensor:
+    """Whole numbers (D,K) as int8 or int16; of 4 bits two to a byte, the first half of the columns lower."""
     if bits > 4:
         return whole.to(torch.int8 if bits == 8 else torch.int16)
     low, high = nn.functional.pad(whole + 8, (0, whole.shape[1] % 2)).to(torch.uint8).chunk(2, 1)
@@ -349,14 +283,12 @@ def stored(whole: Tensor, bits: int) -> Tensor:
 
 
 def _check_buffers(projection: Tensor, scale: Tensor, offset: Tensor, length: Tensor) -> None:
-    """Refuse what is no projection and its scale."""
+    """Refuse shapes, types and values that `take` does not make."""
     seen = [tuple(tensor.shape) for tensor in (projection, scale, offset, length)]
-    columns = seen[1]
-    if projection.dtype == torch.uint8:  # two numbers to a byte
-        columns = tuple((count + 1) // 2 for count in seen[1])
-    whole = projection.dtype in (torch.uint8, torch.int8, torch.int16) and seen[2] == seen[1]
+    width = tuple((count + 1) // 2 if projection.dtype == torch.uint8 else count for count in seen[1])
+    fits = projection.ndim == 2 and seen[0][1:] == width and seen[2] == seen[1] and seen[3] in ((0,), (1,))
     finite = all(bool(tensor.isfinite().all()) for tensor in (scale, offset, length))
-    if len(seen[0]) != 2 or seen[0][1:] != columns or not whole or not finite or seen[3] not in ((0,), (1,)):
+    if not fits or not finite or projection.dtype not in (torch.uint8, torch.int8, torch.int16):
         raise InputError(
             f"the whitening has a projection, scale, offset and length of {seen}; expected finite (D,K), "
             "two numbers to a byte in uint8, (K,), (K,), and one number or none"
@@ -364,27 +296,20 @@ def _check_buffers(projection: Tensor, scale: Tensor, offset: Tensor, length: Te
 
 
 def principal_components(rows: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """The directions in which descriptors vary most, by subspace iteration on a sample of them.
+    """The directions in which SAMPLED of the descriptors, drawn evenly, vary most, by subspace iteration.
 
-    Args:
-        rows: descriptors; `SAMPLED` of them, drawn evenly, are used.
-        count: of directions at most; there are fewer where there are fewer rows or features.
-        seed: of the subspace that the iteration begins with.
+    Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first; C is `count` at most.
 
-    Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first.
-
-    Source: Halko, Martinsson and Tropp, SIAM Review 53 (2011), algorithm 4.4.
-
-    Raises:
-        InputError: fewer than two rows, or rows that do not vary.
+    Source: Halko, Martinsson and Tropp, SIAM Review 53 (2011), algorithm 4.4; with one QR a round it is
+        faster than `torch.svd_lowrank`.
     """
     if rows.ndim != 2 or len(rows) < 2:
         raise InputError(f"the descriptors are {tuple(rows.shape)}; expected (N,D), N at least 2")
     sample = rows[:: max(1, len(rows) // SAMPLED)].float()
     mean = sample.mean(0)
     centred = sample - mean
-    generator = torch.Generator().manual_seed(seed)
     width = min(count + SPARE, len(sample), rows.shape[1])
+    generator = torch.Generator().manual_seed(seed)
     basis = torch.randn(rows.shape[1], width, generator=generator).to(centred)
     for _ in range(ROUNDS):
         basis = torch.linalg.qr(centred.T @ (centred @ basis)).Q

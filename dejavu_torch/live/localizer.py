@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -14,13 +13,13 @@ from torch import Tensor
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.types import InputError, Match, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel
 
 EXPECTED = (
     "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1], or, of a map of ready features, "
     "float (D,)"
 )
-FURTHEST = 100  # frames left out that count; behind more, a jump finds the place again
+FURTHEST = 100  # frames left out that count; after more, a jump finds the place again
 ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
 
 
@@ -50,18 +49,17 @@ class LiveLocalizer:
 
     Args:
         model: has a map. It is used as it is and where it is: on a GPU, frames are moved there.
-        sequence: keeps what the frames before told. "filter", the default, is a `PlaceFilter`: frames of a
-            camera show places one behind the other, and it alone says how probable its answer is. None takes
-            each frame by itself.
+        sequence: "filter", the default, is a `PlaceFilter`: frames of a camera show consecutive places, and
+            it alone says how probable its answer is. None matches each frame by itself.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
     Attributes:
-        scores: (N,) of the latest frame, on the model's device; None ahead of the first.
+        scores: (N,) of the latest frame, on the model's device; None before the first.
 
     Convention: the answers are those of `DejaVu.localize` on the same frames with the same sequence, but for
         rounding. A frame that is refused changes nothing. `localizer(frame, left_out)` says how many frames
-        came since the one before and were left out: a `PlaceFilter` moves once more for each of them.
+        were left out since the one before: a `PlaceFilter` moves once more for each of them.
 
     Raises:
         InputError: a model without a map, or whose places are at even steps along the ground; calling it: an
@@ -89,8 +87,6 @@ class LiveLocalizer:
             )
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self.device = model.map.positions.device
-        if self.sequence is not None:
-            self.sequence.check(None, model.map.places)
         model.check_precision(self.sequence)
         self._pipeline = model.pipeline
         self._shape: tuple[int, ...] | None = None  # of the latest frame that fitted
@@ -101,23 +97,18 @@ class LiveLocalizer:
     def reset(self) -> None:
         """Forget the frames so far."""
         self.scores: Tensor | None = None
-        self._matches: Iterator[Match] = self.model.matches_of(self._descriptors(), self.sequence, self._look)
+        matching = self.model.matching(self.sequence)._replace(on_scores=self._keep)
+        self._localizer = self.model.localizer(matching)
+
+    def _keep(self, scores: Tensor) -> None:
+        self.scores = scores[0]
 
     @torch.no_grad()
     def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
         began = time.perf_counter()
-        self._descriptor = self._describe(as_batch(frame, self.device))
-        filter = self.sequence if isinstance(self.sequence, PlaceFilter) else None
-        try:
-            if filter is not None:
-                filter.moved = 1 + min(left_out, FURTHEST)
-            match = next(self._matches)
-        except BaseException:  # as Ctrl-C: what was half done is not gone on with
-            self.reset()
-            raise
-        finally:
-            if filter is not None:
-                filter.moved = 1
+        descriptor = self._describe(as_batch(frame, self.device))
+        self._localizer.skip(min(left_out, FURTHEST))
+        match = self._localizer(descriptor)
         place, score = int(match.index), float(match.score)
         found = self.model.map
         shown, routes = int(found.frame_of(match.index)), found.routes
@@ -126,7 +117,7 @@ class LiveLocalizer:
             int(found.table.own_frame_of(match.index)) if routes else shown,
             self.model.frame_name(shown) if shown >= 0 else "",
             score,
-            math.nan if filter is None else math.exp(-score),
+            math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
             math.nan if match.probability is None else float(match.probability),
             bool(match.accepted),
             1e3 * (time.perf_counter() - began),
@@ -135,11 +126,9 @@ class LiveLocalizer:
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) probabilities of each place, and of being off the map, behind the latest frame; None without
-        a filter, or ahead of the first frame."""
-        if not isinstance(self.sequence, PlaceFilter) or self.scores is None:
-            return None
-        return self.sequence.latest()
+        """(N+1,) probabilities of each place, and of being off the map, after the latest frame; None without
+        a filter, or before the first frame."""
+        return self._localizer.posterior
 
     def _describe(self, batch: Tensor) -> Tensor:
         """The descriptor of a frame that fits the map, (1,K)."""
@@ -159,14 +148,6 @@ class LiveLocalizer:
         if not descriptor.isfinite().all():
             raise InputError("the frame gives NaN or infinite features; expected finite numbers")
         return descriptor
-
-    def _descriptors(self) -> Iterator[Tensor]:
-        """That of the frame at hand, whenever the next one is asked for."""
-        while True:
-            yield self._descriptor
-
-    def _look(self, scores: Tensor) -> None:
-        self.scores = scores[0]
 
 
 def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> Tensor:

@@ -81,8 +81,7 @@ def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
     if templates.numel() < WORTH_COMPILING:
         return None
     a, b = numbers_of(query), numbers_of(templates)
-    kernel = None if a is None or b is None else _compiled()
-    if a is None or b is None or kernel is None:
+    if a is None or b is None or (kernel := _compiled()) is None:
         return None
     return torch.from_numpy(_in_threads(kernel, a, b))
 
@@ -122,6 +121,5 @@ def _in_threads(kernel: Kernel, query: Floats, templates: Floats) -> Floats:
             kernel(*task)
     else:
         with ThreadPoolExecutor(threads) as pool:
-            for _ in pool.map(kernel, *zip(*tasks, strict=True)):
-                pass
+            list(pool.map(lambda task: kernel(*task), tasks))
     return out

@@ -21,8 +21,7 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
     than their terms are, so the first of equal scores is sought among all r that reach the lowest.
 
     Args:
-        one, other: distances of each layer at its first tau places, in units of the scores times `divisor`.
-        places: at least the longer tau.
+        one, other: distances of each layer at its first tau places. places: at least the longer tau.
 
     Shape: (Q,tau1), (Q,tau2) -> (Q,), (Q,) int64; `places` where no score is finite.
 
@@ -73,20 +72,10 @@ def _circles(outer: int, inner: int, device: torch.device) -> tuple[Tensor, Tens
 def sliding_minimum(values: Tensor, width: int) -> Tensor:
     """The lowest of each value and the width - 1 after it, around the circle of the last dimension.
 
-    O(n) for any width: every window is the end of one block of `width` values and the beginning of the next,
-    and running minima of all blocks are computed once.
-
-    Args:
-        width: from 1 to n.
-
-    Shape: (...,n) -> (...,n).
+    O(n) for any width: every window is the end of one block of `width` values and the beginning of the next.
 
     Source: M. van Herk, A fast algorithm for local minimum and maximum filters on rectangular and octagonal
         kernels, Pattern Recognition Letters 13 (1992).
-
-    Example:
-        >>> sliding_minimum(torch.tensor([3, 1, 4, 2, 5]), 2)
-        tensor([1, 1, 2, 2, 3])
     """
     size = values.shape[-1]
     padding = -(size + width - 1) % width  # of the last block

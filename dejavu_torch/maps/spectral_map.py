@@ -222,7 +222,7 @@ class SpectralMap(PlaceMap):
         known = len(self.lengths) - first  # those of a file that is being read are there already
         self.lengths = torch.cat([self.lengths, self.lengths.new_tensor(places[known:])])
         self.steps = torch.cat([self.steps, self.steps.new_tensor(steps[known:])])
-        if len(self.visits):
+        if len(self.visits) and not known:
             self.count_visits(
                 torch.cat([self.visit_counts[: self.places], self.lengths.new_ones(sum(places))])
             )
@@ -305,7 +305,7 @@ class SpectralMap(PlaceMap):
         return route
 
     @property
-    def routes(self) -> tuple[Route, ...]:
+    def routes(self) -> tuple[Route, ...]:  # type: ignore[override]
         """See `PlaceMap`."""
         ends = [0, *torch.tensor([one.chunks for one in self._routes]).cumsum(0).tolist()]
         return tuple(
@@ -322,13 +322,28 @@ class SpectralMap(PlaceMap):
         names = [one.name for one in self._routes]
         if name not in names:
             raise InputError(f"there is no route {name!r}; expected one of {', '.join(names)}")
-        r, chunks, frames, places = names.index(name), 0, 0, 0
-        for one, route in zip(self._routes[:r], self.routes[:r], strict=True):
-            chunks, frames, places = chunks + one.chunks, frames + one.frames, places + route.places
-        made = SpectralMap(self.means[r : r + 1], **self.settings())
-        made.extend(self.coded()[chunks : chunks + self._routes[r].chunks])
-        made.positions = self.positions[frames : frames + self._routes[r].frames]
-        made.count_visits(self.visit_counts[places : places + made.places])
+        r = names.index(name)
+        first = sum(one.chunks for one in self._routes[:r])
+        made = self.between(first, first + self._routes[r].chunks)
+        start, frame = self.chunks[first][0], sum(one.frames for one in self._routes[:r])
+        made._routes = ()
+        made.positions = self.positions[frame : frame + self._routes[r].frames]
+        made.count_visits(self.visit_counts[start : start + made.places])
+        made._check_norms()
+        return made
+
+    def between(self, first: int, last: int) -> SpectralMap:
+        """The chunks [first, last) as a map, whose places score as in this one."""
+        ends = [0, *torch.tensor([one.chunks for one in self._routes]).cumsum(0).tolist()]
+        kept = {
+            r: min(stop, last) - max(start, first)
+            for r, (start, stop) in enumerate(pairwise(ends))
+            if start < last and stop > first
+        }
+        made = SpectralMap(self.means[[*kept] or [0]], **self.settings())
+        made._routes = tuple(RouteState(self._routes[r].name, count, 0) for r, count in kept.items())
+        made.extend(self.coded()[first:last])
+        made.min_norm = self.min_norm
         return made
 
     @property
@@ -461,60 +476,54 @@ class SpectralMap(PlaceMap):
 
     def get_extra_state(self) -> dict[str, Any]:
         """See `PlaceMap`."""
-        return {**super().get_extra_state(), "routes": [[*one] for one in self._routes]}
+        return {**super().get_extra_state(), "routes": [one._asdict() for one in self._routes]}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """See `PlaceMap`."""
         super().set_extra_state(state)
-        self._routes = tuple(RouteState(*one) for one in state.get("routes", ()))
+        self._routes = tuple(RouteState(**one) for one in state.get("routes", ()))
 
     def _save_to_state_dict(self, *args: Any) -> None:
         self._encode()
-        super()._save_to_state_dict(*args)  # type: ignore[no-untyped-call]
+        super()._save_to_state_dict(*args)
 
     def disagreement(self) -> str:
-        """See `PlaceMap`: of the tensors of a file."""
+        """See `PlaceMap`."""
         for name, (dtype, ndim) in FILE.items():
             tensor = getattr(self, name)
             if tensor.dtype != dtype or tensor.ndim != ndim:
                 return f"{name} {tuple(tensor.shape)} {tensor.dtype}; expected {dtype} of {ndim} dimensions"
-        lengths, sizes = self.lengths.tolist(), self.stream_table[:, 0].tolist()
-        if tuple(self.stream_table.shape) != (len(lengths), 2):
-            shape = tuple(self.stream_table.shape)
-            return f"a stream table {shape} for {len(lengths)} chunks; expected a row each"
+        lengths, routes = self.lengths.tolist(), self._routes
         if min(lengths, default=1) < 1 or sum(lengths) != self.places:
             return f"chunks of {lengths!s:.100} places; expected {self.places} in all"
-        if min(sizes, default=0) < 0 or sum(sizes) != len(self.streams):
-            return f"the coded lines are {len(self.streams)} bytes; the table claims {sizes!s:.100}"
         if len(self.steps) != len(lengths) or not bool(((self.steps > 0) & self.steps.isfinite()).all()):
             return f"steps {self.steps.tolist()!s:.100}; expected {len(lengths)} finite numbers above 0"
-        routes = max(1, len(self._routes))
-        if self.places and (
-            tuple(self.means.shape) != (routes, self.dimension) or not self.means.isfinite().all()
-        ):
-            return f"means {tuple(self.means.shape)}; expected ({routes}, {self.dimension}) finite numbers"
-        names = [one.name for one in self._routes]
+        shape = (max(1, len(routes)), self.dimension)
+        if self.places and (self.means.shape != shape or not self.means.isfinite().all()):
+            return f"means {tuple(self.means.shape)}; expected {shape} finite numbers"
+        names, chunks, frames = zip(*routes, strict=True) if routes else ((), (), ())
         if len({*names}) != len(names) or not all(names):
             return f"names {', '.join(names)}; expected another one for each of {len(names)} routes"
-        if self._routes and (
-            sum(one.chunks for one in self._routes) != len(lengths)
-            or min(one.chunks for one in self._routes) < 1
-        ):
-            return f"routes of {[one.chunks for one in self._routes]!s:.100} chunks; expected {len(lengths)} in all"
-        frames = [one.frames for one in self._routes]
-        if len(frames) and sum(frames) != (len(self.positions) or self.places):
-            return f"routes of {frames!s:.100} frames; expected {len(self.positions) or self.places} in all"
+        if routes and (sum(chunks) != len(lengths) or min(chunks) < 1):
+            return f"routes of {[*chunks]!s:.100} chunks; expected {len(lengths)} in all"
+        if routes and sum(frames) != self.table.frames:
+            return f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all"
         return ""
 
     def loaded(self) -> None:
         """Decode the chunks of a file."""
+        lengths, steps, table = (one.tolist() for one in (self.lengths, self.steps, self.stream_table))
         problem = self.disagreement()
+        if not problem and tuple(self.stream_table.shape) != (len(lengths), 2):
+            shape = tuple(self.stream_table.shape)
+            problem = f"a stream table {shape} for {len(lengths)} chunks; expected a row each"
+        sizes = [] if problem else [size for size, _ in table]
+        if not problem and (min(sizes, default=0) < 0 or sum(sizes) != len(self.streams)):
+            problem = f"the coded lines are {len(self.streams)} bytes; the table claims {sizes!s:.100}"
         if problem:
             raise InputError(f"the map does not fit together: {problem}")
         check_sizes(self.places)
-        lengths, steps = self.lengths.tolist(), self.steps.tolist()
-        table, escapes = self.stream_table.tolist(), self.escapes.cpu()
-        streams = self.streams.cpu().split([size for size, _ in table])
+        streams, escapes = self.streams.cpu().split(sizes), self.escapes.cpu()
         self._clear()
         used, parts = 0, []
         for places, (_, checksum), stream in zip(lengths, table, streams, strict=True):

@@ -43,15 +43,14 @@ class TemplateState(NamedTuple):
 class Segment(NamedTuple):
     """Places [start, stop) that the same layers cover, by their positions in the plan.
 
-    lap: places until the scores repeat. searched: whether `lowest` searches the two layers. cost: of that, or
-    of a scan, in places that are scored.
+    lap: places until the scores repeat. cost: of `lowest` here, in places that are scored in the same time:
+    that of a search of two layers, if it is less than `lap`, else `lap`.
     """
 
     start: int
     stop: int
     layers: tuple[int, ...]
     lap: int
-    searched: bool
     cost: int
 
 
@@ -62,9 +61,8 @@ def segments(plan: Plan, places: int) -> Iterator[Segment]:
         members = tuple(j for j, layer in enumerate(plan) if layer.start <= start and stop <= layer.stop)
         sizes = [plan[j].period.numerator for j in members]
         lap = reduce(lambda length, size: min(math.lcm(length, size), stop - start), sizes, 1)
-        search = PHASE_COST * sum(sizes)
-        pays = len(members) == 2 and search < lap
-        yield Segment(start, stop, members, lap, pays, search if pays else lap)
+        cost = min(lap, PHASE_COST * sum(sizes)) if len(members) == 2 else lap
+        yield Segment(start, stop, members, lap, cost)
 
 
 def weight_per_feature(metric: Metric, features: int) -> float:
@@ -73,17 +71,10 @@ def weight_per_feature(metric: Metric, features: int) -> float:
 
 
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
-    """How unlikely each place is: -log softmax(-S / T) over places.
+    """How unlikely each place is, in nats: -log softmax(-S / T) over places; (Q,N) -> (Q,N), lower is better.
 
-    It keeps the order of places (but for rounding at a large T) and makes the scores of different queries
-    comparable: what no template explains raises S at all places, and this not at all.
-
-    Args:
-        scores: S, lower is better. temperature: T, in units of S.
-
-    Shape: (Q,N) -> (Q,N), in nats, lower is better, at least 0.
-
-    Convention: a place that scores +inf has no probability and stays +inf.
+    It keeps the order of places and makes the scores of different queries comparable: what no template
+    explains raises S at all places, and this not at all. A place that scores +inf stays +inf.
 
     Example:
         >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()
@@ -105,7 +96,6 @@ class TemplateMap(PlaceMap):
         feature_index: (sum F,) int32.
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
         weights: (D,) float, the factor of each feature's difference in eq. 3; (0,) for 1.
-        positions: see `PlaceMap`.
 
     Args:
         plan: the layers.
@@ -114,10 +104,8 @@ class TemplateMap(PlaceMap):
         dimension: D, features per frame.
         metric: distance of eq. 3, see `phase_distances`.
         reduction: "sum" is eq. 4 as printed. "mean" divides it by the number of features summed over (l2:
-            their roots, cosine: the layers), so that places covered by many features and places covered by
-            few are comparable.
-        temperature: scores are those of `log_posterior`; None, the paper's letter, leaves S as it is. It is
-            part of the state, not of the settings.
+            their roots, cosine: the layers), so that places are comparable whatever covers them.
+        temperature: T of `log_posterior`, which scores then are; None, the paper's letter, leaves S as it is.
         weights: see above; None for 1.
 
     Shape: scores: query features (Q,D) -> (Q,N), lower is better, uncovered +inf.
@@ -127,7 +115,7 @@ class TemplateMap(PlaceMap):
 
     Raises:
         InputError: templates that do not fit the plan, an unknown metric or reduction, a temperature of 0 or
-            less; scores: features of another dimension than the map's.
+            less; scores: features of another dimension.
 
     Example:
         >>> plan = (FrequencyLayer(2, 2, 0, 3, (0,)),)
@@ -163,11 +151,11 @@ class TemplateMap(PlaceMap):
             raise InputError(f"reduction {reduction!r} is unknown; expected 'mean' or 'sum'")
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
         for layer, block in zip(plan, templates, strict=True):
-            expected = layer.phases, len(layer.features)
-            if block.shape != expected:
+            phases, features = layer.phases, len(layer.features)
+            if block.shape != (phases, features):
                 raise InputError(
-                    f"a layer of {expected[0]} phases and {expected[1]} features got templates "
-                    f"{tuple(block.shape)}; expected {expected}"
+                    f"a layer of {phases} phases and {features} features got templates {tuple(block.shape)}; "
+                    f"expected ({phases}, {features})"
                 )
         rows = [(*layer.period.as_integer_ratio(), layer.phases, layer.start, layer.stop) for layer in plan]
         index = [feature for layer in plan for feature in layer.features]
@@ -227,7 +215,7 @@ class TemplateMap(PlaceMap):
         return super().get_extra_state() | {"temperature": self.temperature}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See `PlaceMap`; the temperature comes from the state."""
+        """See `PlaceMap`."""
         super().set_extra_state(state)
         self.temperature = state.get("temperature")
 
@@ -242,7 +230,7 @@ class TemplateMap(PlaceMap):
         return list(self.feature_index.split([len(layer.features) for layer in self.plan]))
 
     def weighted(self, features: Tensor) -> Tensor:
-        """Features times `weights`, which templates are made from and compared with. (n,D) -> (n,D)."""
+        """Features times `weights`, as templates are made and compared with them: (n,D) -> (n,D)."""
         return features * self.weights if len(self.weights) else features
 
     def distances(self, queries: Tensor, layers: Sequence[int] | None = None) -> list[Tensor]:
@@ -257,10 +245,10 @@ class TemplateMap(PlaceMap):
             for j in (range(len(blocks)) if layers is None else layers)
         ]
 
-    def along(self, distances: Tensor, layer: int, start: int, stop: int) -> Tensor:
-        """Distances of a layer at the places [start, stop) that it covers: (Q,P) -> (Q,stop - start)."""
+    def along(self, distances: Tensor, layer: int, start: int, count: int) -> Tensor:
+        """Distances of a layer at `count` places that it covers, from `start` on: (Q,P) -> (Q,count)."""
         lap = self.lap_phases[self.laps[layer]]
-        first, count = (start - self.plan[layer].start) % len(lap), stop - start
+        first = (start - self.plan[layer].start) % len(lap)
         if first + count <= len(lap):
             return distances.index_select(1, lap[first : first + count])
         lap = lap.roll(-first) if first else lap
@@ -268,22 +256,20 @@ class TemplateMap(PlaceMap):
 
     def divisor(self, layers: Sequence[int]) -> float:
         """What the sum of the distances of these layers is divided by in S."""
-        if self.reduction == "sum":
-            return 1.0
-        return sum(weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
+        per_layer = (weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
+        return sum(per_layer) if self.reduction == "mean" else 1.0
 
     def combine(self, distances: Sequence[Tensor], segments: Sequence[Segment] | None = None) -> Tensor:
         """S(i) from the phase distances of each layer (eq. 4): L tensors (Q,P) -> (Q,N).
 
         Args:
-            segments: whose places, in order; None for all.
-
-        Convention: a place that no layer covers scores +inf.
+            segments: whose places, in order; None for all. A place that no layer covers scores +inf.
         """
         parts = []
         for start, stop, layers, *_ in self.segments if segments is None else segments:
             if layers:
-                total: Tensor = reduce(torch.add, [self.along(distances[j], j, start, stop) for j in layers])
+                rows = [self.along(distances[j], j, start, stop - start) for j in layers]
+                total: Tensor = reduce(torch.add, rows)
                 parts.append(total / self.divisor(layers) if self.reduction == "mean" else total)
             else:
                 parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, stop - start))
@@ -316,17 +302,14 @@ class TemplateMap(PlaceMap):
             return None
         distances, found = self.distances(queries), []
         for segment in self.segments:
-            start, _, layers, lap, searched, _ = segment
-            if searched:
-                ends = [start + self.plan[j].period.numerator for j in layers]
+            start, _, layers, lap, cost = segment
+            if cost < lap:
                 one, other = (
-                    self.along(distances[j], j, start, end) for j, end in zip(layers, ends, strict=True)
+                    self.along(distances[j], j, start, self.plan[j].period.numerator) for j in layers
                 )
                 score, place = lowest(one, other, lap, self.divisor(layers))
-            elif layers:
-                score, place = self.combine(distances, [segment._replace(stop=start + lap)]).min(1)
             else:
-                continue
+                score, place = self.combine(distances, [segment._replace(stop=start + lap)]).min(1)
             found.append((score, start + place))
         scores, places = (torch.stack(column, 1) for column in zip(*found, strict=True))
         best = scores.amin(1)
@@ -422,7 +405,7 @@ class TemplateMapper(Mapper):
     Shape: features (N,D) -> TemplateMap of N places; one without layers, on which every place scores +inf,
         if nothing repeats.
 
-    Convention: periods are exact numbers and get no gradient; the templates do, where gradients are enabled.
+    Convention: periods get no gradient; the templates do, where gradients are enabled.
 
     Raises:
         InputError: see `TemplateMap`, and what `periods` refuses.
@@ -449,12 +432,16 @@ class TemplateMapper(Mapper):
                 f"periods is a {type(periods).__name__}; expected a PeriodFinder such as SpectrogramAnalysis"
             )
         self.trainable = trainable
-        self.periods = SpectrogramAnalysis() if periods is None else periods
+        self.periods: PeriodFinder | None = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
         self.templates = PhaseTemplates()
         self.empty()  # refuses what a map would
 
     def forward(self, features: Tensor) -> TemplateMap:
+        if self.periods is None:  # of a map file
+            raise InputError(
+                "what found the map's periods is not of this package; expected a mapper with it to learn anew"
+            )
         plan = self.periods.plan(features)
         return self._map(plan, self.templates(features, plan), *features.shape).to(features.device)
 

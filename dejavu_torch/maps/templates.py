@@ -53,9 +53,9 @@ def phase_mask(
         frames = torch.arange(frames)
     inside = frames >= start if stop is None else (frames >= start) & (frames < stop)
     phases = period.numerator if phases is None else phases
-    layer = FrequencyLayer(period, phases, start, start + 1 if stop is None else stop, (0,))
+    phase = FrequencyLayer(period, phases, start, start + 1 if stop is None else stop, (0,)).phase(frames)
     mask = torch.zeros(phases, len(frames), dtype=dtype, device=frames.device)
-    return mask.scatter_(0, layer.phase(frames)[None], inside.to(mask.dtype)[None])
+    return mask.scatter_(0, phase[None], inside.to(mask.dtype)[None])
 
 
 class PhaseTemplates(nn.Module):

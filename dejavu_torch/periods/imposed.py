@@ -24,16 +24,15 @@ class ImposedPeriods(PeriodFinder):
     Args:
         periods: P of each layer, distinct, >= 2, in bins; None chooses `supportive_periods` for the route.
         bin: places that share a phase, >= 1; the tolerance is a sensible size.
-        stagger: let the bins of the layers drift past each other, so that together they tell places apart
-            that share a bin: the periods are P * bin places and, in turn, a tenth of a bin more and less.
-            What `support_of` says then holds for nearly all places, not for every one.
+        stagger: the bins of the layers drift past each other, to tell places apart that share a bin: the
+            periods are P * bin places and, in turn, a tenth of a bin more and less. What `support_of`
+            says then holds for nearly all places.
 
     Shape: features (N,D), N >= 2 -> plan of L layers, each of period P * bin places and P phases over 0..N,
         each of all D features.
 
-    Convention: the last bin may be short. Given periods keep their order. Those that cannot tell the bins of
-        the route apart are allowed and logged in a line; one period of as many phases as bins is a
-        classifier of places. A phase that no place has gets a template that nothing reads.
+    Convention: the last bin may be short. Periods that cannot tell the bins of the route apart are allowed
+        and logged in a line; one period of as many phases as bins is a classifier of places.
 
     Raises:
         InputError: periods or a bin out of range, or features not (N,D) with N >= 2 and D >= 1.

@@ -23,20 +23,16 @@ def bin_period(length: int, k: Bin) -> Bin:
 
 
 def layers_of(bins: Tensor, start: int, stop: int) -> list[FrequencyLayer]:
-    """Group the features of the chunk [start, stop) into layers.
+    """Layers of the chunk [start, stop) by increasing period: features of equal `bin_period` share one.
 
     Args:
         bins: the strongest bins of each feature, -1 for none.
 
-    Shape: bins (count,D) -> layers by increasing period, phases = period.
-
-    Convention: features of similar period share a layer; similar means the same whole period, that is bins
-        whose `bin_period` is equal. A feature appears once in a layer.
+    Shape: bins (count,D) -> layers, phases = period.
     """
     rank, feature = (bins > 0).nonzero(as_tuple=True)
     period = bin_period(stop - start, bins[rank, feature])
-    layers = []
-    for tau in period.unique().tolist():
-        members = feature[period == tau].unique().tolist()
-        layers.append(FrequencyLayer(Fraction(tau), tau, start, stop, tuple(members)))
-    return layers
+    return [
+        FrequencyLayer(Fraction(tau), tau, start, stop, tuple(feature[period == tau].unique().tolist()))
+        for tau in period.unique().tolist()
+    ]

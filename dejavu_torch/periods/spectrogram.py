@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from inspect import signature
 from typing import Literal, NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.layers import layers_of
 from dejavu_torch.periods.stft import Spectrogram
-from dejavu_torch.types import InputError, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 log = logging.getLogger("dejavu_torch")
 
@@ -35,13 +36,10 @@ def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", 
     """The `count` strongest bins of each feature among bins 2..last, strongest first (section III-A).
 
     Args:
-        power: (K,D) power of each bin and feature.
-        count: how many bins per feature.
-        last: the largest bin allowed, that is the shortest period.
         peaks: "bins" ranks all bins by power; "local" ranks only local maxima, so that a peak and
             its own leakage into the next bin are not taken for two periods.
 
-    Shape: (K,D) -> (count,D) int64, -1 where a feature has no more such bins.
+    Shape: (K,D) -> (count,D) int64, -1 if a feature has no more such bins.
 
     Convention: a bin without power is no candidate; of equal bins the lower one wins.
     """
@@ -49,9 +47,8 @@ def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", 
     candidates = torch.zeros_like(power, dtype=torch.bool)
     candidates[2 : last + 1] = power[2 : last + 1] > 0
     if peaks == "local":
-        beyond = torch.cat([power[1:], power.new_full((1, features), -math.inf)])
-        before = torch.cat([power.new_full((1, features), -math.inf), power[:-1]])
-        candidates &= (power > before) & (power >= beyond)
+        edge = power.new_full((1, features), -math.inf)
+        candidates &= (power > torch.cat([edge, power[:-1]])) & (power >= torch.cat([power[1:], edge]))
     ranked = power.masked_fill(~candidates, -math.inf)
     order = ranked.argsort(dim=0, descending=True, stable=True)[:count]
     found = order.masked_fill(~candidates.gather(0, order), -1)
@@ -59,14 +56,10 @@ def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", 
 
 
 def noise_share(bins: int, features: int, false_alarm: float) -> float:
-    """Share of its power that a feature of white noise holds in one bin only by a rare accident.
+    """Share of its power that any of so many features of white noise holds in one bin, with this probability.
 
-    Fisher's test for a hidden period: the largest of K shares exceeds g with a probability of at
-    most K * (1 - g)**(K - 1); Bonferroni's bound over the D features of a chunk.
-
-    Args:
-        bins: K, bins the power is shared among. features: D.
-        false_alarm: accepted probability that any feature of a chunk of pure noise exceeds it.
+    Fisher's test for a hidden period, P(largest of K shares > g) <= K * (1 - g)**(K - 1), with Bonferroni's
+    bound over the D features of a chunk.
 
     Source: R. A. Fisher, Tests of significance in harmonic analysis, Proc. R. Soc. A 125 (1929).
 
@@ -83,26 +76,25 @@ class SpectrogramAnalysis(PeriodFinder):
     Args:
         window: places per spectrum, which is also the length of a chunk.
         hop: places from one chunk to the next; None is `window`, chunks side by side.
-        min_period: shortest period considered, in places. The longest is half the window (bin 2):
-            bins 0 and 1 hold the mean, slow drift, and their leakage through the Hann window.
+        min_period: shortest period considered, in places. The longest is half the window (bin 2): bins 0
+            and 1 hold the mean, slow drift, and their leakage through the Hann window.
         strongest: how many of its strongest frequencies a feature keeps.
         peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
-        false_alarm: a chunk gets layers only where some frequency holds a larger share of its feature's
-            power than white noise would show anywhere in the chunk with at most this probability
-            (`noise_share`), so that places in random order get none. Smooth footage passes, whether
-            it repeats or not. None: every chunk gets layers (the paper).
+        false_alarm: a chunk gets layers only if some frequency holds a larger share of its feature's power
+            than white noise would anywhere in the chunk with at most this probability (`noise_share`).
+            Smooth footage passes, whether it repeats or not. None: every chunk gets layers (the paper).
         short: for a route shorter than the window: "shrink" the window to it and log that, or "refuse".
 
     Shape: features (N,D) -> tuple of G spectra, one for each chunk, each (n // 2 + 1, D).
 
     Convention: Hann window, not centred. The places after the last whole window are a shorter window of
-        their own, left out where they are fewer than two of the shortest periods. A feature that does not
-        vary inside a chunk has no power there. Features of equal `bin_period` share a layer (`layers_of`).
-        Where a chunk is too short for any wave to pass `false_alarm`, one logged line says so.
+        their own, left out if they are fewer than two of the shortest periods. A feature that does not
+        vary inside a chunk has no power there. Features of equal `bin_period` share a layer. A chunk too
+        short for any wave to pass `false_alarm` is logged.
 
     Raises:
-        InputError: not a float tensor (N,D), not finite, fewer places than two of the shortest periods, or
-            than the window where `short` is "refuse".
+        InputError: an argument out of range; features that are not float (N,D) or not finite, or fewer
+            places than two of the shortest periods, or than the window if `short` is "refuse".
 
     Example:
         >>> wave = torch.sin(torch.arange(256) * 2 * torch.pi / 32)[:, None]
@@ -137,13 +129,8 @@ class SpectrogramAnalysis(PeriodFinder):
             raise InputError(
                 f"spectrogram got false_alarm={false_alarm}; expected None or a number in (0, 1)"
             )
-        self.window = window
-        self.hop = hop
-        self.min_period = min_period
-        self.strongest = strongest
-        self.peaks = peaks
-        self.false_alarm = false_alarm
-        self.short = short
+        self.window, self.hop, self.min_period, self.strongest = window, hop, min_period, strongest
+        self.peaks, self.false_alarm, self.short = peaks, false_alarm, short
         self._logged: set[str] = set()
 
     def chunks(self, places: int) -> list[tuple[int, int]]:
@@ -154,12 +141,12 @@ class SpectrogramAnalysis(PeriodFinder):
                 f"the route has {places} place{'s' * (places != 1)}; expected at least {shortest}, "
                 f"two periods of {self.min_period}"
             )
-        window = min(self.window, places)
-        if window < self.window and self.short == "refuse":
+        if places < self.window and self.short == "refuse":
             raise InputError(
                 f"the route has {places} places; expected at least {self.window}, the window, "
                 "or a shorter window, or one that shrinks (--mapper.periods.short shrink)"
             )
+        window = min(self.window, places)
         hop = min(self.hop or window, window)
         chunks = [(start, start + window) for start in range(0, places - window + 1, hop)]
         rest = chunks[-1][0] + hop
@@ -172,6 +159,7 @@ class SpectrogramAnalysis(PeriodFinder):
         chunks = self.chunks(len(features))
         return tuple(Spectrum(start, stop, chunk_power(features[start:stop])) for start, stop in chunks)
 
+    @torch.no_grad()
     def plan(self, features: Tensor) -> Plan:
         """The layers of a route, where gradients stop.
 
@@ -180,14 +168,13 @@ class SpectrogramAnalysis(PeriodFinder):
         check_features(features)
         places = len(features)
         chunks = self.chunks(places)
-        if chunks == [(0, places)] and places < self.window:
+        if places < self.window:
             self._warn_once(f"window shrunk from {self.window} to {places} places, the whole route")
-        layers = []
-        with torch.no_grad():
-            for start, stop in chunks:
-                bins, share = self._strongest(features[start:stop])
-                if self._stands_out(share, start, stop):
-                    layers += layers_of(bins, start, stop)
+        layers: list[FrequencyLayer] = []
+        for start, stop in chunks:
+            bins, share = self._strongest(features[start:stop])
+            if self._exceeds_noise(share, start, stop):
+                layers += layers_of(bins, start, stop)
         return tuple(layers)
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
@@ -195,14 +182,15 @@ class SpectrogramAnalysis(PeriodFinder):
         kept, shares = [], []
         for columns in chunk.split(max(1, NUMBERS_AT_ONCE // len(chunk)), 1):
             power = chunk_power(columns)
-            most = min(self.strongest, len(power))  # there are no more
-            bins = strongest_bins(power, most, len(chunk) // self.min_period, self.peaks)
+            bins = strongest_bins(
+                power, min(self.strongest, len(power)), len(chunk) // self.min_period, self.peaks
+            )
             share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
             kept.append(bins)
             shares.append(share.where(bins > 0, 0.0).amax(0))
         return torch.cat(kept, 1), torch.cat(shares)
 
-    def _stands_out(self, share: Tensor, start: int, stop: int) -> bool:
+    def _exceeds_noise(self, share: Tensor, start: int, stop: int) -> bool:
         """Whether any frequency of a chunk is stronger than noise that is new at every place."""
         if self.false_alarm is None:
             return True
@@ -217,8 +205,7 @@ class SpectrogramAnalysis(PeriodFinder):
             self._logged.add(message)
 
     def extra_repr(self) -> str:
-        names = ("window", "hop", "min_period", "strongest", "peaks", "false_alarm", "short")
-        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in signature(type(self)).parameters)
 
 
 def check_features(features: Tensor) -> None:
@@ -239,9 +226,8 @@ def chunk_power(chunk: Tensor) -> Tensor:
     centred = chunk - chunk.mean(0)
     # rounding leaves a constant feature a trace of power: zero it, or noise would name its period
     constant = centred.abs().amax(0) <= 8 * torch.finfo(chunk.dtype).eps * chunk.abs().amax(0)
-    centred = centred.masked_fill(constant, 0.0)
     transform = Spectrogram(
         n_fft=length, hop_length=length, center=False, power=2.0, wkwargs={"dtype": chunk.dtype}
     )
-    power: Tensor = transform.to(chunk)(centred.T)[..., 0].T
+    power: Tensor = transform.to(chunk)(centred.masked_fill(constant, 0.0).T)[..., 0].T
     return power

@@ -1,7 +1,7 @@
-"""The one place that imports torchaudio, and what stands in where its wheel does not load.
+"""The one place that imports torchaudio, and what replaces it if its wheel does not load.
 
-torchaudio's compiled library refuses a torch of another build at import time. The import is tried,
-never probed; `BACKEND` tells which one is active: "torchaudio" or "torch.stft".
+torchaudio's compiled library refuses a torch of another build at import, so the import is tried, never
+probed; `BACKEND` names the active one: "torchaudio" or "torch.stft".
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from torch import Tensor, nn
 class StftSpectrogram(nn.Module):
     """torchaudio.transforms.Spectrogram on torch.stft: same arguments, same persistent `window` buffer.
 
-    Args: as torchaudio.transforms.Spectrogram; power=None returns the complex spectrum.
-
-    Shape: (..., time) -> (..., n_fft // 2 + 1, frames), or (..., n_fft, frames) where not onesided.
+    Shape: (..., time) -> (..., n_fft // 2 + 1, frames), or (..., n_fft, frames) if not onesided.
     """
+
+    window: Tensor
 
     def __init__(
         self,
@@ -36,37 +36,28 @@ class StftSpectrogram(nn.Module):
         onesided: bool = True,
     ) -> None:
         super().__init__()
-        self.n_fft = n_fft
-        self.win_length = win_length if win_length is not None else n_fft
-        self.hop_length = hop_length if hop_length is not None else self.win_length // 2
-        self.register_buffer("window", window_fn(self.win_length, **(wkwargs or {})))
-        self.pad = pad
-        self.power = power
-        self.normalized = normalized
-        self.center = center
-        self.pad_mode = pad_mode
-        self.onesided = onesided
-
-    window: Tensor
+        length = n_fft if win_length is None else win_length
+        self.register_buffer("window", window_fn(length, **(wkwargs or {})))
+        self.pad, self.power, self.normalized = pad, power, normalized in (True, "window")
+        self.options: dict[str, Any] = {
+            "n_fft": n_fft,
+            "win_length": length,
+            "hop_length": length // 2 if hop_length is None else hop_length,
+            "center": center,
+            "pad_mode": pad_mode,
+            "normalized": normalized == "frame_length",
+            "onesided": onesided,
+            "return_complex": True,
+        }
 
     def forward(self, waveform: Tensor) -> Tensor:
-        if self.pad > 0:
-            waveform = nn.functional.pad(waveform, (self.pad, self.pad))
         lead = waveform.shape[:-1]
-        spectrum = torch.stft(
-            waveform.reshape(-1, waveform.shape[-1]),
-            n_fft=self.n_fft,
-            hop_length=self.hop_length,
-            win_length=self.win_length,
-            window=self.window,
-            center=self.center,
-            pad_mode=self.pad_mode,
-            normalized=self.normalized == "frame_length",
-            onesided=self.onesided,
-            return_complex=True,
+        waves = nn.functional.pad(waveform, (self.pad, self.pad)).reshape(
+            -1, waveform.shape[-1] + 2 * self.pad
         )
+        spectrum = torch.stft(waves, window=self.window, **self.options)
         spectrum = spectrum.reshape(lead + spectrum.shape[-2:])
-        if self.normalized is True or self.normalized == "window":
+        if self.normalized:
             spectrum = spectrum / self.window.square().sum().sqrt()
         if self.power is None:
             return spectrum

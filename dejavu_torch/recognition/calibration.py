@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.recognition.candidates import Candidates, best_candidates
+from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
-from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import InputError, Scorer, SequenceModel
+from dejavu_torch.recognition.select import best_candidates, best_match
+from dejavu_torch.types import InputError, Match, SequenceModel
 
 TOLERANCE = 5  # places within which an answer is right
 MARGIN = 2.0  # weight of the margin beside the score itself
@@ -25,21 +25,21 @@ STEPS = 100  # of Newton's method at most
 
 
 class Platt(NamedTuple):
-    """p = 1 / (1 + exp(-(slope * evidence + offset)))"""
+    """p = 1 / (1 + exp(-(slope * confidence + offset)))"""
 
     slope: float
     offset: float
 
-    def probability(self, evidence: Tensor) -> Tensor:
-        """Of evidence (Q,): (Q,) float64 on the CPU, 0 where it is -inf."""
-        evidence = evidence.cpu()  # not every device has double precision
-        finite = evidence.double().nan_to_num(neginf=0.0)
+    def probability(self, confidence: Tensor) -> Tensor:
+        """Of confidence (Q,): (Q,) float64 on the CPU, 0 where it is -inf."""
+        confidence = confidence.cpu()  # not every device has double precision
+        finite = confidence.double().nan_to_num(neginf=0.0)
         p = torch.sigmoid(self.slope * finite + self.offset)
-        return torch.where(evidence.isneginf(), 0.0, p)
+        return torch.where(confidence.isneginf(), 0.0, p)
 
 
 class Calibration(NamedTuple):
-    """What turns evidence into probabilities; None for a kind of matching that is not calibrated.
+    """What turns confidence into probabilities; None for a kind of matching that is not calibrated.
 
     single: of queries by themselves. filter: of a `PlaceFilter` with its defaults.
     """
@@ -67,18 +67,18 @@ class Trial(NamedTuple):
     places: Tensor
 
 
-def fit(evidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:
+def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:
     """The slope and offset under which the answers that were seen are most likely.
 
     Args:
         weight: (n,) how often each answer counts; None is once.
 
-    Shape: evidence (n,) float and right (n,) bool -> Platt.
+    Shape: confidence (n,) float and right (n,) bool -> Platt.
 
-    Convention: what is aimed at is not 1 and 0, but (r + 1) / (r + 2) and 1 / (w + 2) of r right and w wrong
-        answers, so that the fit is finite where evidence tells all apart, or no answer was wrong. Evidence of
-        -inf is left out. A slope is never negative: where less evidence went with right answers, the share of
-        right ones is the probability of each.
+    Convention: the targets are not 1 and 0, but (r + 1) / (r + 2) and 1 / (w + 2) of r right and w wrong
+        answers, so that the fit is finite if confidence separates them, or no answer was wrong. Confidence of
+        -inf is left out. A slope is never negative: if right answers had less confidence, the share of right
+        ones is the probability of each.
 
     Source: Platt, Advances in Large Margin Classifiers (1999); by Newton's method, as of Lin, Lin and Weng,
         Machine Learning 68 (2007).
@@ -91,10 +91,10 @@ def fit(evidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:
         >>> platt.probability(torch.tensor([0.0, 1.5, 3])).round(decimals=1)
         tensor([0.2000, 0.5000, 0.8000], dtype=torch.float64)
     """
-    known = ~evidence.isneginf()
+    known = ~confidence.isneginf()
     if not bool((right & known).any()):
         raise InputError(f"none of {len(right)} answers is right; expected some, to calibrate by")
-    x, y = evidence[known].double(), right[known]
+    x, y = confidence[known].double(), right[known]
     weight = torch.ones_like(x) if weight is None else weight[known].double()
     mean, spread = x.mean(), x.std(correction=0)
     columns = torch.stack([(x - mean) / (spread if spread > 0 else 1), torch.ones_like(x)], 1)
@@ -125,16 +125,16 @@ def fit(evidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:
     return Platt(slope, float(found[1] - slope * mean))
 
 
-def evidence_of(scores: Tensor) -> Tensor:
+def confidence_of(scores: Tensor) -> Tensor:
     """How much the best place of each query stands out, (Q,N) -> (Q,); -inf where none is found.
 
     Minus its score, and `MARGIN` times how much lower it is than the best beyond `TOLERANCE` places.
     """
-    return evidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE))
+    return confidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE))
 
 
-def evidence(candidates: Candidates) -> Tensor:
-    """As `evidence_of`, by the two best places of each query that are more than `TOLERANCE` apart, (Q,2)."""
+def confidence(candidates: Match) -> Tensor:
+    """As `confidence_of`, by the two best places of each query, (Q,2), more than `TOLERANCE` apart."""
     best, second = candidates.score[:, 0], candidates.score[:, -1]
     margin = torch.where(second.isfinite(), second - best, 0)
     return torch.where(best.isfinite(), MARGIN * margin - best, -math.inf)
@@ -178,7 +178,7 @@ def _around(index: Tensor, far: int, scores: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = False) -> Calibration:
+def calibrated(route: PlaceMap, trials: Iterable[Trial], another_visit: bool = False) -> Calibration:
     """Fit on queries whose places are known, and on the same with the place and its surroundings, twice the
     tolerance to each side, left out: answers off the map, of which none is right.
 
@@ -197,23 +197,23 @@ def calibrated(route: Scorer, trials: Iterable[Trial], another_visit: bool = Fal
         away = scores.scatter(1, _around(places, 2 * TOLERANCE, scores), math.inf)
         for one, is_there in ((scores, True), (away, False)):
             filtered = PlaceFilter()(one)
-            for kind, found, evidence in (
-                ("single", one, evidence_of(one)),
+            for kind, found, confidence in (
+                ("single", one, confidence_of(one)),
                 ("filter", filtered, Track()(filtered, one)),
             ):
                 index = best_match(found).index
                 right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & is_there
                 there = torch.full_like(right, is_there)
-                kinds[kind].append((evidence.cpu()[known.cpu()], right[known].cpu(), there[known].cpu()))
+                kinds[kind].append((confidence.cpu()[known.cpu()], right[known].cpu(), there[known].cpu()))
     if not kinds["single"]:
         raise InputError("there are no queries to calibrate by; expected some")
     platts: list[Platt | None] = []
     for pairs in kinds.values():
-        evidence, right, there = map(torch.cat, zip(*pairs, strict=True))
+        confidence, right, there = map(torch.cat, zip(*pairs, strict=True))
         wrong = int((there & ~right).sum())
         off_map = max(0, MISSED - wrong) / max(1, int((~there).sum())) if another_visit else 1.0
         weight = torch.where(there, 1.0, off_map)
-        platts.append(fit(evidence, right, weight) if not platts or bool(right.any()) else None)
+        platts.append(fit(confidence, right, weight) if not platts or bool(right.any()) else None)
     return Calibration(*platts)
 
 

@@ -1,19 +1,20 @@
-"""A probability for every place, driven along with the queries, and for being off the map."""
+"""A probability for every place, followed along the queries, and for being off the map."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dejavu_torch.types import InputError, Scorer, SequenceModel
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.types import InputError, SequenceModel
 
 IMPOSSIBLE = 1e-30  # a probability that gradients still bear
-LIKELY = 0.99  # of all probability has to lie in a stretch of places for these to be scored alone
+LIKELY = 0.99  # of all probability: a stretch of places with less is not scored alone
 UNLIKELY = 1e-4  # of all probability: a place with less ends such a stretch
 
 
@@ -22,18 +23,18 @@ class Moments(NamedTuple):
 
     mean: Tensor
     spread: Tensor
-    tells: Tensor
+    varied: Tensor
 
 
 def moments_of(scores: Tensor) -> Moments:
     """Of scores (Q,N); the spread is 1 where all are alike."""
-    known = scores.isfinite()
-    count = known.sum(1, keepdim=True).clamp(min=1)
-    mean = torch.where(known, scores, 0).sum(1, keepdim=True) / count
-    variance = torch.where(known, mean - scores, 0).square().sum(1, keepdim=True) / count
-    most = scores.masked_fill(~known, -math.inf).amax(1, keepdim=True)
-    tells = (most > scores.amin(1, keepdim=True)) & (variance > 0)
-    return Moments(mean, torch.where(tells, variance, 1).sqrt(), tells)
+    valid = scores.isfinite()
+    count = valid.sum(1, keepdim=True).clamp(min=1)
+    mean = torch.where(valid, scores, 0).sum(1, keepdim=True) / count
+    variance = torch.where(valid, mean - scores, 0).square().sum(1, keepdim=True) / count
+    most = scores.masked_fill(~valid, -math.inf).amax(1, keepdim=True)
+    varied = (most > scores.amin(1, keepdim=True)) & (variance > 0)
+    return Moments(mean, torch.where(varied, variance, 1).sqrt(), varied)
 
 
 class PlaceFilter(SequenceModel):
@@ -49,30 +50,27 @@ class PlaceFilter(SequenceModel):
             A camera that is faster is lost until a jump finds it again.
         jump: probability of being anywhere on the map next, whatever the place before.
         leave: probability of leaving the map. enter: of entering it, from off the map.
-        sharpness: nats for a standard deviation. Consecutive frames are alike, so that they tell less than
+        sharpness: nats for a standard deviation. Consecutive frames are alike, so that they say less than
             as many independent ones.
-        off_map: standard deviations; a place that stands out less than this speaks for being off the map.
+        off_map: standard deviations; a place that stands out less than this suggests being off the map.
         within: places; the score of a place counts its neighbours up to here, the less the further away,
             since what is nearly right counts as right.
         threshold: accept a match whose score is below, math.inf every match; None leaves it to
             `DejaVu.acceptance`, which without a calibrated map accepts what is more likely than not.
-        search_every: queries from one search of all places to the next. In between `follow`, and so
-            `DejaVu.localize`, scores only the stretch of places that is likely, as far as the map can score a
-            stretch alone: a spectral map by its chunks, a template map by its layers. Where no stretch holds
-            nearly all of the probability, all places are searched. Probabilities then differ by up to about
-            0.02 from those of a filter that always searches, and a jump is noticed at the next search.
-
-    Attributes:
-        moved: how often the camera moves from one query to the next: 1, or more ahead of a query that comes
-            behind some that were left out. It may be set while `stream` or `follow` goes on.
+        search_every: queries from one search of all places to the next. In between `DejaVu.localize` scores
+            only the stretch of places that is likely, as far as the map can score a stretch alone: a spectral
+            map by its chunks, a template map by its layers. If no stretch holds nearly all of the
+            probability, all places are searched. Probabilities then differ by up to about 0.02 from those of
+            a filter that always searches, and a jump is noticed at the next search.
 
     Shape: scores (Q,N), the posterior (N+1,) of the query before them or None -> (Q,N), -log of a
         probability in nats, lower is better.
 
-    Convention: only earlier queries are used. exp(-score) is at most the probability that the right place
-        lies within `within` places. A place that nothing covers scores +inf; a query that scores all places
-        alike says nothing. The settings from `moves` to `off_map` are parameters: gradients of `forward` and
-        `posterior` reach them, and the scores. `stream` carries no gradient from batch to batch.
+    Convention: causal. exp(-score) is at most the probability that the right place lies within `within`
+        places. The state is the posterior (N+1,), the last number that of being off the map, and all 0 before
+        the first query. A place that nothing covers scores +inf; a query that scores all places alike says
+        nothing. The settings from `moves` to `off_map` are parameters: gradients reach them, the scores and
+        the state. Only `DejaVu.localize` and `LiveLocalizer` use `search_every`.
 
     Source: an off-map state is in the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021);
         motion model and likelihood are ours.
@@ -124,50 +122,57 @@ class PlaceFilter(SequenceModel):
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness)).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map)))
         self.within, self.threshold, self.search_every = within, threshold, search_every
-        self.moved = 1  # how often the camera has moved since the query before
-        self._latest: tuple[Tensor, int, int] | None = None  # arguments of `_spread`
+
+    def start(self, places: int, fixed: bool = False) -> Tensor:
+        """See `SequenceModel`: (N+1,) of 0."""
+        return torch.zeros(places + 1, device=self.off_map.device)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
-        return self.unlikely(self.posterior(scores, before)[:, :-1], scores)
+        return self._unlikely(self.posterior(scores, before)[:, :-1], scores)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
-        """Probability of each place, and of being off the map, behind each query.
+        """Probability of each place, and of being off the map, after each query.
 
         Shape: (Q,N), (N+1,) or None -> (Q,N+1), the last column being off the map; rows add up to 1.
         """
+        if before is None:
+            before = self.start(scores.shape[-1])
+        elif before.shape == (scores.shape[-1] + 1,):
+            _checked(before)
+        return self._posteriors(scores, before)
+
+    def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+        posteriors = self._posteriors(scores, state)
+        return self._unlikely(posteriors[:, :-1], scores), posteriors[-1] if len(scores) else state
+
+    def _posteriors(self, scores: Tensor, state: Tensor) -> Tensor:
         if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
             raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
         places = scores.shape[1]
-        if before is not None and before.shape != (places + 1,):
+        if state.shape != (places + 1,):
             raise InputError(
-                f"a posterior {tuple(before.shape)} of another map, of {places} places; expected "
+                f"a posterior {tuple(state.shape)} of another map, of {places} places; expected "
                 f"({places + 1},)"
             )
-        belief = None if before is None else _with_rest(_checked(before).to(scores))
-        rows = []
-        for likelihood in self.evidence(scores, moments_of(scores)):
-            belief = self._updated(self._next(belief, 0, places).to(scores), likelihood)
-            rows.append(_without_rest(belief))
-        return torch.stack(rows) if rows else scores.new_zeros(0, places + 1)
-
-    def step(self, scores: Tensor, before: Tensor) -> Tensor:
-        """As `posterior`, of one query, by tensor operations alone: (1,N), (N+1,) -> (N+1,).
-
-        Args:
-            before: the posterior of the query before; all 0 where there is none. It is not checked.
-        """
-        places = scores.shape[1]
-        first = self._expected(None, 0, places).to(scores)
-        later = self._expected(_with_rest(before), 0, places)
-        likelihood = self.evidence(scores, moments_of(scores))[0]
-        expected = torch.where((before == 0).all(), first, later)
-        return _without_rest(self._updated(expected, likelihood))
+        if not len(scores):
+            return scores.new_zeros(0, places + 1)
+        rows: list[Tensor] = []
+        state = state.to(scores)
+        belief = _with_rest(state)
+        first = torch.where(
+            (state == 0).all(), self._anywhere(places).to(scores), self._moved(belief, places)
+        )
+        for likelihood in self.likelihoods(scores, moments_of(scores)):
+            expected = self._moved(belief, places) if rows else first
+            belief = _updated(expected, likelihood)
+            rows.append(belief)
+        return _without_rest(torch.stack(rows))
 
     def predicted(self, posterior: Tensor) -> Tensor:
-        """What the motion makes of a posterior, ahead of the next query: (N+1,) -> (N+1,)."""
-        return _without_rest(self._expected(_with_rest(_checked(posterior)), 0, len(posterior) - 1))
+        """The posterior after the next move, before a query: (N+1,) -> (N+1,)."""
+        return _without_rest(self._moved(_with_rest(_checked(posterior)), len(posterior) - 1))
 
-    def evidence(self, scores: Tensor, moments: Moments) -> Tensor:
+    def likelihoods(self, scores: Tensor, moments: Moments) -> Tensor:
         """Likelihoods of each query up to a factor, the greatest of each row 1.
 
         Args:
@@ -175,135 +180,45 @@ class PlaceFilter(SequenceModel):
 
         Shape: (Q,W) -> (Q,W+2): of each place, of another one that scores as the mean, and of no place.
         """
-        mean, spread, tells = moments
-        known = scores.isfinite()
-        z = torch.where(known, mean - scores, 0) / spread
+        mean, spread, varied = moments
+        valid = scores.isfinite()
+        z = torch.where(valid, mean - scores, 0) / spread
         others = torch.stack([z.new_zeros(()), self.off_map.to(z)]).expand(len(z), 2)
-        logits = torch.where(tells, self.log_sharpness.to(z).exp() * torch.cat([z, others], 1), 0)
-        closed = torch.cat([~known, known.new_zeros(len(z), 2)], 1) & tells
+        logits = torch.where(varied, self.log_sharpness.to(z).exp() * torch.cat([z, others], 1), 0)
+        closed = torch.cat([~valid, valid.new_zeros(len(z), 2)], 1) & varied
         logits = logits.masked_fill(closed, -math.inf)
         return (logits - logits.amax(1, keepdim=True)).exp()
 
-    def _expected(self, belief: Tensor | None, start: int, places: int) -> Tensor:
-        """The belief ahead of the next query.
+    def _anywhere(self, places: int) -> Tensor:
+        """The belief before the first query: off the map or on it, as many as leave and enter."""
+        leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
+        off = (leave / (leave + enter)).clamp(max=0.5)
+        return torch.cat([((1 - off) / places).expand(places), off.new_zeros(1), off[None]])
+
+    def _moved(self, belief: Tensor, places: int, start: int = 0) -> Tensor:
+        """The belief before the next query.
 
         A belief (W+2,) holds the probability of each of the places [start, start + W), that of all others
         together, and that of being off the map. The result has up to V more places, as far as one can drive.
         """
-        leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
-        if belief is None:  # off the map or on it, as many as leave and enter, and there anywhere
-            off = (leave / (leave + enter)).clamp(max=0.5)
-            return torch.cat([((1 - off) / places).expand(places), off.new_zeros(1), off[None]])
-        moves, stay = self.move_logits.to(belief).softmax(0), self.rate_logits.to(belief).softmax(0)[0]
-        jump, leave, enter = self.rate_logits.to(belief).softmax(0)[1], leave.to(belief), enter.to(belief)
+        moves, (stay, jump, leave) = (
+            self.move_logits.to(belief).softmax(0),
+            self.rate_logits.to(belief).softmax(0),
+        )
         on, rest, off = belief[:-2], belief[-2], belief[-1]
         furthest = len(moves) - 1
         ahead = min(furthest, places - start - len(on))
         # a convolution, but conv1d takes 100 times as long for one row
         moved = F.pad(on, (furthest, ahead)).unfold(0, furthest + 1, 1) @ moves.flip(0)
+        enter = self.enter_logit.sigmoid().to(belief)
         total = on.sum() + rest
         anywhere = (jump * total + enter * off) / places
         rest = stay * rest + anywhere * (places - len(moved))
         off = stay * (on.sum() - moved.sum()) + leave * total + (1 - enter) * off
         return torch.cat([stay * moved + anywhere, rest[None], off[None]])
 
-    def _next(self, belief: Tensor | None, start: int, places: int) -> Tensor:
-        """The belief ahead of the next query, which is `moved` moves on."""
-        for _ in range(self.moved):
-            belief = self._expected(belief, start, places)
-        assert belief is not None
-        return belief
-
-    def _updated(self, expected: Tensor, likelihood: Tensor) -> Tensor:
-        """Bayes' rule; where what is likely was impossible, what was expected stands."""
-        joint = expected * likelihood
-        total = joint.sum()
-        return torch.where(total > IMPOSSIBLE, joint / torch.where(total > IMPOSSIBLE, total, 1), expected)
-
-    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """See `SequenceModel`; between two batches one posterior is kept."""
-        before = None
-        for scores in batches:
-            posterior = self.posterior(scores, before)
-            if len(posterior):
-                before = posterior[-1].detach()
-                self._latest = _with_rest(before), 0, scores.shape[1]
-            yield self.unlikely(posterior[:, :-1], scores)
-
-    def latest(self) -> Tensor | None:
-        """The posterior (N+1,) behind the latest query of `stream` or `follow`; None ahead of the first."""
-        return None if self._latest is None else _without_rest(_spread(*self._latest))
-
-    def follow(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[Tensor]:
-        """See `SequenceModel`; between two searches only the places of a likely stretch are scored.
-
-        All other places then count as if they scored as the mean, and mean and spread are those of the last
-        search.
-        """
-        if self.search_every == 1:
-            yield from super().follow(batches, route)
-        else:
-            yield from (torch.cat([near.row() for near in part]) for part in self._near(batches, route))
-
-    def best(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[tuple[Tensor, Tensor]] | None:
-        """See `SequenceModel`; between two searches a query takes time for its stretch of places alone."""
-        if self.search_every == 1:
-            return None
-        parts = (zip(*(near.best() for near in part), strict=True) for part in self._near(batches, route))
-        return ((torch.cat(score), torch.cat(place)) for score, place in parts)
-
-    @torch.no_grad()
-    def _near(self, batches: Iterable[Tensor], route: Scorer) -> Iterator[list[_Near]]:
-        """What each query of a batch is found by, without gradients."""
-        places, start, since = route.places, 0, 0
-        belief: Tensor | None = None
-        search: tuple[Moments, Tensor] | None = None  # of the last: moments, and which places are covered
-        for queries in batches:
-            found = []
-            for query in queries.split(1) if len(queries) else ():
-                near = None if belief is None or since >= self.search_every else self._likely(belief)
-                if belief is None or search is None or near is None:
-                    belief = belief if belief is None else _spread(belief, start, places)
-                    start, scores = 0, route.scores(query)
-                    expected = self._next(belief, start, places).to(scores)
-                    moments, covered = moments_of(scores), scores.isfinite()
-                    if moments.tells:  # a query that tells nothing is no search
-                        search, since = (moments, covered), 0
-                else:
-                    belief, start = _narrowed(belief, near), start + near.start
-                    expected = self._next(belief, start, places)
-                    scores = route.scores_between(query, start, start + len(expected) - 2)
-                    moments, covered = search
-                since += 1
-                belief = self._updated(expected, self.evidence(scores, moments)[0])
-                self._latest = belief, start, places
-                found.append(self._told(belief, start, scores, covered))
-            if found:
-                yield found
-
-    def _told(self, belief: Tensor, start: int, scores: Tensor, covered: Tensor) -> _Near:
-        """As `unlikely`, of (W+2,) and (1,W); which of all places are covered is (1,N)."""
-        places = covered.shape[1]
-        stop, smallest = start + scores.shape[1], torch.finfo(belief.dtype).tiny
-        elsewhere = (self.within + 1) * belief[-2] / max(1, places - stop + start)
-        elsewhere = -elsewhere.clamp(smallest, 1).log()
-        left, right = min(self.within, start), min(self.within, places - stop)  # neighbours beside the W
-        on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
-        near = torch.minimum(elsewhere, self.unlikely(on, seen))
-        open_ = seen.isfinite() & covered[:, start - left : stop + right]
-        return _Near(near.masked_fill(~open_, math.inf), start - left, elsewhere, covered)
-
-    def _likely(self, belief: Tensor) -> range | None:
-        """The stretch of a belief's places that hold most of it; None where it is not where the camera is."""
-        on = belief[:-2]
-        (likely,) = (on > UNLIKELY).nonzero(as_tuple=True)
-        if not len(likely):
-            return None
-        near = range(int(likely[0]), int(likely[-1]) + 1)
-        return near if float(on[near.start : near.stop].sum()) > LIKELY else None
-
-    def unlikely(self, posterior: Tensor, scores: Tensor) -> Tensor:
-        """-log of the probability of each place and its neighbours: (Q,W) and what they are of -> (Q,W)."""
+    def _unlikely(self, posterior: Tensor, scores: Tensor) -> Tensor:
+        """-log of the probability of each place and its neighbours, (Q,W) -> (Q,W); +inf where scores are."""
         within = min(self.within, posterior.shape[1])  # further neighbours there are not
         side = within + 1  # two means over so many make a triangle
         padded = F.pad(posterior[:, None], (within, within))
@@ -332,7 +247,75 @@ class PlaceFilter(SequenceModel):
         )
 
 
-class _Near(NamedTuple):
+class LocalSearch:
+    """A filter that between two searches scores only the stretch of places that is likely; keeps its state.
+
+    All other places then count as if they scored as the mean, and mean and spread are those of the last
+    search.
+
+    Args:
+        filter: whose `search_every` counts the queries. route: the map.
+    """
+
+    def __init__(self, filter: PlaceFilter, route: PlaceMap) -> None:
+        self.filter, self.route = filter, route
+        self.belief: Tensor | None = None  # of the places from `start` on
+        self.start = self.since = self.skipped = (
+            0  # queries since the last search, and left out before the next
+        )
+        self.search: tuple[Moments, Tensor] | None = None  # the last: moments, and which places are covered
+
+    def __call__(self, query: Tensor) -> LocalScores:
+        """The scores of the next query, (1,K)."""
+        filter, places = self.filter, self.route.places
+        belief, start, since, search = self.belief, self.start, self.since, self.search
+        near = None if belief is None or search is None or since >= filter.search_every else _likely(belief)
+        if belief is not None and near is not None:
+            belief, start = _narrowed(belief, near), start + near.start
+        elif belief is not None:
+            belief, start = self._spread(belief), 0
+        expected = filter._anywhere(places) if belief is None else belief
+        for _ in range(0 if belief is None else 1 + self.skipped):
+            expected = filter._moved(expected, places, start)
+        if search is None or near is None:
+            scores = self.route.scores(query)
+            moments, covered = moments_of(scores), scores.isfinite()
+            if moments.varied:  # a query that says nothing is no search
+                search, since = (moments, covered), 0
+        else:
+            blocks = self.route.score_blocks(query, start, start + len(expected) - 2)
+            scores = torch.cat([block for _, block in blocks], 1)
+            moments, covered = search
+        belief = _updated(expected.to(scores), filter.likelihoods(scores, moments)[0])
+        self.belief, self.start, self.since, self.search, self.skipped = belief, start, since + 1, search, 0
+        return self._scores(belief, start, scores, covered)
+
+    @property
+    def posterior(self) -> Tensor | None:
+        """(N+1,), None before the first query."""
+        return None if self.belief is None else _without_rest(self._spread(self.belief))
+
+    def _spread(self, belief: Tensor) -> Tensor:
+        """A belief of all places from one of those from `start` on."""
+        count = len(belief) - 2
+        on = (belief[-2] / max(1, self.route.places - count)).repeat(self.route.places)
+        on[self.start : self.start + count] = belief[:-2]
+        return torch.cat([on, belief.new_zeros(1), belief[-1:]])
+
+    def _scores(self, belief: Tensor, start: int, scores: Tensor, covered: Tensor) -> LocalScores:
+        """-log of the probabilities of a belief (W+2,), by (1,W) scores and (1,N) places that are covered."""
+        within, places = self.filter.within, covered.shape[1]
+        stop, smallest = start + scores.shape[1], torch.finfo(belief.dtype).tiny
+        elsewhere = (within + 1) * belief[-2] / max(1, places - stop + start)
+        elsewhere = -elsewhere.clamp(smallest, 1).log()
+        left, right = min(within, start), min(within, places - stop)  # neighbours beside the W
+        on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
+        near = torch.minimum(elsewhere, self.filter._unlikely(on, seen))
+        open_ = seen.isfinite() & covered[:, start - left : stop + right]
+        return LocalScores(near.masked_fill(~open_, math.inf), start - left, elsewhere, covered)
+
+
+class LocalScores(NamedTuple):
     """-log of the probability of every place, most of which are alike.
 
     scores: (1,W) of the places from `start` on. elsewhere: of each other place that is covered, which is at
@@ -381,15 +364,24 @@ def _with_rest(posterior: Tensor) -> Tensor:
 
 
 def _without_rest(belief: Tensor) -> Tensor:
-    return torch.cat([belief[:-2], belief[-1:]])
+    return torch.cat([belief[..., :-2], belief[..., -1:]], -1)
 
 
-def _spread(belief: Tensor, start: int, places: int) -> Tensor:
-    """A belief of all places from one of those from `start` on."""
-    others = places - (len(belief) - 2)
-    on = (belief[-2] / max(1, others)).repeat(places)
-    on[start : start + len(belief) - 2] = belief[:-2]
-    return torch.cat([on, belief.new_zeros(1), belief[-1:]])
+def _updated(expected: Tensor, likelihood: Tensor) -> Tensor:
+    """Bayes' rule; if what is likely was impossible, the expectation stays."""
+    joint = expected * likelihood
+    total = joint.sum()
+    return torch.where(total > IMPOSSIBLE, joint / torch.where(total > IMPOSSIBLE, total, 1), expected)
+
+
+def _likely(belief: Tensor) -> range | None:
+    """The stretch of a belief's places that holds most of it; None if none does."""
+    on = belief[:-2]
+    (likely,) = (on > UNLIKELY).nonzero(as_tuple=True)
+    if not len(likely):
+        return None
+    near = range(int(likely[0]), int(likely[-1]) + 1)
+    return near if float(on[near.start : near.stop].sum()) > LIKELY else None
 
 
 def _narrowed(belief: Tensor, near: range) -> Tensor:

@@ -1,4 +1,4 @@
-"""The best place and whether to believe it (section III-C, eq. 5 and eq. 6)."""
+"""The best places and whether to believe them (section III-C, eq. 5 and eq. 6)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from dejavu_torch.types import InputError, Match
 
 HIGHEST = torch.finfo(torch.float64).max  # of the numbers that a file can hold: every score is below
-PROBABLE = 0.5  # what a calibrated map accepts from, where nobody says otherwise
+PROBABLE = 0.5  # what a calibrated map accepts from by default
 
 
 class Acceptance(NamedTuple):
@@ -57,12 +57,71 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
         >>> best_match(torch.tensor([[3.0, 1.0, 1.0], [2.0, 4.0, 9.0]]), threshold=2.0)
         Match(index=tensor([1, 0]), score=tensor([1., 2.]), accepted=tensor([ True, False]))
     """
+    return best_candidates(scores, 1, 0, threshold).map(lambda column: column[:, 0])
+
+
+def best_candidates(
+    scores: Tensor, k: int, radius: int, threshold: float | None = None, places: Tensor | None = None
+) -> Match:
+    """The best place, then again and again the best of those further than `radius` from all before.
+
+    Args:
+        scores: S, lower is better.
+        k: how many, from 1 to N.
+        radius: places, at least 0: any two candidates differ by more.
+        threshold: as of `best_match`, for each candidate.
+        places: (Q,N) of the scores, if these are not all places in order.
+
+    Shape: (Q,N) -> Match of (Q,k).
+
+    Convention: of equal scores the first wins. If no place with a finite score is left, the place is -1 and
+        the score +inf.
+
+    Raises:
+        InputError: not (Q,N), or k or radius out of range.
+
+    Example:
+        >>> best_candidates(torch.tensor([[5.0, 1.0, 2.0, 4.0, 3.0]]), k=3, radius=1)[:2]
+        (tensor([[ 1,  4, -1]]), tensor([[1., 3., inf]]))
+    """
     if not isinstance(scores, Tensor):
         raise InputError(f"scores are a {type(scores).__name__}; expected a tensor (Q,N)")
     if scores.ndim != 2 or scores.shape[1] < 1:
         raise InputError(f"scores are {tuple(scores.shape)}; expected (Q,N) with N >= 1")
-    score, index = scores.min(1)
-    return Match(torch.where(score.isfinite(), index, -1), score, accept(score, threshold))
+    columns = scores.shape[1]
+    check_candidates(k, radius, columns)
+    window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)
+    found, left = [], scores.clone() if k > 1 and places is None else scores
+    for rank in range(k):
+        score, at = left.min(1)
+        index = at if places is None else places.gather(1, at[:, None])[:, 0]
+        found.append((torch.where(score.isfinite(), index, -1), score))
+        if rank + 1 == k:
+            break
+        if places is None:  # a window cut off at an end of the map repeats that end, which is in it
+            left.scatter_(1, (at[:, None] + window).clamp(0, columns - 1), torch.inf)
+        else:
+            left = left.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
+        left = left.masked_fill(~score.isfinite()[:, None], torch.inf)
+    index, score = (torch.stack(column, 1) for column in zip(*found, strict=True))
+    return Match(index, score, accept(score, threshold))
+
+
+def check_candidates(k: int, radius: int, places: int | None = None) -> None:
+    """Refuse early how many candidates there cannot be.
+
+    Args:
+        places: of the map, None where unknown.
+
+    Raises:
+        InputError: k below 1 or above the number of places, or radius below 0.
+    """
+    if k < 1:
+        raise InputError(f"{k} candidates a query; expected at least 1")
+    if places is not None and k > places:
+        raise InputError(f"{k} candidates a query on {places} places; expected at most {places}")
+    if radius < 0:
+        raise InputError(f"candidates more than {radius} places apart; expected at least 0")
 
 
 def accept(score: Tensor, threshold: float | None) -> Tensor:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -15,16 +15,15 @@ from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectrum import Transform
+from dejavu_torch.maps.template_map import TemplateMap
+from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.training.chance import phase_chance, place_chance
-from dejavu_torch.training.datamodule import Batch, StoredFrames, as_frames
-from dejavu_torch.training.losses import Losses, place_cross_entropy
+from dejavu_torch.training.datamodule import Batch, RouteData, StoredFrames, as_frames
+from dejavu_torch.training.losses import Losses, Objective, place_cross_entropy
 from dejavu_torch.training.processes import noise_like, own_part, own_random
 from dejavu_torch.training.rate import STEP, bands_of, coded_proxies
 from dejavu_torch.types import InputError
-
-if TYPE_CHECKING:
-    from dejavu_torch.training.task import PlaceRecognitionTask
 
 ROUNDS = 10  # views of each training frame, for whitening and code
 NUMBERS = 2**27  # of all views at most, but for one of each frame: half a gigabyte
@@ -43,6 +42,39 @@ class Views(NamedTuple):
     positives: Tensor
 
 
+class Task(Protocol):
+    """What stages use of a `PlaceRecognitionTask`; see there."""
+
+    dejavu: DejaVu
+    made: bool
+    gives_way: bool
+    frozen: list[nn.Module]
+    log_temperature: nn.Parameter
+    losses: Objective
+    views: Views | None
+    views_drawn_at: Tensor | None
+    places: Tensor | None
+
+    @property
+    def data(self) -> RouteData: ...
+
+    @property
+    def route(self) -> TemplateMap: ...
+
+    @property
+    def device(self) -> torch.device: ...
+
+    @property
+    def global_step(self) -> int: ...
+
+    @property
+    def progress(self) -> float: ...
+
+    def relearn(self) -> None: ...
+
+    def scores(self, distances: Sequence[Tensor]) -> Tensor: ...
+
+
 class Stage(nn.Module):
     """One part of a training. The task runs them one behind the other, each with an optimizer of its own.
 
@@ -54,21 +86,21 @@ class Stage(nn.Module):
         super().__init__()
         self.share = share
 
-    def begin(self, task: PlaceRecognitionTask) -> None:
+    def begin(self, task: Task) -> None:
         """Make what the stage works with; called again where a training is resumed in it."""
 
-    def end(self, task: PlaceRecognitionTask) -> None:
+    def end(self, task: Task) -> None:
         """Leave what the next stage needs."""
 
-    def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
+    def trained(self, task: Task) -> list[nn.Parameter]:
         """The parameters that the stage trains."""
         return []
 
-    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+    def losses(self, task: Task, batch: Batch) -> Losses:
         """The losses of a batch."""
         raise NotImplementedError(f"{type(self).__name__} takes no steps")
 
-    def chance(self, task: PlaceRecognitionTask) -> dict[str, float]:
+    def chance(self, task: Task) -> dict[str, float]:
         """The least that each loss can be without a look at the frames, of those that tell places apart."""
         return {}
 
@@ -92,7 +124,7 @@ class DescriptorStage(Stage):
         # of each place, as `RouteData.apart` numbers them; between two routes one behind the last
         self.register_buffer("stretch", torch.zeros(0, dtype=torch.int64), persistent=False)
 
-    def begin(self, task: PlaceRecognitionTask) -> None:
+    def begin(self, task: Task) -> None:
         if not _trainable(network_of(task.dejavu.features)):
             raise InputError(
                 f"nothing of {type(task.dejavu.features).__name__} can be trained; expected a network with "
@@ -121,23 +153,23 @@ class DescriptorStage(Stage):
                 f"{task.data.route_name} has {count}; expected the route that it was learned on"
             )
 
-    def make(self, stretches: int, dimension: int, task: PlaceRecognitionTask) -> None:
+    def make(self, stretches: int, dimension: int, task: Task) -> None:
         """Proxies to start from."""
         self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
 
-    def end(self, task: PlaceRecognitionTask) -> None:
+    def end(self, task: Task) -> None:
         self.proxies = nn.Parameter(self.proxies.detach()[:0])  # no later checkpoint needs them
 
-    def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
+    def trained(self, task: Task) -> list[nn.Parameter]:
         return [*_trainable(network_of(task.dejavu.features)), *self.parameters()]
 
-    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+    def losses(self, task: Task, batch: Batch) -> Losses:
         return self.losses_to(self.proxies, task, batch)
 
-    def chance(self, task: PlaceRecognitionTask) -> dict[str, float]:
+    def chance(self, task: Task) -> dict[str, float]:
         return {"descriptor": place_chance(sum(task.data.lengths), task.data.tolerance)}
 
-    def losses_to(self, proxies: Tensor, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+    def losses_to(self, proxies: Tensor, task: Task, batch: Batch) -> Losses:
         """The losses of a batch, to proxies (W,K)."""
         with own_random(task.global_step):
             frames = task.data.augmented(batch.frames, task.data.clip)
@@ -173,12 +205,12 @@ class RateStage(DescriptorStage):
         self.log_step = nn.Parameter(torch.tensor(math.log(STEP)))
         self.log_widths = nn.Parameter(torch.zeros(0))  # of one dimension, which weight decay leaves alone
 
-    def make(self, stretches: int, dimension: int, task: PlaceRecognitionTask) -> None:
+    def make(self, stretches: int, dimension: int, task: Task) -> None:
         bands = int(bands_of(stretches, _transform(task)).max()) + 1
         self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
         self.log_widths = nn.Parameter(torch.zeros(bands * dimension, device=task.device))
 
-    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+    def losses(self, task: Task, batch: Batch) -> Losses:
         coded = coded_proxies(self.proxies, self.log_step, self.log_widths, _transform(task))
         place = self.losses_to(coded.proxies, task, batch)
         per_place = coded.bits / len(task.data.sets["reference"])
@@ -195,7 +227,7 @@ class RateStage(DescriptorStage):
 class WhiteningStage(Stage):
     """The descriptor is whitened by what the augmentation and a second traverse change in it; no steps."""
 
-    def end(self, task: PlaceRecognitionTask) -> None:
+    def end(self, task: Task) -> None:
         task.views = describe_views(task)
         shown = place_descriptors(task)[task.views.positives[:, 0]]
         _coder(embedding_of(task)).whiten(task.views.descriptors, shown)
@@ -208,7 +240,7 @@ class CodeStage(Stage):
     it is learned from them. Of any other backbone the whole is trained, on augmented frames.
     """
 
-    def begin(self, task: PlaceRecognitionTask) -> None:
+    def begin(self, task: Task) -> None:
         if has_descriptor(task.dejavu.features):
             network = embedding_of(task).network
             if not any(module is network for module in task.frozen):
@@ -217,12 +249,12 @@ class CodeStage(Stage):
         if not task.dejavu.map.places:
             task.relearn()
 
-    def trained(self, task: PlaceRecognitionTask) -> list[nn.Parameter]:
+    def trained(self, task: Task) -> list[nn.Parameter]:
         features = task.dejavu.features
         learns = _coder(embedding_of(task)) if has_descriptor(features) else features
         return [task.log_temperature, *_trainable(learns), *task.route.parameters()]
 
-    def losses(self, task: PlaceRecognitionTask, batch: Batch) -> Losses:
+    def losses(self, task: Task, batch: Batch) -> Losses:
         if task.views is None:
             positives = batch.truth.positives
             with own_random(task.global_step):
@@ -238,7 +270,7 @@ class CodeStage(Stage):
         temperature, tolerance = task.log_temperature.exp(), task.data.tolerance
         return task.losses(distances, task.scores(distances), positives, task.route, temperature, tolerance)
 
-    def chance(self, task: PlaceRecognitionTask) -> dict[str, float]:
+    def chance(self, task: Task) -> dict[str, float]:
         place = {"place": place_chance(task.route.places, task.data.tolerance)}
         return place | ({"phase": phase_chance(task.route.plan)} if task.losses.phase else {})
 
@@ -270,7 +302,7 @@ def has_descriptor(backbone: nn.Module) -> bool:
     return isinstance(backbone, Embedding) and backbone.coder is not None
 
 
-def embedding_of(task: PlaceRecognitionTask) -> Embedding:
+def embedding_of(task: Task) -> Embedding:
     """The task's backbone, where its stages are of an `Embedding`."""
     return cast(Embedding, task.dejavu.features)
 
@@ -280,7 +312,7 @@ def network_of(backbone: nn.Module) -> nn.Module:
     return cast(Embedding, backbone).network if has_descriptor(backbone) else backbone
 
 
-def descriptor_of(task: PlaceRecognitionTask) -> Callable[[Tensor], Tensor]:
+def descriptor_of(task: Task) -> Callable[[Tensor], Tensor]:
     """Describes frames: (B,C,H,W) -> (B,K)."""
     if not has_descriptor(task.dejavu.features):
         return task.dejavu.describe
@@ -291,7 +323,7 @@ def _coder(embedding: Embedding) -> Coder:
     return cast(Coder, embedding.coder)
 
 
-def _transform(task: PlaceRecognitionTask) -> Transform:
+def _transform(task: Task) -> Transform:
     transform: Transform = getattr(task.dejavu.mapper, "transform", "dft")
     return transform
 
@@ -300,7 +332,7 @@ def _trainable(module: nn.Module) -> list[nn.Parameter]:
     return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 
-def describe_views(task: PlaceRecognitionTask) -> Views:
+def describe_views(task: Task) -> Views:
     """Descriptors of all training frames of known places, under several augmentations of each.
 
     A run that is resumed draws those of the first one again.
@@ -316,7 +348,7 @@ def describe_views(task: PlaceRecognitionTask) -> Views:
 
 
 @torch.no_grad()
-def views_of(task: PlaceRecognitionTask, rounds: int, most: int) -> Iterator[Views]:
+def views_of(task: Task, rounds: int, most: int) -> Iterator[Views]:
     """Batches of descriptors of augmented training frames of known places.
 
     Args:
@@ -335,7 +367,7 @@ def views_of(task: PlaceRecognitionTask, rounds: int, most: int) -> Iterator[Vie
                     yield Views(views, batch.truth.positives[known].to(task.device))
 
 
-def check_map(task: PlaceRecognitionTask, places: int, dimension: int) -> None:
+def check_map(task: Task, places: int, dimension: int) -> None:
     """Refuse ahead of the training a map that could not be made behind it, as of too few bytes.
 
     Bytes that the user did not ask for give way: what a map takes without any line comes on top of them.
@@ -361,7 +393,7 @@ def check_map(task: PlaceRecognitionTask, places: int, dimension: int) -> None:
     )
 
 
-def place_descriptors(task: PlaceRecognitionTask) -> Tensor:
+def place_descriptors(task: Task) -> Tensor:
     """Descriptors of the stored reference frames, (N,K), of a network that is trained no more: made once."""
     if task.places is None:
         with in_mode(embedding_of(task), False):
@@ -369,7 +401,7 @@ def place_descriptors(task: PlaceRecognitionTask) -> Tensor:
     return task.places
 
 
-def make_map(task: PlaceRecognitionTask) -> None:
+def make_map(task: Task) -> None:
     """Learn the whitening and the map of the present descriptors, in closed form.
 
     Whitening sees the training's own views. None of training's random numbers are taken, and the same
@@ -389,9 +421,7 @@ def make_map(task: PlaceRecognitionTask) -> None:
         model.learn_features(model.whitened(features), alone)
 
 
-def stored_features(
-    task: PlaceRecognitionTask, describe: Callable[[Tensor], Tensor], shuffled: bool = False
-) -> Tensor:
+def stored_features(task: Task, describe: Callable[[Tensor], Tensor], shuffled: bool = False) -> Tensor:
     """Features of the stored reference frames, as of `in_batches`.
 
     Args:
@@ -408,7 +438,7 @@ def stored_features(
     return in_batches(task, len(frames), make, shuffled)
 
 
-def coded_places(task: PlaceRecognitionTask, shuffled: bool) -> Tensor:
+def coded_places(task: Task, shuffled: bool) -> Tensor:
     """The same of the descriptors that are kept: the code alone is run."""
     code, places = embedding_of(task).code, place_descriptors(task)
     with torch.autocast(task.device.type, enabled=False):
@@ -416,9 +446,7 @@ def coded_places(task: PlaceRecognitionTask, shuffled: bool) -> Tensor:
 
 
 @torch.no_grad()
-def in_batches(
-    task: PlaceRecognitionTask, count: int, make: Callable[[Tensor], Tensor], shuffled: bool
-) -> Tensor:
+def in_batches(task: Task, count: int, make: Callable[[Tensor], Tensor], shuffled: bool) -> Tensor:
     """What is made of so many places, batch by batch, in 32 bits and in their order.
 
     Args:
@@ -445,7 +473,7 @@ def in_batches(
     return features
 
 
-def described(task: PlaceRecognitionTask, values: Tensor, describe: Callable[[Tensor], Tensor]) -> Tensor:
+def described(task: Task, values: Tensor, describe: Callable[[Tensor], Tensor]) -> Tensor:
     """Features of stored frames, in 32 bits.
 
     Raises:

@@ -13,7 +13,7 @@ from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.matching import SINGLE
+from dejavu_torch.recognition.localizer import SINGLE
 from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -41,7 +41,7 @@ def beside_untrained(
     trained = fitted(query, model.frame_shape or ()) if len(query.frame_shape) == 3 else query
     found = {TRAINED: _match(model, trained)}
     hog = hog_baselines(reference, query, model.batch_size, tolerance)
-    found |= {HOG: hog["hog"].found.match()} if hog else {}
+    found |= {HOG: hog["hog"].found} if hog else {}
     mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
     try:
         preprocess = Preprocess(size=model.preprocess.size)
@@ -70,5 +70,4 @@ def better(scores: Mapping[str, Scores]) -> list[str]:
 
 
 def _match(model: DejaVu, query: Traverse) -> Match:
-    found = model.found(model.extract_all(query), SINGLE).moved(model.map.table.scored)
-    return Match(*(None if part is None else part.cpu() for part in found.match()))
+    return model.found(model.extract_all(query), SINGLE).renumbered(model.map.table.scored)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames, stride_bytes
-from dejavu_torch.recognition.matching import Matching
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
 DISTANCES = {
@@ -34,7 +34,7 @@ def test_the_nearest_stored_frame(metric: str) -> None:
     torch.manual_seed(0)
     reference, query = torch.rand(23, 5, dtype=torch.float64), torch.rand(9, 5, dtype=torch.float64)
     for k in (1, 2, 7, 50):
-        match = nearest_frames(reference, query, k, metric).match()
+        match = nearest_frames(reference, query, k, metric)
         expected = literal_nearest(reference, query, k, metric)
         assert match.index.tolist() == [index for index, _ in expected]
         assert match.score.tolist() == pytest.approx([score for _, score in expected], abs=1e-12)
@@ -43,13 +43,13 @@ def test_the_nearest_stored_frame(metric: str) -> None:
 
 def test_of_equally_near_frames_the_first_is_reported() -> None:
     reference = torch.tensor([[2.0], [0.0], [2.0], [0.0]])
-    match = nearest_frames(reference, torch.tensor([[0.0], [1.0], [2.0]])).match()
+    match = nearest_frames(reference, torch.tensor([[0.0], [1.0], [2.0]]))
     assert match.index.tolist() == [1, 0, 0]
 
 
 def test_the_uncompressed_reference_finds_its_own_frames() -> None:
     reference = torch.rand(50, 8)
-    match = nearest_frames(reference, reference).match()
+    match = nearest_frames(reference, reference)
     assert match.index.tolist() == list(range(50))
     assert match.score.tolist() == [0.0] * 50
 
@@ -61,20 +61,20 @@ def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> Non
     found = nearest_frames(reference, query, k, matching=Matching(matcher, lengths=(1, 6)))
     nearest = [min(range(0, 30, k), key=lambda stored: (abs(stored - frame), -stored)) for frame in range(30)]
     score, index = matcher(torch.cdist(query, reference[nearest], p=1)).min(1)
-    for match in (found.match(), found.sequences[6]):
+    for match in (found, found.sequences[6]):
         assert match.index.tolist() == index.tolist()
         assert torch.allclose(match.score, score)
-    assert found.sequences[1].index.tolist() == nearest_frames(reference, query, k).match().index.tolist()
+    assert found.sequences[1].index.tolist() == nearest_frames(reference, query, k).index.tolist()
 
 
 def test_distances_in_parts_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     reference, query = torch.rand(20, 4), torch.rand(11, 4)
     for k, sequence in ((1, None), (3, None), (1, SequenceMatcher(4)), (3, SequenceMatcher(4))):
-        whole = nearest_frames(reference, query, k, matching=Matching(sequence)).match()
+        whole = nearest_frames(reference, query, k, matching=Matching(sequence))
         for numbers in (1, 20, 45):
             with monkeypatch.context() as patch:
                 patch.setattr("dejavu_torch.evaluation.baselines.DISTANCES_AT_ONCE", numbers)
-                parts = nearest_frames(reference, query, k, matching=Matching(sequence)).match()
+                parts = nearest_frames(reference, query, k, matching=Matching(sequence))
             assert all(torch.equal(x, y) for x, y in zip(parts, whole, strict=True))
 
 

@@ -36,7 +36,7 @@ from dejavu_torch.evaluation.pictures import (
 )
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import PICTURES
-from dejavu_torch.recognition.matching import Matching
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.types import FrequencyLayer, GroundTruth
 

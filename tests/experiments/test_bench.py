@@ -64,6 +64,7 @@ def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
         (L1, "scipy cdist"),
         (L1, "faiss"),
         (SEQUENCE, "dejavu"),
+        (SEQUENCE, "dejavu (a query at a time)"),
         (FILTER, "dejavu"),
         (FILTER, "dejavu (all places)"),
         (EXPORT, "dejavu"),

@@ -36,7 +36,7 @@ from dejavu_torch.experiments.frontier import (
     whitenings,
 )
 from dejavu_torch.maps.spectral import SpectralMapper
-from dejavu_torch.recognition.matching import Matching
+from dejavu_torch.recognition.localizer import Matching
 
 PLACES, NUMBERS = 300, 24
 

@@ -209,24 +209,12 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
         export_onnx(DejaVu(), tmp_path / "map.onnx")
     with refused("folder", "does not exist"):
         export_onnx(of_features(), tmp_path / "none" / "map.onnx")
-    with refused("no step"):
-        export_onnx(of_features(), tmp_path / "map.onnx", Fastest())
     with refused("what frames"):
         export_onnx(DejaVu().learn_features(torch.rand(60, 4)), tmp_path / "map.onnx")
     monkeypatch.setattr(onnx_file, "MOST_BYTES", 60 * 5 * 4 - 1)
     with refused("60 places of 5 numbers", "GB"):
         export_onnx(DejaVu().learn(torch.rand(60, 4)), tmp_path / "map.onnx")
     assert list(tmp_path.iterdir()) == []
-
-
-class Fastest(SequenceModel):
-    """Of its own kind."""
-
-    def stream(self, batches: Any) -> Any:
-        return batches
-
-    def check(self, queries: int | None, places: int) -> None:
-        """Anything goes."""
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

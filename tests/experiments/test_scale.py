@@ -190,7 +190,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     }.items():
         monkeypatch.setattr(scale, name, value)
     monkeypatch.setattr(scale_contenders, "CHUNK", 128)
-    kept = ("dejavu 4 B", "dejavu 4 B, one chunk", "dejavu 4 B, ivf", "null 4 B", "faiss flat")
+    kept = ("dejavu 4 B", "dejavu 4 B, one chunk", "null 4 B", "faiss flat")
     for name in list(PLACED):
         if name not in kept:
             monkeypatch.delitem(PLACED, name)
@@ -221,13 +221,7 @@ def test_rows_of_all_cases_are_written(
         shares = ("bandwidth_share", "learn_rate", "bytes")
         assert min(ours[key] for key in ("seconds", "seconds_one", "seconds_load", *shares)) > 0
         assert ours["device"] == "cpu"
-        assert ours["agrees"] is None
-        one_chunk, lists = rows[case, "dejavu 4 B, one chunk"], rows[case, "dejavu 4 B, ivf"]
-        assert one_chunk["recall_at_1"] > 0.8
-        if lists["skipped"] is None:  # faiss is there
-            assert lists["agrees"] > 0.9
-            assert lists["bandwidth_share"] is None
-            assert lists["bytes"] == ours["bytes"]
+        assert rows[case, "dejavu 4 B, one chunk"]["recall_at_1"] > 0.8
     assert "600" in rows["places=900", "null 4 B"]["skipped"]
     assert rows["repeat=600", "null"]["bytes_per_place"] == pytest.approx(
         rows["repeat=600", ONE_CHUNK]["bytes_per_place"], rel=0.02

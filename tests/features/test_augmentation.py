@@ -248,7 +248,7 @@ def test_a_wrong_strength_is_refused(name: str, wrong: object) -> None:
 def test_wrong_frames_are_refused() -> None:
     with refused("(3, 16, 16) torch.float32", "(B,C,H,W)", "(B,T,C,H,W)"):
         Augmentation()(torch.rand(3, 16, 16))
-    with refused("torch.float64", "expected float32"):
+    with refused("torch.float64", "float32 (B,C,H,W)"):
         Augmentation()(torch.rand(2, 3, 16, 16, dtype=torch.float64))
     with refused("(2, 3, 4, 16)", "more than 4 pixels"):
         only(blur=4.0)(torch.rand(2, 3, 4, 16))

@@ -130,8 +130,6 @@ def test_gradients_of_patches_are_finite_on_flat_frames(value: float) -> None:
 @pytest.mark.parametrize("patch", [-3, 0, 1, 2, 8])
 def test_patches_even_or_too_small_are_refused(patch: int) -> None:
     with refused(f"patch is {patch}", "odd", "at least 3"):
-        normalise_patches(torch.rand(1, 1, 16, 16), patch)
-    with refused(f"patch is {patch}"):
         Preprocess(patch=patch)
 
 
@@ -197,16 +195,14 @@ def test_a_difference_is_moved_into_range_ahead_of_clahe() -> None:
 
 @pytest.mark.parametrize("grid", [(0, 8), (8, -1), (8,), (2, 2, 2), (2.5, 2)])
 def test_bad_grids_are_refused(grid: tuple[int, int]) -> None:
-    for refusing in (lambda: equalise(torch.rand(1, 1, 64, 64), grid=grid), lambda: Preprocess(grid=grid)):
-        with refused(f"grid is {grid}", "(rows, columns)"):
-            refusing()
+    with refused(f"grid is {grid}", "(rows, columns)"):
+        Preprocess(grid=grid)
 
 
 @pytest.mark.parametrize("limit", [-1.0, float("nan"), float("inf")])
 def test_bad_clip_limits_are_refused(limit: float) -> None:
-    for refusing in (lambda: equalise(torch.rand(1, 1, 64, 64), limit), lambda: Preprocess(clip_limit=limit)):
-        with refused(f"clip_limit is {limit}", "at least 0"):
-            refusing()
+    with refused(f"clip_limit is {limit}", "at least 0"):
+        Preprocess(clip_limit=limit)
 
 
 # --- the module

@@ -22,7 +22,7 @@ def _visits(route: str) -> tuple[str, str]:
     return f"sim:{route}", f"sim:{route}&traverse=1"
 
 
-# {data} is DEJAVU_TEST_DATA. Of 4 bits a whitening multiplies what rounds otherwise with another number of threads
+# {data} is DEJAVU_TEST_DATA; a whitening of 4 bits multiplies what another number of threads rounds otherwise
 RUNS: dict[str, tuple[str, ...]] = {
     "demo": (*_visits("aerial?seed=0&frames=600"), "--whitening.bits", "16"),
     "paper": (*_visits(f"aerial?frames=200&{SMALL}"), "--config", "paper", "--mapper.periods.window", "100"),

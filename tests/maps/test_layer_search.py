@@ -62,7 +62,7 @@ def check(route: TemplateMap, queries: Tensor) -> tuple[int, int]:
     expected = best_match(route.scores(queries))
     assert torch.equal(found[0], expected.score)
     assert torch.equal(found[1], expected.index)
-    searched = sum(segment.searched for segment in route.segments)
+    searched = sum(segment.cost < segment.lap for segment in route.segments)
     return searched, len(route.segments) - searched
 
 

@@ -26,7 +26,7 @@ from dejavu_torch.recognition.calibration import (
     Trial,
     calibrated,
     calibration_error,
-    evidence_of,
+    confidence_of,
     fit,
 )
 from dejavu_torch.types import Match
@@ -121,8 +121,8 @@ def test_single_evidence_is_the_margin_beyond_the_tolerance_and_the_score() -> N
     )  # best at 11, 4 lies 5 behind it: the next is 9
     scores[1, 3], scores[1, 20] = 1.0, 3.0
     scores[2] = INF
-    assert evidence_of(scores).tolist() == [2 * 9 - 0, 2 * 2 - 1, -INF]
-    assert evidence_of(torch.tensor([[2.0]])).tolist() == [-2]  # nothing to compare with
+    assert confidence_of(scores).tolist() == [2 * 9 - 0, 2 * 2 - 1, -INF]
+    assert confidence_of(torch.tensor([[2.0]])).tolist() == [-2]  # nothing to compare with
 
 
 def test_a_track_remembers_how_its_answers_stood_out() -> None:
@@ -151,14 +151,16 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
     scores[places, places] = 0.3
     own = calibrated(Table(), [Trial(scores[:20], places[:20]), Trial(scores[20:], places[20:])])
     assert own.single is not None
-    there = own.single.probability(evidence_of(scores))
-    away = own.single.probability(evidence_of(1 + 0.1 * torch.randn(40, 40, generator=draw)))
+    there = own.single.probability(confidence_of(scores))
+    away = own.single.probability(confidence_of(1 + 0.1 * torch.randn(40, 40, generator=draw)))
     assert (float(there.mean()) > 0.9, float(away.mean()) < 0.1) == (True, True)
     known = places.where(places % 2 == 0, -1)  # what is not known does not count
     half = calibrated(Table(), [Trial(scores, known)])
     assert half.single == calibrated(Table(), [Trial(scores[::2], places[::2])]).single
     visit = calibrated(Table(), [Trial(scores, places)], another_visit=True)
-    assert float(visit.single.probability(evidence_of(scores)).mean()) > float(there.mean())  # none was wrong
+    assert float(visit.single.probability(confidence_of(scores)).mean()) > float(
+        there.mean()
+    )  # none was wrong
     with refused("none of 80 answers"):
         calibrated(Table(), [Trial(scores, (places + 20) % 40)])
     with refused("no queries"):

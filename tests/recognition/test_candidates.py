@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dejavu_torch import best_match
-from dejavu_torch.recognition.candidates import best_candidates, check_candidates
+from dejavu_torch.recognition.select import best_candidates, check_candidates
 
 INF = math.inf
 SCORE = st.one_of(st.integers(-3, 3).map(float), st.just(INF))  # few values: many ties
@@ -21,7 +21,8 @@ ROWS = st.integers(1, 12).flatmap(lambda n: st.lists(st.lists(SCORE, min_size=n,
 @given(ROWS, st.integers(1, 12), st.integers(0, 13))
 def test_equals_reference(rows: list[list[float]], k: int, apart: int) -> None:
     k = min(k, len(rows[0]))
-    index, score = best_candidates(torch.tensor(rows), k, apart)
+    index, score, accepted = best_candidates(torch.tensor(rows), k, apart)
+    assert torch.equal(accepted, score.isfinite())
     assert index.tolist() == [reference.candidates(row, k, apart) for row in rows]
     at = [
         [row[i] if i >= 0 else INF for i in places] for row, places in zip(rows, index.tolist(), strict=True)
@@ -33,18 +34,17 @@ def test_equals_reference(rows: list[list[float]], k: int, apart: int) -> None:
 def test_the_first_is_the_best_match(rows: list[list[float]], apart: int) -> None:
     scores = torch.tensor(rows)
     match = best_match(scores, threshold=1.0)
-    first = best_candidates(scores, 1, apart).as_match(threshold=1.0)
+    first = best_candidates(scores, 1, apart, 1.0).map(lambda column: column[:, 0])
     for one, other in zip(first, match, strict=True):
         assert torch.equal(one, other)
 
 
 def test_each_candidate_as_a_match() -> None:
-    candidates = best_candidates(torch.tensor([[5.0, 1, 2, 4, 3], [INF, 2, INF, INF, INF]]), 3, 1)
-    index, score, accepted = candidates.as_match(threshold=3.0)
-    assert index.tolist() == [1, 4, -1, 1, -1, -1]
-    assert score.tolist() == [1, 3, INF, 2, INF, INF]
-    assert accepted.tolist() == [True, False, False, True, False, False]
-    assert candidates.as_match().accepted.tolist() == [True, True, False, True, False, False]
+    scores = torch.tensor([[5.0, 1, 2, 4, 3], [INF, 2, INF, INF, INF]])
+    index, score, accepted = best_candidates(scores, 3, 1, threshold=3.0)
+    assert index.tolist() == [[1, 4, -1], [1, -1, -1]]
+    assert score.tolist() == [[1, 3, INF], [2, INF, INF]]
+    assert accepted.tolist() == [[True, False, False], [True, False, False]]
 
 
 def test_a_query_of_nan_has_no_candidates() -> None:

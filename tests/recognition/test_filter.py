@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
-from dejavu_torch.types import SequenceModel
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.types import Match, SequenceModel
 
 
 @torch.no_grad()
@@ -210,8 +213,7 @@ def test_no_graph_grows_from_batch_to_batch() -> None:
         torch.autograd.grad(part.sum(), filter_.log_sharpness) for part in (last, filter_(scores)[-4:])
     ]
     assert through[0] != through[1]
-    *_, last = PlaceFilter(search_every=10).follow(scores.split(4), Watched(50))
-    assert not last.requires_grad
+    assert not followed(PlaceFilter(search_every=10), scores, Watched(50), 4).requires_grad
 
 
 @pytest.mark.parametrize(
@@ -246,26 +248,39 @@ def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> No
         make()
 
 
-class Watched:
+class Watched(PlaceMap):
     """A route that counts the places that it scores; a query is the row of scores itself."""
 
+    kind = "watched"
+    settings = summary = disagreement = lambda self: {}  # type: ignore[assignment]
+
     def __init__(self, places: int) -> None:
-        self.places, self.scored = places, 0
+        super().__init__(places, places)
+        self.scored = 0
 
     def scores(self, queries: Tensor) -> Tensor:
-        return self.scores_between(queries, 0, self.places)
+        return torch.cat([block for _, block in self.score_blocks(queries)], 1)
 
-    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
-        self.scored += len(queries) * (stop - start)
-        return queries[:, start:stop]
+    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> Any:
+        for first, rows in zip((start, start + 9), queries[:, start:stop].tensor_split([9], 1), strict=True):
+            self.scored += rows.numel()
+            yield first, rows
+
+
+def followed(model: SequenceModel | None, scores: Tensor, route: PlaceMap, size: int = 33) -> Tensor:
+    """The scores that places are found by."""
+    rows: list[Tensor] = []
+    localizer = Localizer(route, Matching(model, on_scores=rows.append))
+    for part in scores.split(size):
+        localizer(part)
+    return torch.cat(rows)
 
 
 def test_where_the_camera_is_known_only_its_neighbourhood_is_scored() -> None:
     shown = [*range(100, 300), *range(700, 900)]
     scores, route = standing_out(1000, shown), Watched(1000)
     scores[torch.arange(len(shown)), torch.tensor(shown)] -= 3
-    searching = PlaceFilter(search_every=20)
-    found = torch.cat(list(searching.follow(scores.split(33), route)))
+    found = followed(PlaceFilter(search_every=20), scores, route)
     everything = PlaceFilter()(scores)
     assert route.scored < 0.2 * scores.numel()
     assert torch.equal(found.argmin(1)[:200], everything.argmin(1)[:200])
@@ -277,14 +292,13 @@ def test_where_the_camera_is_known_only_its_neighbourhood_is_scored() -> None:
 
 def test_a_filter_that_searches_for_every_query_scores_all_places() -> None:
     scores, route = standing_out(50, [*range(10, 40)]), Watched(50)
-    assert torch.equal(torch.cat(list(PlaceFilter().follow([scores], route))), PlaceFilter()(scores))
+    assert torch.equal(followed(PlaceFilter(), scores, route), PlaceFilter()(scores))
     assert route.scored == scores.numel()
 
 
 def test_who_is_lost_is_searched_for_everywhere() -> None:
     route = Watched(200)
-    for _ in PlaceFilter(search_every=50).follow([standing_out(200, [-1] * 30)], route):
-        pass
+    followed(PlaceFilter(search_every=50), standing_out(200, [-1] * 30), route)
     assert route.scored > 0.9 * 30 * 200
 
 
@@ -294,7 +308,7 @@ def test_a_search_that_says_nothing_is_made_again() -> None:
     scores = standing_out(300, shown)
     scores[torch.arange(60), torch.tensor(shown)] -= 4
     scores[20] = 0.7
-    found = torch.cat(list(PlaceFilter(search_every=20).follow([scores], Watched(300)))).argmin(1)
+    found = followed(PlaceFilter(search_every=20), scores, Watched(300)).argmin(1)
     assert ((found - 100).abs()[5:] <= 2).all()
 
 
@@ -302,7 +316,7 @@ def test_convention_2_a_place_that_nothing_covers_is_not_reported_by_a_filter() 
     scores = standing_out(300, [*range(20, 80)])
     scores[:, 200:220] = math.inf
     for filter_ in (PlaceFilter(), PlaceFilter(search_every=20)):
-        found = torch.cat(list(filter_.follow(scores.split(7), Watched(300))))
+        found = followed(filter_, scores, Watched(300), 7)
         assert torch.equal(found.isinf(), scores.isinf())
 
 
@@ -311,24 +325,71 @@ def test_the_best_place_of_a_neighbourhood_is_that_of_all_scores() -> None:
         scores = standing_out(300, shown)
         scores[torch.arange(len(shown)), torch.tensor(shown).clamp(min=0)] -= 3
         scores[:, 200:220] = math.inf
-        filter_, batches = PlaceFilter(search_every=20), scores.split(7)
-        rows = torch.cat(list(filter_.follow(batches, Watched(300))))
-        found = filter_.best(batches, Watched(300))
-        assert found is not None
-        score, place = (torch.cat(column) for column in zip(*found, strict=True))
-        assert torch.equal(score, rows.amin(1))
-        assert torch.equal(place, rows.argmin(1))
+        rows = followed(PlaceFilter(search_every=20), scores, Watched(300))
+        found = Localizer(Watched(300), Matching(PlaceFilter(search_every=20)))(scores)
+        assert torch.equal(found.score, rows.amin(1))
+        assert torch.equal(found.index, rows.argmin(1))
     closed = torch.full((5, 30), math.inf)
-    found = PlaceFilter(search_every=3).best([closed], Watched(30))
-    assert found is not None
-    assert next(found)[1].tolist() == [-1] * 5
-    assert PlaceFilter().best([closed], Watched(30)) is None
-    assert SequenceMatcher(3).best([closed], Watched(30)) is None
+    assert Localizer(Watched(30), Matching(PlaceFilter(search_every=3)))(closed).index.tolist() == [-1] * 5
 
 
-@pytest.mark.parametrize("model", [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3)])
-def test_an_empty_batch_changes_nothing(model: SequenceModel) -> None:
+@pytest.mark.parametrize("model", [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3), None])
+def test_an_empty_batch_changes_nothing(model: SequenceModel | None) -> None:
     scores = standing_out(50, [*range(12)])
-    parts = [scores[:5], scores[:0], scores[5:]]
-    found = torch.cat(list(model.follow(parts, Watched(50))))
-    assert torch.allclose(found, torch.cat(list(model.follow([scores], Watched(50)))), rtol=1e-4)
+    localizer = Localizer(Watched(50), Matching(model))
+    found = Match.joined(map(localizer, (scores[:5], scores[:0], scores[5:])))
+    whole = Localizer(Watched(50), Matching(model))(scores)
+    assert torch.equal(found.index, whole.index)
+    assert torch.allclose(found.score, whole.score, rtol=1e-4)
+
+
+MODELS = {
+    "eleven": SequenceMatcher(11),
+    "speeds": SequenceMatcher(5, (1, 0.75, 2.5)),
+    "backwards": SequenceMatcher(7, (-1, 0)),
+    "filter": PlaceFilter(),
+    "filter alone": PlaceFilter(within=0, moves=(0.5, 0.0, 0.25, 0.25), jump=0.05, off_map=2.0),
+}
+
+
+def with_gaps() -> Tensor:
+    """Scores of queries that pass places 3, 4, .., some of which are not covered."""
+    scores = torch.rand(30, 25)
+    scores[torch.arange(30), (torch.arange(30) + 3) % 25] -= 0.5
+    scores[:, 7:9], scores[4], scores[20, ::2] = math.inf, math.inf, math.inf
+    return scores
+
+
+class Step(torch.nn.Module):
+    def __init__(self, model: SequenceModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, scores: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        return self.model.step(scores, state)
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_steps_are_the_batch_and_are_exported(model: SequenceModel) -> None:
+    scores, state = with_gaps(), model.start(25, fixed=True)
+    run = torch.export.export(Step(model).eval(), (scores[:1], state)).module()
+    with torch.no_grad():
+        together, last = model.step(scores, model.start(25))
+        for row, expected in zip(scores.split(1), together.split(1), strict=True):
+            found, state = run(row, state)
+            torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(state, last, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_reach_scores_and_settings_through_the_state() -> None:
+    scores, model = with_gaps().requires_grad_(), PlaceFilter()
+    state, found = model.start(25), []
+    for row in scores.split(1):
+        together, state = model.step(row, state)
+        found.append(together.amin())
+    torch.stack(found[:4] + found[5:]).sum().backward()
+    assert scores.grad is not None
+    assert scores.grad.isfinite().all()
+    assert scores.grad[0].abs().sum() > 0
+    assert model.log_sharpness.grad is not None
+    assert model.log_sharpness.grad.isfinite()

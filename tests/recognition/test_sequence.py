@@ -69,6 +69,26 @@ def test_a_score_is_the_mean_of_its_trajectory(
             assert float(scores[query, passed].mean()) == pytest.approx(score)
 
 
+@given(TABLE, st.integers(1, 12), SPEEDS, st.integers(0, 7))
+def test_trajectories_stay_on_their_route(
+    rows: list[list[float]], length: int, speeds: list[float], cut: int
+) -> None:
+    matcher, scores, cut = SequenceMatcher(length, speeds), torch.tensor(rows), min(cut, len(rows[0]))
+    found, _ = matcher.step(scores, matcher.start(len(rows[0])), (0, cut))
+    parts = [matcher(part) for part in (scores[:, :cut], scores[:, cut:])]
+    assert torch.equal(found, torch.cat(parts, 1))
+
+
+@given(TABLE, st.integers(1, 12), SPEEDS)
+def test_a_fixed_state_of_nan_is_no_query(rows: list[list[float]], length: int, speeds: list[float]) -> None:
+    matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows)
+    state = matcher.start(scores.shape[1], fixed=True)
+    for row, expected in zip(scores.split(1), matcher(scores).split(1), strict=True):
+        found, state = matcher.step(row, state)
+        assert state.shape == (length - 1, scores.shape[1])
+        assert torch.equal(found, expected)
+
+
 def test_later_queries_change_nothing() -> None:
     scores = torch.rand(20, 30)
     matcher = SequenceMatcher(7, [1.0, 0.8])
@@ -89,7 +109,7 @@ def test_no_more_rows_than_a_sequence_are_kept(largest_tensor: type) -> None:
     with largest_tensor() as seen:
         for _ in matcher.stream(batches):
             pass
-    assert seen.numel <= (5 - 1 + 2) * 50
+    assert seen.numel <= (5 - 1 + 2) * (50 + 2 * 4)  # a trajectory's places to each side
 
 
 def route(noise: int) -> Tensor:
@@ -152,7 +172,9 @@ def test_settings_that_make_no_sequence_are_refused() -> None:
         SequenceMatcher(3)(torch.zeros(3, 4, dtype=torch.int64))
     with refused("scores are (4,)", "(Q,N)"):
         SequenceMatcher(3)(torch.rand(4))
-    with refused("(2, 4) torch.float32 behind (3, 5)"):
+    with refused("(2, 4) torch.float32 after (3, 4)", "at most (2,N)"):
+        SequenceMatcher(3)(torch.rand(2, 4), torch.rand(3, 4))
+    with refused("(2, 4) torch.float32 after (3, 5)"):
         SequenceMatcher(3)(torch.rand(2, 4), torch.rand(3, 5))
 
 

@@ -143,7 +143,7 @@ def test_its_null_is_beside_it(tmp_path: Path) -> None:
     features, queries = (model.extract_all(ArrayTraverse(footage(noise))) for noise in (0.0, 0.05))
     null = baselines_of(model, features, queries, tolerance=2)["null"]
     assert null.name == "null: shuffled frames, as many bytes"
-    assert len(null.found.match().index) == FRAMES
+    assert len(null.found.index) == FRAMES
 
 
 # checkpoints ---------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from helpers import refused
 from torch import Tensor, nn
 
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.layer import run, up_to
+from dejavu_torch.features.truncate import run, up_to
 from dejavu_torch.types import InputError
 
 FRAMES = torch.rand(2, 3, 12, 16)

@@ -1,0 +1,128 @@
+"""A network up to one of its layers: what comes after it is neither computed nor kept."""
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.features.extract import in_mode
+from dejavu_torch.types import InputError
+
+SHOWN = 12  # names of layers in a message
+
+
+class Reached(Exception):
+    """Ends a forward pass at a layer, whose output it carries."""
+
+
+def run(network: nn.Module, frames: Tensor) -> object:
+    """The output of a network, or of the layer that `up_to` ends it at."""
+    calls = _traced_calls()
+    begun = len(calls)
+    try:
+        output: object = network(frames)
+    except Reached as reached:
+        output = reached.args[0]
+        while len(calls) > begun:
+            calls.popitem()
+    return output
+
+
+def _traced_calls() -> OrderedDict[str, Any]:
+    """The calls of modules that torch.export is in, which its tracer does not leave by an exception."""
+    if torch.compiler.is_exporting() and not torch.compiler.is_dynamo_compiling():
+        from torch.fx.experimental.proxy_tensor import get_proxy_mode
+
+        calls = getattr(getattr(get_proxy_mode(), "tracer", None), "module_stack", None)
+        if isinstance(calls, OrderedDict):
+            return calls
+    return OrderedDict()
+
+
+def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
+    """A copy of a network that `run` ends at a layer, the name of a submodule; the first of its runs counts.
+
+    Convention: modules that have not run when the layer is done are left out of the copy, unless it gives
+        something else without them on `frames`. The names of the others stay.
+
+    Raises:
+        InputError: no such layer, or one that the network does not run.
+    """
+    name, names = type(network).__name__, [one for one, _ in network.named_modules() if one]
+    if layer not in names:
+        some = [one for one in names if one.count(".") < 2]
+        more = ", .." if len(some) > SHOWN else ""
+        known = ", ".join(some[:: -(-len(some) // SHOWN) or 1]) or "none, it has none"
+        raise InputError(f"{name} has no layer {layer!r:.80}; expected one such as {known}{more}")
+    try:
+        ended = copy.deepcopy(network)
+    except RuntimeError as error:
+        raise InputError(f"{name} cannot be copied to end at {layer}: {error}") from error
+    begun: set[nn.Module] = set()
+    done: set[nn.Module] = set()
+    hooks = []
+    for module in ended.modules():
+        hooks.append(module.register_forward_pre_hook(lambda module, *_: begun.add(module)))
+        hooks.append(module.register_forward_hook(lambda module, *_: done.add(module)))
+    ended.get_submodule(layer).register_forward_hook(_end)
+    try:
+        expected = _tried(ended, frames)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    if ended.get_submodule(layer) not in begun:
+        raise InputError(f"{name} does not run its layer {layer} as a module; expected another layer")
+    smaller = copy.deepcopy(ended)
+    _leave_out(ended, smaller, begun, done)
+    try:
+        return smaller if _same(_tried(smaller, frames), expected) else ended
+    except Exception:  # a network may look at any of its parts
+        return ended
+
+
+def _end(layer: nn.Module, given: Any, output: object) -> None:
+    raise Reached(output)
+
+
+def _tried(network: nn.Module, frames: Tensor) -> list[Tensor]:
+    with torch.no_grad(), in_mode(network, False):
+        return tensors_in(run(network, frames))
+
+
+def _leave_out(whole: nn.Module, smaller: nn.Module, begun: set[nn.Module], done: set[nn.Module]) -> None:
+    """Replace by nothing, in a copy of a module, the parts with weights that have not begun."""
+    for name, part in whole.named_children():
+        if part in done:  # it may use parts without running them
+            continue
+        if not begun.isdisjoint(part.modules()):
+            _leave_out(part, smaller.get_submodule(name), begun, done)
+        elif part.state_dict():
+            setattr(smaller, name, nn.Identity())
+
+
+def _same(found: list[Tensor], expected: list[Tensor]) -> bool:
+    # a map's network is first made without numbers
+    return [one.shape for one in found] == [one.shape for one in expected] and all(
+        one.is_meta or torch.allclose(one, other, rtol=1e-4, atol=1e-5)
+        for one, other in zip(found, expected, strict=True)
+    )
+
+
+def members_of(made: object) -> list[object]:
+    """The members of a tuple, list or dict; anything else is the only one."""
+    if isinstance(made, dict):
+        return [*made.values()]
+    return [*made] if isinstance(made, (tuple, list)) else [made]
+
+
+def tensors_in(made: object) -> list[Tensor]:
+    """The tensors in what a network made, in order."""
+    if isinstance(made, Tensor):
+        return [made]
+    if not isinstance(made, (tuple, list, dict)):
+        return []
+    return [tensor for member in members_of(made) for tensor in tensors_in(member)]
