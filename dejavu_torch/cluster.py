@@ -154,6 +154,7 @@ def code_on(
     ]
     total = len(range(*coder.span(range(first, coder.total))))
     done: dict[int, Chunk] = {}
+    failed: dict[int, tuple[range, Failure]] = {}
     following = first
     with tqdm(
         total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False
@@ -161,11 +162,15 @@ def code_on(
         for task, made, failure in cluster.run(_coded, tasks, coder, traverse):
             done |= zip(task, made, strict=False)
             bar.update(sum(chunk.places for chunk in made))
+            if failure is not None:
+                rest = range(task.start + len(made), task.stop)
+                failed[rest.start] = rest, failure
             while following in done:
                 yield done.pop(following)
                 following += 1
-            if failure is not None:
-                start, stop = coder.span(range(task.start + len(made), task.stop))
+            if following in failed:
+                rest, failure = failed[following]
+                start, stop = coder.span(rest)
                 read = "" if failure.host is None else f", read on {failure.host}"
                 raise InputError(f"frames {start} to {stop - 1}{read}: {failure.why}")
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from small_training import CONFIG, MINE, footage, train
 
-from dejavu_torch import DejaVu
+from dejavu_torch import growth
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 CALIBRATED = ("test_export", "test_train_command")
@@ -39,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _without_calibration(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of many small trainings, of which it takes a third; those of the command are calibrated."""
     if request.path.stem not in CALIBRATED:
-        monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda *_: None)
+        monkeypatch.setattr(growth, "calibrate_if_possible", lambda *_: None)
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ import torch
 from helpers import refused
 from small_training import backbone, data_of, footage, new_task, train, trainer, warned
 
-from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
+from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper, growth
 from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
@@ -22,7 +22,7 @@ from dejavu_torch.training.worth import UNTRAINED, beside_untrained
 
 FRAMES = 320
 MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map
-CALIBRATE = DejaVu.calibrate_if_possible  # which conftest.py patches away
+CALIBRATE = growth.calibrate_if_possible  # which conftest.py patches away
 
 
 def long(**settings: Any) -> RouteData:
@@ -91,10 +91,10 @@ def test_what_training_has_not_seen_calibrates(
 ) -> None:
     seen: list[Views] = []
 
-    def taken(self: DejaVu, reference: object, views: Views) -> None:
+    def taken(model: DejaVu, reference: object, views: Views) -> None:
         seen.append(views)
 
-    monkeypatch.setattr(DejaVu, "calibrate_if_possible", taken)
+    monkeypatch.setattr(growth, "calibrate_if_possible", taken)
     monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
     data = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0") if validated else long()
     trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), data)
@@ -108,7 +108,7 @@ def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, first: dict[str, Any]
 ) -> None:
     seen: list[Views] = []
-    monkeypatch.setattr(DejaVu, "calibrate_if_possible", lambda _, reference, views: seen.append(views))
+    monkeypatch.setattr(growth, "calibrate_if_possible", lambda _, reference, views: seen.append(views))
     monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
     quiet = {"max_steps": 2, "limit_val_batches": 0}
     trainer(tmp_path / "one", LastCheckpoint(), **quiet).fit(new_task(**MADE), long(**first))
@@ -125,7 +125,7 @@ def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At another size than the reference's, with a backbone that takes no other."""
-    monkeypatch.setattr(DejaVu, "calibrate_if_possible", CALIBRATE)
+    monkeypatch.setattr(growth, "calibrate_if_possible", CALIBRATE)
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
     np.save(tmp_path / "long.npy", footage(frames=FRAMES, side=32).numpy())
     words = [
@@ -152,7 +152,7 @@ def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch:
     def failing(*_: object) -> None:
         raise RuntimeError("shapes cannot be multiplied")
 
-    monkeypatch.setattr(DejaVu, "calibrate_if_possible", failing)
+    monkeypatch.setattr(growth, "calibrate_if_possible", failing)
     with pytest.raises(RuntimeError, match="shapes"):
         trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), long())
     assert DejaVu.load(tmp_path / "map.safetensors").map.places == FRAMES
