@@ -19,7 +19,7 @@ from dejavu_torch.features.extract import check_alone, feature_batches, warn_of_
 from dejavu_torch.features.memory import IN_MEMORY, concatenate
 from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
-from dejavu_torch.maps.file import read_map, write_map
+from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
@@ -448,13 +448,6 @@ class Checkpoint:
     def _refuse(self, why: str = "") -> NoReturn:
         seen = f"{self.path} has finished chunks of another run{why}"
         raise InputError(f"{seen}; expected the command that began it, or the file removed")
-
-
-def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    """The tensors of one part of a file, by their own names."""
-    return {
-        name.removeprefix(f"{part}."): one for name, one in tensors.items() if name.startswith(f"{part}.")
-    }
 
 
 def learn_map(

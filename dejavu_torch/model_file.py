@@ -34,6 +34,7 @@ from dejavu_torch.maps.file import (
     digests,
     json_values,
     map_size,
+    part_of,
     read_map,
     write_map,
 )
@@ -333,15 +334,11 @@ def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> A
 def _fill(route: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
     """Give an empty map what a file holds of it; nothing if there is only a descriptor."""
     checked(state, route.state, "its map")
-    own = _below(tensors, "map.")
+    own = part_of(tensors, "map")
     if own or state["places"]:
         route.load_packed(own, state)
     else:
         route.set_extra_state(state)
-
-
-def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
 def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:

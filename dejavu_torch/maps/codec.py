@@ -41,7 +41,7 @@ END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 8 * 8  # the first context of each kind o
 NEAR = 34  # contexts by the magnitudes near a level
 CONTEXTS = LENGTH + 8 * NEAR
 FIRST = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
-BLOCK, PIECE = 2**16, 2**12  # levels whose contexts are found, and that are encoded, at a time
+BLOCK, PIECE = 2**16, 2**11  # levels whose contexts are found, and that are encoded, at a time
 PATH, SYMBOL = 17, 80  # upper bounds of bits, and of bytes, per symbol
 SPAN, BYTE = 56, 48  # bits of the interval at first, and at least
 LEAST = 1 << BYTE
@@ -116,28 +116,20 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
     padded = bytearray(packed + bytes(SPAN // 8 - 1))
     most = (LEVELS_AT_LEAST + LEVELS_PER_BYTE * len(packed)) // columns
     code = _code(levels.size)
-    room = [
-        code.numbers(one) for one in (np.zeros((1, 1 + columns), np.int16), _sums(columns), _logarithms())
-    ]
+    near = np.zeros((1, 1 + columns), np.int16)
+    room = [code.numbers(one) for one in (near, _sums(columns), _logarithms())]
     tables = tuple(code.numbers(table) for table in (*_tree(), *_first_counts()))
-    why, read = code.read(code.bytes(padded), levels, most, *room, tables) if packed else (TOO_SHORT, 0)
+    failed = TOO_SHORT, len(padded)
+    why, read = code.read(code.bytes(padded), levels, most, *room, tables) if packed else failed
     if why == TOO_MANY:
         check_work(most + 1, columns, len(packed))
-    checksum = _checksum(levels)
-    if why == NO_SYMBOL:
-        problem = "a level that int8 does not hold"
-    elif why == TOO_SHORT:
-        problem = f"{len(packed)} bytes are too few"
-    elif read < len(padded):
-        problem = f"{len(packed)} bytes, of which {len(padded) - read} are left over"
-    elif checksum != stream.checksum:
-        problem = f"levels of checksum {checksum}"
-    else:
-        return torch.from_numpy(levels)
-    raise InputError(
-        f"the coded lines are truncated or altered: {problem}; expected {levels.size} levels of "
-        f"{stream.checksum}"
-    )
+    left, checksum = len(padded) - read, _checksum(levels)
+    if why not in (GOES_ON, ENDS) or left or checksum != stream.checksum:
+        raise InputError(
+            f"the coded lines are truncated or altered: {len(packed)} bytes, {left} of them left over, give "
+            f"levels of checksum {checksum}; expected {levels.size} levels of {stream.checksum}"
+        )
+    return torch.from_numpy(levels)
 
 
 def check_claim(rows: int, columns: int) -> None:

@@ -134,6 +134,13 @@ def read_map(path: Path) -> Contents:
     return Contents(tensors, header)
 
 
+def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """The tensors of one part of a file, by their own names."""
+    return {
+        name.removeprefix(f"{part}."): one for name, one in tensors.items() if name.startswith(f"{part}.")
+    }
+
+
 def json_values(text: str) -> Any:
     """JSON values, of finite numbers, whole ones below 2^53; else ValueError."""
     return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
