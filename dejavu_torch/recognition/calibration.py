@@ -108,11 +108,11 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
         gradient = columns.T @ (weight * (p - target))
         curvature = (columns * (weight * p * (1 - p))[:, None]).T @ columns + ridge
         step = torch.linalg.solve(curvature, gradient)
-        before = loss(found)
-        while loss(found - step) > before and float(step.abs().max()) > 1e-9:
-            step = step / 2
-        found = found - step
-        if float(step.abs().max()) < 1e-9:
+        before, size = loss(found), 1.0
+        while loss(found - size * step) > before and size > 1e-8:
+            size /= 2
+        found = found - size * step
+        if float((size * step).abs().max()) < 1e-9:
             break
     slope = float(found[0]) / spread
     if slope < 0:

@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.recognition.select import best_candidates
+from dejavu_torch.types import InputError, Match, SequenceModel
 
 IMPOSSIBLE = 1e-30  # a probability that gradients still bear
 LIKELY = 0.99  # of all probability: a stretch of places with less is not scored alone
@@ -249,8 +250,8 @@ class LocalSearch:
         self.start = self.since = self.skipped = 0  # queries since the last search; left out before the next
         self.search: tuple[Moments, Tensor] | None = None  # the last: moments, and which places are covered
 
-    def __call__(self, query: Tensor) -> Tensor:
-        """As `PlaceFilter.unlikely` of the next query, (1,K) -> (1,N)."""
+    def __call__(self, query: Tensor) -> LocalScores:
+        """Scores as of `PlaceFilter` of the next query, (1,K)."""
         filter, places = self.filter, self.route.places
         belief, start, since, search = self.belief, self.start, self.since, self.search
         near = None if belief is None or search is None or since >= filter.search_every else _likely(belief)
@@ -274,19 +275,18 @@ class LocalSearch:
             moments, covered = search
         belief = updated(expected.to(scores), filter.likelihoods(scores, moments)[0])
         self.belief, self.start, self.since, self.search, self.skipped = belief, start, since + 1, search, 0
-        return self._unlikely(belief, start, scores).masked_fill(~covered, math.inf)
+        return self._unlikely(belief, start, scores, covered)
 
-    def _unlikely(self, belief: Tensor, start: int, scores: Tensor) -> Tensor:
-        """Of a belief, and the scores (1,W) of its places -> (1,N); elsewhere all places are alike."""
+    def _unlikely(self, belief: Tensor, start: int, scores: Tensor, covered: Tensor) -> LocalScores:
+        """Of a belief, and the scores (1,W) of its places."""
         within, places, stop = self.filter.within, self.route.places, start + scores.shape[1]
         elsewhere = (within + 1) * belief[-2] / max(1, places - stop + start)
         elsewhere = -elsewhere.clamp(torch.finfo(belief.dtype).tiny, 1).log()
-        row = elsewhere.repeat(1, places)
         left, right = min(within, start), min(within, places - stop)  # neighbours beside the W
         on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
         near = torch.minimum(elsewhere, self.filter.unlikely(on, seen))
-        row[:, start - left : stop + right] = near.masked_fill(~seen.isfinite(), math.inf)
-        return row
+        open_ = seen.isfinite() & covered[:, start - left : stop + right]
+        return LocalScores(near.masked_fill(~open_, math.inf), start - left, elsewhere, covered)
 
     @property
     def posterior(self) -> Tensor | None:
@@ -299,6 +299,28 @@ class LocalSearch:
         on = (belief[-2] / max(1, self.route.places - count)).repeat(self.route.places)
         on[self.start : self.start + count] = belief[:-2]
         return torch.cat([on, belief.new_zeros(1), belief[-1:]])
+
+
+class LocalScores(NamedTuple):
+    """Scores (1,W) of the places from `start` on; all others that are covered, (1,N), score `elsewhere`."""
+
+    scores: Tensor
+    start: int
+    elsewhere: Tensor
+    covered: Tensor
+
+    def row(self) -> Tensor:
+        """(1,N)"""
+        row = self.elsewhere.repeat(self.covered.shape).masked_fill_(~self.covered, math.inf)
+        row[:, self.start : self.start + self.scores.shape[1]] = self.scores
+        return row
+
+    def best(self) -> Match:
+        """The best place, (1,1); most often without a row of all places."""
+        near = best_candidates(self.scores, 1, 0)
+        if bool(near.score < self.elsewhere):
+            return near._replace(index=near.index + self.start)
+        return best_candidates(self.row(), 1, 0)
 
 
 def updated(expected: Tensor, likelihood: Tensor) -> Tensor:

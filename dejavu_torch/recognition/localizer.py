@@ -172,7 +172,10 @@ class Localizer(Matcher):
 
     def _by_scores(self, descriptors: Tensor) -> Match:
         if self.local is not None:
-            return Match.joined(self.matched(self.local(one)) for one in descriptors.split(1))
+            near = map(self.local, descriptors.split(1))
+            if self.matching.k is None and self.matching.on_scores is None:
+                return self.answer(Match.joined(one.best() for one in near))
+            return Match.joined(self.matched(one.row()) for one in near)
         parts = descriptors.split(max(1, SCORES_AT_ONCE // self.route.places))
         return Match.joined(self.match(self.route.scores(part)) for part in parts)
 
