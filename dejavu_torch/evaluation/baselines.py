@@ -99,7 +99,7 @@ def nearest_frames(
     sequences = dict(found.sequences)
     if 1 in sequences:
         sequences[1] = sequences[1].renumbered(of_one)
-    if matching.single:
+    if matching.sequence is None or matcher.own == 1:  # single queries
         found = found._replace(index=of_one(found.index))
     return found.with_probability(None, sequences)
 

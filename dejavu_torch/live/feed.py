@@ -6,7 +6,6 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from types import TracebackType
 
 from dejavu_torch.data.camera import Shot
 from dejavu_torch.types import InputError
@@ -19,19 +18,18 @@ class Feed:
 
     Args:
         shots: read by the thread.
-        newest: only the newest frame waits: those that come before it was asked for are dropped, and counted.
-            Else the reading waits, and none is.
+        newest: only the newest frame waits: earlier ones are dropped, and counted. Else the reading waits.
         timeout: seconds without a frame after which the source has stalled; None waits forever.
         name: of the source, for messages.
 
     Attributes:
         dropped: frames so far.
 
-    Convention: a context manager; behind it the thread ends with the frame that it reads. One that is stuck
-        in a read does not keep the process.
+    Convention: a context manager; after it the thread ends with the frame that it reads. One that is stuck in
+        a read does not keep the process.
 
     Raises:
-        InputError: iterating: the source stalled, or what reading it raises, behind the frames before.
+        InputError: iterating: the source stalled, or what reading it raises, after the frames before.
 
     Example:
         >>> with Feed(Shot(i, i / 30, None) for i in range(3)) as feed:
@@ -58,9 +56,7 @@ class Feed:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._changed:
             self._over = True
             self._waiting.clear()
@@ -70,8 +66,7 @@ class Feed:
     def __iter__(self) -> Iterator[Shot]:
         while True:
             with self._changed:
-                came = self._changed.wait_for(lambda: self._waiting or self._over, self.timeout)
-                if not came:
+                if not self._changed.wait_for(lambda: self._waiting or self._over, self.timeout):
                     raise InputError(
                         f"{self.name} stalled: no frame in {self.timeout:g} seconds; expected it to go on"
                     )
@@ -90,8 +85,7 @@ class Feed:
                     if self.newest:
                         self.dropped += len(self._waiting)
                         self._waiting.clear()
-                    else:
-                        self._changed.wait_for(lambda: len(self._waiting) < WAITING or self._over)
+                    self._changed.wait_for(lambda: len(self._waiting) < WAITING or self._over)
                     if self._over:
                         return
                     self._waiting.append(shot)

@@ -20,6 +20,7 @@ EXPECTED = (
     "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1], or, of a map of ready features, "
     "float (D,)"
 )
+DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
 FURTHEST = 100  # frames left out that count; after more, a jump finds the place again
 ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
 
@@ -27,11 +28,10 @@ ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
 class LiveMatch(NamedTuple):
     """Where a frame was found.
 
-    place: the reported place, -1 where none has a finite score. frame: the reference frame that it shows, -1
-    likewise. name: of that frame, "" where it has none. score: as of `Match`, lower is better. posterior: the
-    probability that the filter gives the place, of all frames so far; NaN without a filter. probability: of
-    being right, where the map is calibrated; NaN where it is not. accepted: as of `Match`. milliseconds: from
-    the frame to this answer. route: of a merged map, the name of the route whose frame it is, else "".
+    place, score, accepted: as of `Match`. frame: the reference frame that the place shows, -1 for none. name:
+    of that frame, if it has one. posterior: the probability that a filter gives the place; NaN without one.
+    probability: of being right; NaN where the map is not calibrated. milliseconds: from the frame to this
+    answer. route: of a merged map, the name of the route whose frame it is.
     """
 
     place: int
@@ -50,17 +50,16 @@ class LiveLocalizer:
 
     Args:
         model: has a map. It is used as it is and where it is: on a GPU, frames are moved there.
-        sequence: "filter", the default, is a `PlaceFilter`: frames of a camera show consecutive places, and
-            it alone says how probable its answer is. None matches each frame by itself.
+        sequence: "filter" is a `PlaceFilter`; None matches each frame by itself.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
     Attributes:
         scores: (N,) of the latest frame, on the model's device; None before the first.
 
-    Convention: the answers are those of `DejaVu.localize` on the same frames with the same sequence, but for
-        rounding. A frame that is refused changes nothing. `localizer(frame, left_out)` says how many frames
-        were left out since the one before: a `PlaceFilter` moves once more for each of them.
+    Convention: the answers are those of `DejaVu.localize`, but for rounding. A frame that is refused changes
+        nothing. `localizer(frame, left_out)` says how many frames were left out since the one before: a
+        `PlaceFilter` moves once more for each of them.
 
     Raises:
         InputError: a model without a map, or whose places are at even steps along the ground; calling it: an
@@ -114,15 +113,15 @@ class LiveLocalizer:
         found = self.model.map
         shown, routes = int(found.frame_of(match.index)), found.routes
         return LiveMatch(
-            place,
-            int(found.table.own_frame_of(match.index)) if routes else shown,
-            self.model.frame_name(shown) if shown >= 0 else "",
-            score,
-            math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
-            math.nan if match.probability is None else float(match.probability),
-            bool(match.accepted),
-            1e3 * (time.perf_counter() - began),
-            routes[int(found.table.route_of(match.index))].name if routes and place >= 0 else "",
+            place=place,
+            frame=int(found.table.own_frame_of(match.index)) if routes else shown,
+            name=self.model.frame_name(shown) if shown >= 0 else "",
+            score=score,
+            posterior=math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
+            probability=math.nan if match.probability is None else float(match.probability),
+            accepted=bool(match.accepted),
+            milliseconds=1e3 * (time.perf_counter() - began),
+            route=routes[int(found.table.route_of(match.index))].name if routes and place >= 0 else "",
         )
 
     @property
@@ -161,30 +160,26 @@ def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> 
         >>> as_batch(np.zeros((480, 640, 3), np.uint8)).shape
         torch.Size([1, 3, 480, 640])
     """
-    kind = str(getattr(frame, "dtype", type(frame).__name__)).removeprefix("torch.")
-    kind = frame.dtype.name if isinstance(frame, np.ndarray) else kind  # whatever its byte order
+    if isinstance(frame, np.ndarray) and frame.dtype.name in DTYPES:
+        frame = torch.from_numpy(np.require(frame, frame.dtype.newbyteorder("="), ["C", "W"]))
     shape = tuple(getattr(frame, "shape", ()))
-    pixels = kind == "uint8"
-    floats = kind in ("float16", "bfloat16", "float32", "float64")
+    kind = str(getattr(frame, "dtype", type(frame).__name__)).removeprefix("torch.")
     last, first = shape[-1:] in ((1,), (3,)), shape[:1] in ((1,), (3,))
     image = len(shape) == 2 or (len(shape) == 3 and (last or first))
-    if not isinstance(frame, Tensor | np.ndarray) or not (
-        (image and (pixels or floats)) or (len(shape) == 1 and floats)
-    ):
+    known = isinstance(frame, Tensor) and kind in DTYPES
+    if not known or not (image or (len(shape) == 1 and kind != "uint8")):
         raise InputError(f"the frame is {f'{shape} {kind}' if shape else f'a {kind}'}; expected {EXPECTED}")
     if 0 in shape:
         raise InputError(f"the frame is {shape}, which holds nothing; expected {EXPECTED}")
-    if isinstance(frame, np.ndarray):
-        whole = frame if frame.flags.writeable and min(frame.strides) >= 0 else frame.copy()
-        frame = torch.from_numpy(whole.astype(frame.dtype.newbyteorder("="), copy=False))
+    assert isinstance(frame, Tensor)
     values = frame.detach().to(device)
     if len(shape) == 1:
         return values.float()[None]
     if len(shape) == 2:
         values = values[None]
-    elif last and not (first and floats):  # a tensor of floats has its channels first
+    elif last and not (first and kind != "uint8"):  # a tensor of floats has its channels first
         values = values.permute(2, 0, 1)
-    if pixels:
+    if kind == "uint8":
         return values[None].float().div_(255)
     values = values if values.dtype == torch.float64 else values.float()
     low, high = (float(end) for end in values.aminmax())

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
@@ -35,11 +34,7 @@ PAGE = Path(__file__).with_name("page.html")
 
 
 class Moment(NamedTuple):
-    """What the page shows of one frame.
-
-    scores: (N,) of all places; or, where `posterior`, (N+1,) probabilities of each and of being off the map.
-    p50, p99: milliseconds.
-    """
+    """What the page shows of one frame: `scores` (N,), or a `posterior` (N+1,); p50, p99 in milliseconds."""
 
     shot: Shot
     match: LiveMatch
@@ -57,7 +52,7 @@ class Page:
     Args:
         port: 0 is any that is free; `url` says which.
         title: a line below the heading.
-        reference: pictures of the reference's frames, where the page is to show them.
+        reference: gives pictures of the reference's frames.
 
     Convention: a context manager. It answers requests for 127.0.0.1 and localhost only, so that no other site
         can ask for it by a name of its own.
@@ -96,9 +91,7 @@ class Page:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._server.shutdown()
         self._server.server_close()
 
@@ -108,18 +101,18 @@ class Page:
 
     def answer(self, request: BaseHTTPRequestHandler) -> None:
         """Answer one request."""
-        host = request.headers.get("Host", "").rpartition(":")[0] or request.headers.get("Host", "")
+        host = request.headers.get("Host", "").partition(":")[0]
         address = urlsplit(request.path)
+        body, kind, status = b"", "text/plain", HTTPStatus.OK
         if host not in (HOST, "localhost"):
-            body, kind, status = b"", "text/plain", HTTPStatus.FORBIDDEN
+            status = HTTPStatus.FORBIDDEN
         elif address.path == "/":
-            body, kind, status = PAGE.read_bytes(), "text/html; charset=utf-8", HTTPStatus.OK
+            body, kind = PAGE.read_bytes(), "text/html; charset=utf-8"
         elif address.path == "/state":
             seen = parse_qs(address.query).get("seen", [""])[0]
-            body = json.dumps(self.state(seen)).encode()
-            kind, status = "application/json", HTTPStatus.OK
+            body, kind = json.dumps(self.state(seen)).encode(), "application/json"
         else:
-            body, kind, status = b"", "text/plain", HTTPStatus.NOT_FOUND
+            status = HTTPStatus.NOT_FOUND
         try:
             request.send_response(status)
             request.send_header("Content-Type", kind)
@@ -131,18 +124,15 @@ class Page:
             pass
 
     def state(self, seen: str = "") -> dict[str, Any]:
-        """What the page asks for again and again; without pictures where it has `seen` that frame."""
+        """What the page asks for again and again; no more than the number of a frame that it has `seen`."""
         moment = self.moment
-        state: dict[str, Any] = {"title": self.title, "number": -1}
-        if moment is None:
-            return state
+        if moment is None or seen == str(moment.shot.number):
+            return {"title": self.title, "number": -1 if moment is None else moment.shot.number}
         shot, match = moment.shot, moment.match
-        state["number"] = shot.number
-        if seen == str(shot.number):
-            return state
         known = match._asdict() | {"time": shot.seconds, "p50": moment.p50, "p99": moment.p99}
-        state |= {name: _number(value) for name, value in known.items()}
-        return state | {
+        return {name: _number(value) for name, value in known.items()} | {
+            "title": self.title,
+            "number": shot.number,
             "frames": moment.frames,
             "dropped": moment.dropped,
             "places": len(moment.scores) - moment.posterior,
@@ -165,9 +155,8 @@ def curve(scores: Tensor, posterior: bool) -> list[float]:
     """What the page draws of all places, as at most `COLUMNS` heights in [0, 1].
 
     Args:
-        scores: (N,), of which a column has the best of its places: the best of all has height 1, the worst 0.
-        posterior: they are probabilities (N+1,), the last of being off the map: a column has the sum of its
-            places, so that all columns and the last number add up to 1.
+        scores: (N,): the height of a column is that of its best place; the best of all has 1, the worst 0.
+        posterior: they are probabilities (N+1,), the last of being off the map: a column is a sum of places.
 
     Example:
         >>> curve(torch.tensor([3.0, 1.0, 2.0, torch.inf]), posterior=False)
@@ -176,19 +165,19 @@ def curve(scores: Tensor, posterior: bool) -> list[float]:
         [0.25, 0.5, 0.0]
     """
     scores = scores.detach().float().cpu()
+    places = len(scores) - posterior
+    columns = min(COLUMNS, places)
     if posterior:
-        places = len(scores) - 1
-        columns = min(COLUMNS, places)
-        sums = torch.zeros(columns).index_add_(0, torch.arange(places) * columns // places, scores[:-1])
-        return [round(value, 6) for value in sums.tolist()]
-    known = scores.isfinite()
+        column = torch.arange(places) * columns // places
+        heights: list[float] = torch.zeros(columns).index_add_(0, column, scores[:-1]).tolist()
+        return [round(value, 6) for value in heights]
     height = torch.zeros_like(scores)
-    if known.any():
-        worst, best = scores[known].max(), scores[known].min()
-        height = torch.where(known, (worst - scores) / (worst - best).clamp(min=1e-12), 0).clamp(0, 1)
-    columns = min(COLUMNS, len(height))
-    best = torch.nn.functional.adaptive_max_pool1d(height[None], columns)[0]
-    return [round(value, 4) for value in best.tolist()]
+    valid = scores.isfinite()
+    if valid.any():
+        best, worst = scores[valid].aminmax()
+        height = torch.where(valid, (worst - scores) / (worst - best).clamp(min=1e-12), 0).clamp(0, 1)
+    heights = torch.nn.functional.adaptive_max_pool1d(height[None], columns)[0].tolist()
+    return [round(value, 4) for value in heights]
 
 
 def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
@@ -209,9 +198,8 @@ class ReferencePictures:
     """Pictures of the frames of a reference, for `Page`.
 
     Args:
-        reference: the traverse that the map was learned from. One that can be read in any order is; of
-            another, as a video, small pictures are made in a thread of its own, of at most `KEPT` frames, of
-            which the nearest is shown.
+        reference: the traverse that the map was learned from. If it can only be read in order, as a video, a
+            thread makes small pictures of at most `KEPT` frames, of which the nearest is shown.
         frames: how many the map's reference has.
 
     Raises:

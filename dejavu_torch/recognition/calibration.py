@@ -16,9 +16,9 @@ from dejavu_torch.types import InputError, Match, SequenceModel
 
 TOLERANCE = 5  # places within which an answer is right
 MARGIN = 2.0  # weight of the margin beside the score itself
-SPREADS = 3.0  # nats that a filter's track counts for each standard deviation it stands out by
+SPREADS = 3.0  # nats of a filter's confidence for each standard deviation that single queries stand out by
 MISSED = 20  # wrong answers that a visit may have been spared: they come in stretches of like places
-MEMORY = 0.9  # of what a track told, from one query to the next
+MEMORY = 0.9  # of a track, from one query to the next
 NEAR = 2  # places around an answer whose best score counts for a track
 SURE = 1e-6  # least distance of a filter's probability from 0 and 1
 STEPS = 100  # of Newton's method at most
@@ -31,15 +31,14 @@ class Platt(NamedTuple):
     offset: float
 
     def probability(self, confidence: Tensor) -> Tensor:
-        """Of confidence (Q,): (Q,) float64 on the CPU, 0 where it is -inf."""
-        confidence = confidence.cpu()  # not every device has double precision
-        finite = confidence.double().nan_to_num(neginf=0.0)
-        p = torch.sigmoid(self.slope * finite + self.offset)
+        """(Q,) -> (Q,) float64 on the CPU, 0 where the confidence is -inf."""
+        confidence = confidence.cpu().double()  # not every device has double precision
+        p = torch.sigmoid(self.slope * confidence.nan_to_num(neginf=0.0) + self.offset)
         return torch.where(confidence.isneginf(), 0.0, p)
 
 
 class Calibration(NamedTuple):
-    """What turns confidence into probabilities; None for a kind of matching that is not calibrated.
+    """What makes probabilities of confidences, None where nothing does.
 
     single: of queries by themselves. filter: of a `PlaceFilter` with its defaults.
     """
@@ -58,10 +57,7 @@ NEVER = Calibration(None, None)
 
 
 class Trial(NamedTuple):
-    """Consecutive queries whose places are known.
-
-    descriptors: (T,K). places: (T,) int64, of each the place that it shows; -1 for none.
-    """
+    """Consecutive queries whose places are known: descriptors (T,K) and places (T,) int64, -1 for none."""
 
     descriptors: Tensor
     places: Tensor
@@ -96,20 +92,20 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
         raise InputError(f"none of {len(right)} answers is right; expected some, to calibrate by")
     x, y = confidence[known].double(), right[known]
     weight = torch.ones_like(x) if weight is None else weight[known].double()
-    mean, spread = x.mean(), x.std(correction=0)
-    columns = torch.stack([(x - mean) / (spread if spread > 0 else 1), torch.ones_like(x)], 1)
+    mean, spread = float(x.mean()), float(x.std(correction=0)) or 1.0
+    columns = torch.stack([(x - mean) / spread, torch.ones_like(x)], 1)
     hits, misses = float(weight[y].sum()), float(weight[~y].sum())
-    aim = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
+    target = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
     found = torch.tensor([0.0, math.log((hits + 1) / (misses + 1))], dtype=torch.float64)
     ridge = 1e-9 * torch.eye(2, dtype=torch.float64)
 
     def loss(at: Tensor) -> float:
         logits = columns @ at
-        return float((weight * (torch.nn.functional.softplus(logits) - aim * logits)).sum())
+        return float((weight * (torch.nn.functional.softplus(logits) - target * logits)).sum())
 
     for _ in range(STEPS):
         p = torch.sigmoid(columns @ found)
-        gradient = columns.T @ (weight * (p - aim))
+        gradient = columns.T @ (weight * (p - target))
         curvature = (columns * (weight * p * (1 - p))[:, None]).T @ columns + ridge
         step = torch.linalg.solve(curvature, gradient)
         before, size = loss(found), 1.0
@@ -118,11 +114,11 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
         found = found - size * step
         if float((size * step).abs().max()) < 1e-9:
             break
-    slope = float(found[0] / (spread if spread > 0 else 1))
+    slope = float(found[0]) / spread
     if slope < 0:
         share = (hits + 1) / (hits + misses + 2)
         return Platt(0.0, math.log(share / (1 - share)))
-    return Platt(slope, float(found[1] - slope * mean))
+    return Platt(slope, float(found[1]) - slope * mean)
 
 
 def confidence_of(scores: Tensor) -> Tensor:
@@ -141,16 +137,16 @@ def confidence(candidates: Match) -> Tensor:
 
 
 class Track:
-    """How much a filter's answers stand out, one behind the other, which a single posterior cannot tell: off
-    the map it follows the best of places that are all wrong.
+    """Confidence of a filter's answers, which one posterior cannot give: off the map it follows the best of
+    places that are all wrong.
 
-    The log odds of the answer, and `SPREADS` times how much single queries have stood out there lately: how
+    The log odds of the answer, and `SPREADS` times how much single queries stood out there lately: how
     many standard deviations they scored below their mean, and `MARGIN` times how many below the best place
     beyond `TOLERANCE`.
     """
 
     def __init__(self) -> None:
-        self.told = self.weight = 0.0
+        self.sum = self.weight = 0.0
 
     def __call__(self, found: Tensor, scores: Tensor) -> Tensor:
         """Of the filter's scores and those of single queries, each (B,N) -> (B,) float64 on the CPU."""
@@ -162,13 +158,14 @@ class Track:
         deviations = torch.where(own.isfinite(), (mean[:, 0] - own + MARGIN * margin) / spread[:, 0], 0)
         lately = []
         for one in deviations.tolist():
-            self.told = MEMORY * self.told + (1 - MEMORY) * one
+            self.sum = MEMORY * self.sum + (1 - MEMORY) * one
             self.weight = MEMORY * self.weight + 1 - MEMORY
-            lately.append(self.told / self.weight)
+            lately.append(self.sum / self.weight)
         score = match.score.cpu().double()
         odds = (-score).exp().clamp(SURE, 1 - SURE).logit()
-        stood = torch.tensor(lately, dtype=torch.float64)
-        return torch.where(score.isfinite(), odds + SPREADS * stood, -math.inf)
+        return torch.where(
+            score.isfinite(), odds + SPREADS * torch.tensor(lately, dtype=torch.float64), -math.inf
+        )
 
 
 def _around(index: Tensor, far: int, scores: Tensor) -> Tensor:
@@ -183,37 +180,35 @@ def calibrated(route: PlaceMap, trials: Iterable[Trial], another_visit: bool = F
     tolerance to each side, left out: answers off the map, of which none is right.
 
     Args:
-        another_visit: the queries are of another visit, whose own wrong answers tell how often to expect one.
+        another_visit: the queries are of another visit, whose own wrong answers show how often to expect one.
             Those off the map then count, together, for as many as lack to `MISSED`.
 
     Raises:
         InputError: no right answer of single queries, or none whose place is known.
     """
-    kinds: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {"single": [], "filter": []}
+    kinds: list[list[tuple[Tensor, ...]]] = [[], []]  # single queries, and a filter's
     for descriptors, places in trials:
         scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
         known = places >= 0
         away = scores.scatter(1, _around(places, 2 * TOLERANCE, scores), math.inf)
-        for one, is_there in ((scores, True), (away, False)):
+        for one, on_map in ((scores, True), (away, False)):
             filtered = PlaceFilter()(one)
-            for kind, found, confidence in (
-                ("single", one, confidence_of(one)),
-                ("filter", filtered, Track()(filtered, one)),
-            ):
+            pairs = (one, confidence_of(one)), (filtered, Track()(filtered, one))
+            for answers, (found, own) in zip(kinds, pairs, strict=True):
                 index = best_match(found).index
-                right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & is_there
-                there = torch.full_like(right, is_there)
-                kinds[kind].append((confidence.cpu()[known.cpu()], right[known].cpu(), there[known].cpu()))
-    if not kinds["single"]:
+                right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & on_map
+                columns = own.cpu(), right.cpu(), torch.full(right.shape, on_map)
+                answers.append(tuple(column[known.cpu()] for column in columns))
+    if not kinds[0]:
         raise InputError("there are no queries to calibrate by; expected some")
     platts: list[Platt | None] = []
-    for pairs in kinds.values():
-        confidence, right, there = map(torch.cat, zip(*pairs, strict=True))
-        wrong = int((there & ~right).sum())
-        off_map = max(0, MISSED - wrong) / max(1, int((~there).sum())) if another_visit else 1.0
-        weight = torch.where(there, 1.0, off_map)
-        platts.append(fit(confidence, right, weight) if not platts or bool(right.any()) else None)
+    for answers in kinds:
+        own, right, on_the_map = map(torch.cat, zip(*answers, strict=True))
+        wrong = int((on_the_map & ~right).sum())
+        away_weight = max(0, MISSED - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
+        weight = torch.where(on_the_map, 1.0, away_weight)
+        platts.append(fit(own, right, weight) if not platts or bool(right.any()) else None)
     return Calibration(*platts)
 
 

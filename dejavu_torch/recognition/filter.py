@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.recognition.select import best_candidates
+from dejavu_torch.types import InputError, Match, SequenceModel
 
 IMPOSSIBLE = 1e-30  # a probability that gradients still bear
 LIKELY = 0.99  # of all probability: a stretch of places with less is not scored alone
@@ -50,27 +51,24 @@ class PlaceFilter(SequenceModel):
             A camera that is faster is lost until a jump finds it again.
         jump: probability of being anywhere on the map next, whatever the place before.
         leave: probability of leaving the map. enter: of entering it, from off the map.
-        sharpness: nats for a standard deviation. Consecutive frames are alike, so that they say less than
-            as many independent ones.
+        sharpness: nats for a standard deviation; low, as consecutive frames are alike.
         off_map: standard deviations; a place that stands out less than this suggests being off the map.
-        within: places; the score of a place counts its neighbours up to here, the less the further away,
-            since what is nearly right counts as right.
+        within: places; the score of a place counts its neighbours up to here, the less the further away.
         threshold: accept a match whose score is below, math.inf every match; None leaves it to
             `DejaVu.acceptance`, which without a calibrated map accepts what is more likely than not.
-        search_every: queries from one search of all places to the next. In between `DejaVu.localize` scores
-            only the stretch of places that is likely, as far as the map can score a stretch alone: a spectral
-            map by its chunks, a template map by its layers. If no stretch holds nearly all of the
-            probability, all places are searched. Probabilities then differ by up to about 0.02 from those of
-            a filter that always searches, and a jump is noticed at the next search.
+        search_every: queries from one search of all places to the next. In between `DejaVu.localize` and
+            `LiveLocalizer` score only the stretch of places that holds nearly all of the probability, if
+            there is one, as far as the map can score it alone: a spectral map by its chunks, a template map
+            by its layers. Probabilities then differ by up to about 0.02, and a jump is noticed at the next
+            search.
 
-    Shape: scores (Q,N), the posterior (N+1,) of the query before them or None -> (Q,N), -log of a
-        probability in nats, lower is better.
+    Shape: scores (Q,N), the posterior (N+1,) before them or None -> (Q,N), -log of a probability in nats.
 
     Convention: causal. exp(-score) is at most the probability that the right place lies within `within`
         places. The state is the posterior (N+1,), the last number that of being off the map, and all 0 before
         the first query. A place that nothing covers scores +inf; a query that scores all places alike says
-        nothing. The settings from `moves` to `off_map` are parameters: gradients reach them, the scores and
-        the state. Only `DejaVu.localize` and `LiveLocalizer` use `search_every`.
+        nothing. The settings from `moves` to `off_map` are parameters; gradients reach them, the scores and
+        the state.
 
     Source: an off-map state is in the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021);
         motion model and likelihood are ours.
@@ -124,11 +122,11 @@ class PlaceFilter(SequenceModel):
         self.within, self.threshold, self.search_every = within, threshold, search_every
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        """See `SequenceModel`: (N+1,) of 0."""
+        """See `SequenceModel`."""
         return torch.zeros(places + 1, device=self.off_map.device)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
-        return self._unlikely(self.posterior(scores, before)[:, :-1], scores)
+        return self.unlikely(self.posterior(scores, before)[:, :-1], scores)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         """Probability of each place, and of being off the map, after each query.
@@ -138,39 +136,35 @@ class PlaceFilter(SequenceModel):
         if before is None:
             before = self.start(scores.shape[-1])
         elif before.shape == (scores.shape[-1] + 1,):
-            _checked(before)
+            _check_posterior(before)
         return self._posteriors(scores, before)
 
     def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
         posteriors = self._posteriors(scores, state)
-        return self._unlikely(posteriors[:, :-1], scores), posteriors[-1] if len(scores) else state
+        return self.unlikely(posteriors[:, :-1], scores), posteriors[-1] if len(scores) else state
 
     def _posteriors(self, scores: Tensor, state: Tensor) -> Tensor:
         if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
             raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
-        places = scores.shape[1]
+        places, rows = scores.shape[1], list[Tensor]()
         if state.shape != (places + 1,):
-            raise InputError(
-                f"a posterior {tuple(state.shape)} of another map, of {places} places; expected "
-                f"({places + 1},)"
-            )
+            raise InputError(f"a posterior {tuple(state.shape)} of another map; expected ({places + 1},)")
         if not len(scores):
             return scores.new_zeros(0, places + 1)
-        rows: list[Tensor] = []
-        state = state.to(scores)
-        belief = _with_rest(state)
-        first = torch.where(
-            (state == 0).all(), self._anywhere(places).to(scores), self._moved(belief, places)
-        )
+        belief = _with_rest(state.to(scores))
+        none_before = (belief == 0).all()
         for likelihood in self.likelihoods(scores, moments_of(scores)):
-            expected = self._moved(belief, places) if rows else first
-            belief = _updated(expected, likelihood)
+            expected = self.moved(belief, places)
+            if not rows:
+                expected = torch.where(none_before, self.anywhere(places).to(scores), expected)
+            belief = updated(expected, likelihood)
             rows.append(belief)
         return _without_rest(torch.stack(rows))
 
     def predicted(self, posterior: Tensor) -> Tensor:
         """The posterior after the next move, before a query: (N+1,) -> (N+1,)."""
-        return _without_rest(self._moved(_with_rest(_checked(posterior)), len(posterior) - 1))
+        _check_posterior(posterior)
+        return _without_rest(self.moved(_with_rest(posterior), len(posterior) - 1))
 
     def likelihoods(self, scores: Tensor, moments: Moments) -> Tensor:
         """Likelihoods of each query up to a factor, the greatest of each row 1.
@@ -189,35 +183,32 @@ class PlaceFilter(SequenceModel):
         logits = logits.masked_fill(closed, -math.inf)
         return (logits - logits.amax(1, keepdim=True)).exp()
 
-    def _anywhere(self, places: int) -> Tensor:
+    def anywhere(self, places: int) -> Tensor:
         """The belief before the first query: off the map or on it, as many as leave and enter."""
         leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
         off = (leave / (leave + enter)).clamp(max=0.5)
         return torch.cat([((1 - off) / places).expand(places), off.new_zeros(1), off[None]])
 
-    def _moved(self, belief: Tensor, places: int, start: int = 0) -> Tensor:
+    def moved(self, belief: Tensor, places: int, start: int = 0) -> Tensor:
         """The belief before the next query.
 
         A belief (W+2,) holds the probability of each of the places [start, start + W), that of all others
         together, and that of being off the map. The result has up to V more places, as far as one can drive.
         """
-        moves, (stay, jump, leave) = (
-            self.move_logits.to(belief).softmax(0),
-            self.rate_logits.to(belief).softmax(0),
-        )
+        moves, rates = (logits.to(belief).softmax(0) for logits in (self.move_logits, self.rate_logits))
+        (stay, jump, leave), enter = rates, self.enter_logit.sigmoid().to(belief)
         on, rest, off = belief[:-2], belief[-2], belief[-1]
         furthest = len(moves) - 1
         ahead = min(furthest, places - start - len(on))
         # a convolution, but conv1d takes 100 times as long for one row
         moved = F.pad(on, (furthest, ahead)).unfold(0, furthest + 1, 1) @ moves.flip(0)
-        enter = self.enter_logit.sigmoid().to(belief)
         total = on.sum() + rest
         anywhere = (jump * total + enter * off) / places
         rest = stay * rest + anywhere * (places - len(moved))
         off = stay * (on.sum() - moved.sum()) + leave * total + (1 - enter) * off
         return torch.cat([stay * moved + anywhere, rest[None], off[None]])
 
-    def _unlikely(self, posterior: Tensor, scores: Tensor) -> Tensor:
+    def unlikely(self, posterior: Tensor, scores: Tensor) -> Tensor:
         """-log of the probability of each place and its neighbours, (Q,W) -> (Q,W); +inf where scores are."""
         within = min(self.within, posterior.shape[1])  # further neighbours there are not
         side = within + 1  # two means over so many make a triangle
@@ -248,35 +239,31 @@ class PlaceFilter(SequenceModel):
 
 
 class LocalSearch:
-    """A filter that between two searches scores only the stretch of places that is likely; keeps its state.
+    """A filter that between two searches scores only the likely stretch of places; keeps its state.
 
-    All other places then count as if they scored as the mean, and mean and spread are those of the last
-    search.
-
-    Args:
-        filter: whose `search_every` counts the queries. route: the map.
+    All other places count as if they scored as the mean, and mean and spread are those of the last search.
     """
 
     def __init__(self, filter: PlaceFilter, route: PlaceMap) -> None:
         self.filter, self.route = filter, route
         self.belief: Tensor | None = None  # of the places from `start` on
-        self.start = self.since = self.skipped = (
-            0  # queries since the last search, and left out before the next
-        )
+        self.start = self.since = self.skipped = 0  # queries since the last search; left out before the next
         self.search: tuple[Moments, Tensor] | None = None  # the last: moments, and which places are covered
 
     def __call__(self, query: Tensor) -> LocalScores:
-        """The scores of the next query, (1,K)."""
+        """Scores as of `PlaceFilter` of the next query, (1,K)."""
         filter, places = self.filter, self.route.places
         belief, start, since, search = self.belief, self.start, self.since, self.search
         near = None if belief is None or search is None or since >= filter.search_every else _likely(belief)
         if belief is not None and near is not None:
-            belief, start = _narrowed(belief, near), start + near.start
+            on = belief[near.start : near.stop]
+            rest = belief[-2] + (belief[:-2].sum() - on.sum())
+            belief, start = torch.cat([on, rest[None], belief[-1:]]), start + near.start
         elif belief is not None:
             belief, start = self._spread(belief), 0
-        expected = filter._anywhere(places) if belief is None else belief
+        expected = filter.anywhere(places) if belief is None else belief
         for _ in range(0 if belief is None else 1 + self.skipped):
-            expected = filter._moved(expected, places, start)
+            expected = filter.moved(expected, places, start)
         if search is None or near is None:
             scores = self.route.scores(query)
             moments, covered = moments_of(scores), scores.isfinite()
@@ -286,9 +273,20 @@ class LocalSearch:
             blocks = self.route.score_blocks(query, start, start + len(expected) - 2)
             scores = torch.cat([block for _, block in blocks], 1)
             moments, covered = search
-        belief = _updated(expected.to(scores), filter.likelihoods(scores, moments)[0])
+        belief = updated(expected.to(scores), filter.likelihoods(scores, moments)[0])
         self.belief, self.start, self.since, self.search, self.skipped = belief, start, since + 1, search, 0
-        return self._scores(belief, start, scores, covered)
+        return self._unlikely(belief, start, scores, covered)
+
+    def _unlikely(self, belief: Tensor, start: int, scores: Tensor, covered: Tensor) -> LocalScores:
+        """Of a belief, and the scores (1,W) of its places."""
+        within, places, stop = self.filter.within, self.route.places, start + scores.shape[1]
+        elsewhere = (within + 1) * belief[-2] / max(1, places - stop + start)
+        elsewhere = -elsewhere.clamp(torch.finfo(belief.dtype).tiny, 1).log()
+        left, right = min(within, start), min(within, places - stop)  # neighbours beside the W
+        on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
+        near = torch.minimum(elsewhere, self.filter.unlikely(on, seen))
+        open_ = seen.isfinite() & covered[:, start - left : stop + right]
+        return LocalScores(near.masked_fill(~open_, math.inf), start - left, elsewhere, covered)
 
     @property
     def posterior(self) -> Tensor | None:
@@ -302,25 +300,9 @@ class LocalSearch:
         on[self.start : self.start + count] = belief[:-2]
         return torch.cat([on, belief.new_zeros(1), belief[-1:]])
 
-    def _scores(self, belief: Tensor, start: int, scores: Tensor, covered: Tensor) -> LocalScores:
-        """-log of the probabilities of a belief (W+2,), by (1,W) scores and (1,N) places that are covered."""
-        within, places = self.filter.within, covered.shape[1]
-        stop, smallest = start + scores.shape[1], torch.finfo(belief.dtype).tiny
-        elsewhere = (within + 1) * belief[-2] / max(1, places - stop + start)
-        elsewhere = -elsewhere.clamp(smallest, 1).log()
-        left, right = min(within, start), min(within, places - stop)  # neighbours beside the W
-        on, seen = (F.pad(one, (left, right)) for one in (belief[None, :-2], scores))
-        near = torch.minimum(elsewhere, self.filter._unlikely(on, seen))
-        open_ = seen.isfinite() & covered[:, start - left : stop + right]
-        return LocalScores(near.masked_fill(~open_, math.inf), start - left, elsewhere, covered)
-
 
 class LocalScores(NamedTuple):
-    """-log of the probability of every place, most of which are alike.
-
-    scores: (1,W) of the places from `start` on. elsewhere: of each other place that is covered, which is at
-    least as much. covered: (1,N).
-    """
+    """Scores (1,W) of the places from `start` on; all others that are covered, (1,N), score `elsewhere`."""
 
     scores: Tensor
     start: int
@@ -329,45 +311,19 @@ class LocalScores(NamedTuple):
 
     def row(self) -> Tensor:
         """(1,N)"""
-        row = self.elsewhere.repeat(self.covered.shape).masked_fill(~self.covered, math.inf)
+        row = self.elsewhere.repeat(self.covered.shape).masked_fill_(~self.covered, math.inf)
         row[:, self.start : self.start + self.scores.shape[1]] = self.scores
         return row
 
-    def best(self) -> tuple[Tensor, Tensor]:
-        """The lowest score and its place, -1 for none: (1,), (1,) int64."""
-        score, place = self.scores.min(1)
-        place = place + self.start
-        if not bool(score < self.elsewhere):  # as good as all others
-            score, place = self.row().min(1)
-        return score, torch.where(score.isfinite(), place, -1)
+    def best(self) -> Match:
+        """The best place, (1,1); most often without a row of all places."""
+        near = best_candidates(self.scores, 1, 0)
+        if bool(near.score < self.elsewhere):
+            return near._replace(index=near.index + self.start)
+        return best_candidates(self.row(), 1, 0)
 
 
-def _logits(*probabilities: float) -> Tensor:
-    """Logarithms whose gradients are finite where a probability is 0."""
-    return torch.tensor(probabilities).clamp(min=IMPOSSIBLE).log()
-
-
-def _checked(posterior: Tensor) -> Tensor:
-    """A posterior that was handed in."""
-    valid = posterior.ndim == 1 and len(posterior) > 1 and bool((posterior >= 0).all())
-    if not valid or abs(float(posterior.detach().sum()) - 1) > 1e-3:
-        raise InputError(
-            f"a posterior {tuple(posterior.shape)} that adds up to {float(posterior.detach().sum()):.4g}; "
-            "expected probabilities (N+1,) that add up to 1"
-        )
-    return posterior
-
-
-def _with_rest(posterior: Tensor) -> Tensor:
-    """A posterior (N+1,) as a belief of all places: there are no others."""
-    return torch.cat([posterior[:-1], posterior.new_zeros(1), posterior[-1:]])
-
-
-def _without_rest(belief: Tensor) -> Tensor:
-    return torch.cat([belief[..., :-2], belief[..., -1:]], -1)
-
-
-def _updated(expected: Tensor, likelihood: Tensor) -> Tensor:
+def updated(expected: Tensor, likelihood: Tensor) -> Tensor:
     """Bayes' rule; if what is likely was impossible, the expectation stays."""
     joint = expected * likelihood
     total = joint.sum()
@@ -378,14 +334,28 @@ def _likely(belief: Tensor) -> range | None:
     """The stretch of a belief's places that holds most of it; None if none does."""
     on = belief[:-2]
     (likely,) = (on > UNLIKELY).nonzero(as_tuple=True)
-    if not len(likely):
-        return None
-    near = range(int(likely[0]), int(likely[-1]) + 1)
+    near = range(int(likely[0]), int(likely[-1]) + 1) if len(likely) else range(0)
     return near if float(on[near.start : near.stop].sum()) > LIKELY else None
 
 
-def _narrowed(belief: Tensor, near: range) -> Tensor:
-    """A belief of some of its places; the others join those that are not told apart."""
-    on, rest = belief[near.start : near.stop], belief[-2:].clone()
-    rest[0] += belief[:-2].sum() - on.sum()
-    return torch.cat([on, rest])
+def _logits(*probabilities: float) -> Tensor:
+    """Logarithms whose gradients are finite where a probability is 0."""
+    return torch.tensor(probabilities).clamp(min=IMPOSSIBLE).log()
+
+
+def _check_posterior(posterior: Tensor) -> None:
+    valid = posterior.ndim == 1 and len(posterior) > 1 and bool((posterior >= 0).all())
+    if not valid or abs(float(posterior.detach().sum()) - 1) > 1e-3:
+        raise InputError(
+            f"a posterior {tuple(posterior.shape)} that adds up to {float(posterior.detach().sum()):.4g}; "
+            "expected probabilities (N+1,) that add up to 1"
+        )
+
+
+def _with_rest(posterior: Tensor) -> Tensor:
+    """A posterior (N+1,) as a belief of all places: there are no others."""
+    return torch.cat([posterior[:-1], posterior.new_zeros(1), posterior[-1:]])
+
+
+def _without_rest(belief: Tensor) -> Tensor:
+    return torch.cat([belief[..., :-2], belief[..., -1:]], -1)

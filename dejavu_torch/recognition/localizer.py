@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -28,12 +29,11 @@ LISTED = 16  # numbers held for each of the best of a query, while two lists are
 class Matching(NamedTuple):
     """How queries are matched.
 
-    sequence: scores consecutive queries together; None takes each by itself.
-    lengths: each T of the sequences that are matched beside it, at the speeds of a `SequenceMatcher`.
+    sequence: scores consecutive queries together; None matches each by itself.
+    lengths: T of further sequences beside it, at the speeds of a `SequenceMatcher`.
     k: candidates of a query; None gives matches (Q,). radius: places, any two of them differ by more.
     rule: which are accepted. platt: makes probabilities; None makes none.
-    on_scores: is given the scores (B,N) that places are found by.
-    search: of single queries, see `search`.
+    on_scores: is given the scores (B,N) that places are found by. search: of single queries.
     """
 
     sequence: SequenceModel | None = None
@@ -44,12 +44,6 @@ class Matching(NamedTuple):
     platt: Platt | None = None
     on_scores: Callable[[Tensor], None] | None = None
     search: Search = "auto"
-
-    @property
-    def single(self) -> bool:
-        """Whether each query is matched by itself."""
-        sequence = self.sequence
-        return sequence is None or (isinstance(sequence, SequenceMatcher) and sequence.length == 1)
 
 
 SINGLE = Matching()  # each query by itself
@@ -72,34 +66,31 @@ class Matcher:
     """Scores of consecutive queries -> matches; keeps the state of a sequence or a filter between batches.
 
     Args:
-        matching: how. firsts: the first place of each route of the map.
-
-    Shape: scores (B,N) of the next queries -> Match of (B,) or (B,k) on the CPU, without gradients.
+        firsts: the first place of each route of the map.
 
     Convention: memory does not grow with the queries. A call that raises leaves the state as it was.
     """
 
     def __init__(self, matching: Matching = SINGLE, firsts: Sequence[int] = (0,)) -> None:
-        self.matching, self.firsts = matching, firsts
-        sequence = matching.sequence
-        speeds = sequence.speeds if isinstance(sequence, SequenceMatcher) else (1.0,)
-        self.own = sequence.length if isinstance(sequence, SequenceMatcher) else 0
+        self.matching, self.firsts, self.track = matching, firsts, Track()
+        self.own = 0  # key of the model that places are found by
+        speeds: tuple[float, ...] = (1.0,)
+        if isinstance(matching.sequence, SequenceMatcher):
+            self.own, speeds = matching.sequence.length, matching.sequence.speeds
         self.models: dict[int, SequenceModel] = {}  # by T, 0 of a filter
-        if sequence is not None:
+        if matching.sequence is not None:
             beside = {T: SequenceMatcher(T, speeds) for T in matching.lengths}
-            self.models = beside | {self.own: sequence}
-        self.states: dict[int, Tensor] = {}  # of the models, none before the first query
-        self.track = Track()
+            self.models = beside | {self.own: matching.sequence}
+        self.states: dict[int, Tensor] = {}  # of the models; none before the first query
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:
-        """Match the next queries."""
+        """Match the next queries: (B,N) -> (B,), or (B,k), on the CPU."""
         if not self.models:
             return self.matched(scores, None if self.matching.platt is None else confidence_of(scores))
         return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
 
     def _in_sequence(self, scores: Tensor) -> Match:
-        """Of so few scores that they stay in the cache."""
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
         steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
         together = steps[self.own][0]
@@ -112,15 +103,15 @@ class Matcher:
         """The best places by the scores that they are found by."""
         if self.matching.on_scores is not None:
             self.matching.on_scores(scores)
-        k, threshold = self.matching.k or 1, self.matching.rule.threshold
-        return self.answer(best_candidates(scores, k, self.matching.radius, threshold), confidence)
+        return self.answer(best_candidates(scores, self.matching.k or 1, self.matching.radius), confidence)
 
     def answer(self, match: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) as they are handed out, with the probability that the first is right."""
         matching, match = self.matching, match.map(Tensor.cpu)
+        match = match._replace(accepted=accept(match.score, matching.rule.threshold))
         if matching.platt is not None and confidence is not None:
-            probability = matching.platt.probability(confidence)[:, None]
-            probability = F.pad(probability, (0, match.index.shape[1] - 1), value=math.nan)
+            others = match.index.shape[1] - 1
+            probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)
             if matching.rule.precision is not None:
                 match = match._replace(accepted=probability >= matching.rule.precision)
             match = match.with_probability(probability)
@@ -131,10 +122,9 @@ class Localizer(Matcher):
     """Descriptors of consecutive queries -> matches on a map; keeps the state as `Matcher` does.
 
     Args:
-        route: the map. matching: how.
         find: finds the n lowest scores of queries in place of `search`, as the workers of a cluster do.
 
-    Shape: descriptors (B,K) of the next queries -> Match of (B,) or (B,k) on the CPU, without gradients.
+    Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
 
     Example:
         >>> from dejavu_torch import SpectralMapper
@@ -161,47 +151,33 @@ class Localizer(Matcher):
     def __call__(self, descriptors: Tensor) -> Match:
         if not len(descriptors):
             return self.match(descriptors.new_zeros(0, self.route.places))
-        if self.local is not None:
-            way = self._by_local_search
-        elif self.matching.sequence is None and self.matching.on_scores is None:
-            way = self._by_search
-        else:
-            way = self._by_scores
-        device = self.route.positions.device  # many descriptors are in a file
+        single = self.matching.sequence is None and self.matching.on_scores is None
+        way, device = self._by_search if single else self._by_scores, self.route.positions.device
         return Match.joined(way(part.to(device)) for part in descriptors.split(ROWS))
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
         """So many queries were left out: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
-        if not isinstance(filter, PlaceFilter):
-            return
         if self.local is not None:
             self.local.skipped += queries
-        for _ in range(queries if self.states else 0):
-            self.states = self.states | {self.own: filter.predicted(self.states[self.own])}
+        elif isinstance(filter, PlaceFilter) and self.states:
+            for _ in range(queries):
+                self.states = self.states | {0: filter.predicted(self.states[0])}
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) probabilities of each place, and of being off the map, after the latest query; None without
-        a filter, or before the first query."""
-        if self.local is not None:
-            return self.local.posterior
-        is_filter = isinstance(self.matching.sequence, PlaceFilter)
-        return self.states.get(self.own) if is_filter else None
+        """(N+1,) of a filter after the latest query; None without one, or before the first query."""
+        return self.states.get(0) if self.local is None else self.local.posterior
 
     def _by_scores(self, descriptors: Tensor) -> Match:
-        parts = descriptors.split(max(1, SCORES_AT_ONCE // max(1, self.route.places)))
-        return Match.joined(self.match(self.route.scores(part)) for part in parts)
-
-    def _by_local_search(self, descriptors: Tensor) -> Match:
-        """By a filter that rarely searches; scores of all places are made only if they are asked for."""
-        assert self.local is not None
-        near = map(self.local, descriptors.split(1))
-        if self.matching.k is not None or self.matching.on_scores is not None:
+        if self.local is not None:
+            near = map(self.local, descriptors.split(1))
+            if self.matching.k is None and self.matching.on_scores is None:
+                return self.answer(Match.joined(one.best() for one in near))
             return Match.joined(self.matched(one.row()) for one in near)
-        score, place = (torch.stack(column) for column in zip(*(one.best() for one in near), strict=True))
-        return self.answer(Match(place, score, accept(score, self.matching.rule.threshold)))
+        parts = descriptors.split(max(1, SCORES_AT_ONCE // self.route.places))
+        return Match.joined(self.match(self.route.scores(part)) for part in parts)
 
     def _by_search(self, descriptors: Tensor) -> Match:
         """By the lowest scores alone, unless they are too many."""
@@ -214,11 +190,9 @@ class Localizer(Matcher):
         few = max(1, FEW * min(route.places, route.block_places))
         if self.find is None and n > few and route.places <= SCORES_AT_ONCE:
             return self._by_scores(descriptors)
-        parts = []
+        find, parts = self.find or partial(search, route, method=matching.search), []
         for part in descriptors.split(max(1, SCORES_AT_ONCE // (LISTED * n))):
-            score, place = (
-                search(route, part, n, matching.search) if self.find is None else self.find(part, n)
-            )
-            match, *second = (best_candidates(score, *one, matching.rule.threshold, place) for one in wanted)
+            score, place = find(part, n)
+            match, *second = (best_candidates(score, *one, places=place) for one in wanted)
             parts.append(self.answer(match, *map(confidence, second)))
         return Match.joined(parts)

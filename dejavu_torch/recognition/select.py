@@ -57,25 +57,23 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
         >>> best_match(torch.tensor([[3.0, 1.0, 1.0], [2.0, 4.0, 9.0]]), threshold=2.0)
         Match(index=tensor([1, 0]), score=tensor([1., 2.]), accepted=tensor([ True, False]))
     """
-    return best_candidates(scores, 1, 0, threshold).map(lambda column: column[:, 0])
+    match = best_candidates(scores, 1, 0).map(lambda column: column[:, 0])
+    return match._replace(accepted=accept(match.score, threshold))
 
 
-def best_candidates(
-    scores: Tensor, k: int, radius: int, threshold: float | None = None, places: Tensor | None = None
-) -> Match:
+def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None = None) -> Match:
     """The best place, then again and again the best of those further than `radius` from all before.
 
     Args:
         scores: S, lower is better.
         k: how many, from 1 to N.
         radius: places, at least 0: any two candidates differ by more.
-        threshold: as of `best_match`, for each candidate.
         places: (Q,N) of the scores, if these are not all places in order.
 
     Shape: (Q,N) -> Match of (Q,k).
 
     Convention: of equal scores the first wins. If no place with a finite score is left, the place is -1 and
-        the score +inf.
+        the score +inf; all others are accepted.
 
     Raises:
         InputError: not (Q,N), or k or radius out of range.
@@ -104,7 +102,7 @@ def best_candidates(
             left = left.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
         left = left.masked_fill(~score.isfinite()[:, None], torch.inf)
     index, score = (torch.stack(column, 1) for column in zip(*found, strict=True))
-    return Match(index, score, accept(score, threshold))
+    return Match(index, score, score.isfinite())
 
 
 def check_candidates(k: int, radius: int, places: int | None = None) -> None:

@@ -79,7 +79,7 @@ def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_
     platt = Platt(1.0, 0.0)
     probability = platt.probability(confidence_of(SCORES))
     middle = float(probability.median())
-    by_score = best_candidates(SCORES, 2, 4, 0.02).accepted
+    score = best_candidates(SCORES, 2, 4).score
     for rule in (Acceptance(precision=middle), Acceptance(0.02), Acceptance()):
         match = matched(Matching(k=2, radius=4, rule=rule, platt=platt), size=7)
         assert match.probability is not None
@@ -89,7 +89,7 @@ def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_
             assert torch.equal(match.accepted[:, 0], probability >= middle)
             assert not match.accepted[:, 1].any()
         else:  # of scores, which all candidates have
-            assert match.accepted.tolist() == (by_score if rule.threshold else by_score | True).tolist()
+            assert torch.equal(match.accepted, score < (rule.threshold or math.inf))
         first = matched(Matching(rule=rule, platt=platt))
         assert same(first, match.map(lambda column: column[:, 0]))
     alone = matched(Matching(rule=Acceptance(precision=0.5)))
