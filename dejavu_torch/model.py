@@ -97,6 +97,7 @@ class DejaVu(nn.Module):
         a dynamic batch and through `torch.compile(fullgraph=True)`.
 
     Example:
+        >>> from dejavu_torch import SpectrogramAnalysis, TemplateMapper
         >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])  # two features that repeat
         >>> model = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(window=64, strongest=1))).learn(wave)
         >>> model.localize(wave[20:22]).index

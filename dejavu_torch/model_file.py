@@ -175,7 +175,7 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
         key: part for key, part in _parts(recipe).items() if key != "periods" or part.class_path in REGISTRY
     }
     arguments |= {key: build(part, nn.Module, given) for key, part in parts.items()}
-    if "periods" not in recipe.init_args or "periods" in parts:
+    if not issubclass(cls, Mapper) or "periods" not in recipe.init_args or "periods" in parts:
         return cls(**arguments)
     module: Any = cls(**arguments | {"periods": None})
     module.periods = None

@@ -326,7 +326,7 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
         ("--append f.safetensors --average wide.npy", ["wide.npy has 9 frames", "96"]),
         ("--append f.safetensors --average a.npy --average_truth 0", ["a.npy holds frames"]),
         ("--append templates.safetensors --average d.npy", ["templates.safetensors", "'templates'"]),
-        ("--append both.safetensors --average d.npy", ["both.safetensors", "'merged'"]),
+        ("--append both.safetensors --average d.npy", ["both.safetensors", "merged"]),
         ("--append f.safetensors --average d.npy --map d.npy", ["--map d.npy"]),
     ],
 )  # fmt: skip

@@ -606,7 +606,7 @@ def test_counts_follow_where_a_map_grows(tmp_path: Path) -> None:
     query = walk(3, seed=4)
     assert torch.allclose(model.map.scores(query)[:, 100:], expected.scores(query), atol=1e-5)
     append(model, route)
-    model.map.extend(route[:50])
+    model.map.extend([code_chunk(route[:50], *settings)])
     assert model.map.visits.tolist() == [[100, 1], [100, 2], [250, 1]]
     both = merge([model, learned(route, 50)], ["a", "b"])
     assert both.map.visits.tolist() == [[100, 1], [100, 2], [450, 1]]

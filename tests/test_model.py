@@ -14,12 +14,14 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from dejavu_torch import learning
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.growth import associate
 from dejavu_torch.maps.template_map import log_posterior
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -151,7 +153,7 @@ def test_features_that_spill_to_a_file_give_the_same_map(
     spilled: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain = template_model(batch_size=5).learn(pictures())
-    monkeypatch.setattr(model_module, "IN_MEMORY", spilled)
+    monkeypatch.setattr(learning, "IN_MEMORY", spilled)
     other = template_model(batch_size=5).learn(pictures())
     assert other.map.plan == plain.map.plan
     assert torch.equal(other.map.templates, plain.map.templates)
@@ -542,7 +544,7 @@ def test_large_frames_are_reduced_and_queries_follow(
         for frames in (large, large[..., ::2, ::2], nn.functional.interpolate(small, scale_factor=3)):
             assert known.localize(frames).index.tolist() == [*range(24)]
             assert known(frames).argmin(1).tolist() == [*range(24)]
-    views = model.places_shown(ArrayTraverse(large), ArrayTraverse(large))
+    views = associate(model, ArrayTraverse(large), ArrayTraverse(large))
     assert views.traverse.frame_shape == (1, 80, 160)
     caplog.clear()
     for frames in large[:3]:

@@ -147,7 +147,7 @@ def test_frames_and_places_are_one_another_where_nothing_is_resampled() -> None:
     some = torch.tensor([[0, 4], [-1, 2]])
     assert torch.equal(route.frame_of(some), some)
     assert torch.equal(route.place_of(some), some)
-    assert route.borders.tolist() == list(range(route.places + 1))
+    assert route.table.borders.tolist() == list(range(route.places + 1))
     with refused("frame 5", "0 to 4"):
         route.place_of(torch.tensor([5]))
 
@@ -159,7 +159,7 @@ def test_the_one_table_between_frames_and_places() -> None:
     route.check()
     assert route.frame_of(torch.arange(-1, 4)).tolist() == [-1, 0, 1, 2, 5]
     assert route.place_of(torch.tensor([-1, 0, 2, 3, 4, 5])).tolist() == [-1, 0, 2, 2, 2, 3]
-    assert route.borders.tolist() == [0, 1, 2, 5, 6]
+    assert route.table.borders.tolist() == [0, 1, 2, 5, 6]
     route.positions = torch.tensor([0.0, 1.0])
     with refused("positions of 2 places", "expected 4"):
         route.check()

@@ -15,6 +15,7 @@ from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.views import AugmentedTraverse, Views
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.growth import second_traverse
 from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
 from dejavu_torch.types import Traverse
 
@@ -54,7 +55,7 @@ def test_two_runs_give_the_same_map(model: DejaVu, reference: Traverse) -> None:
     again, other = spectral().learn(reference), spectral(seed=1).learn(reference)
     states = [one.state_dict() for one in (model, again, other)]
     assert torch.equal(states[0]["whitening.projection"], states[1]["whitening.projection"])
-    for name in ("map.counts", "map.feature", "map.level"):
+    for name in ("map.streams", "map.steps", "map.means"):
         assert torch.equal(states[0][name], states[1][name])
     assert not torch.equal(states[0]["whitening.projection"], states[2]["whitening.projection"])
 
@@ -65,7 +66,7 @@ def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Tra
     descriptors = model.whitened(model.describe(frames))
     assert torch.allclose(model.map.scores(descriptors), scores)
     assert torch.equal(model.localize_descriptors(descriptors).index, scores.argmin(1))
-    assert torch.allclose(next(model.extract(ArrayTraverse(frames, "eight"))), descriptors)
+    assert torch.allclose(next(model.describer.descriptors(ArrayTraverse(frames, "eight"))), descriptors)
 
 
 def test_gradients_reach_the_frames(model: DejaVu, second: Traverse) -> None:
@@ -120,16 +121,16 @@ def test_wide_descriptors_reduce_the_route_they_are_of_alone() -> None:
 
 def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> None:
     model = spectral()
-    views = model.views(reference, second)
+    views = second_traverse(model, reference, second)
     assert views.traverse is second
     assert (views.places - torch.arange(FRAMES)).abs().max() <= 2  # by the positions that both carry
-    assert model.views(reference, second, "290").places.tolist() == [*range(290, 300), *[-1] * 290]
+    assert second_traverse(model, reference, second, "290").places.tolist() == [*range(290, 300), *[-1] * 290]
     plain = ArrayTraverse(torch.rand(FRAMES, 1, 9, 9), "plain"), ArrayTraverse(torch.rand(9, 1, 9, 9), "few")
-    assert model.views(plain[0], plain[0]).places.tolist() == list(range(FRAMES))
+    assert second_traverse(model, plain[0], plain[0]).places.tolist() == list(range(FRAMES))
     with refused("few has 9 frames", "plain 300", "a truth that says"):
-        model.views(*plain)
+        second_traverse(model, *plain)
     with refused("no whitening", "few"):
-        DejaVu(whitening="none").views(*plain, "0")
+        second_traverse(DejaVu(whitening="none"), *plain, "0")
     with refused("no whitening", "few"):
         DejaVu(whitening="none").learn(plain[0], second=Views(plain[1], torch.arange(9)))
 
@@ -253,7 +254,7 @@ def test_the_variance_that_a_map_of_ready_features_holds() -> None:
     places, _ = isolated()
     model = DejaVu().learn(places)
     assert model.whitening is not None
-    described, rebuilt = model.whitening(places), model.map.rebuilt(0)  # type: ignore[operator]
+    described, rebuilt = model.whitening(places), model.map.decode(0)  # type: ignore[operator]
     error = (described - rebuilt).square().sum() / (described - described.mean(0)).square().sum()
     assert 1 - error == pytest.approx(0.85, abs=0.01)
     assert DejaVu(whitening="none").learn(places[:, :200]).map.dimension == 200  # as they are

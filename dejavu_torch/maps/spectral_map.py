@@ -577,14 +577,16 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
 
     Shape: (Q,K) -> (Q,S).
 
-    Convention: by a CSR product of MKL, made for the call, where that is fastest; it neither compiles nor
-        exports. By `scatter_add` elsewhere.
+    Convention: on a CPU with MKL by a CSR product, made for the call, since it neither compiles nor exports;
+        elsewhere, and of tensors that are traced, by `scatter_add`. No autocast.
     """
-    if not torch.compiler.is_compiling() and queries.device.type == "cpu" and _has_csr():
+    plain = type(queries) is Tensor and queries.device.type == "cpu"
+    if plain and not torch.compiler.is_compiling() and _has_csr():
         crow = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
         shape = (len(counts), queries.shape[1])
         rows = torch.sparse_csr_tensor(crow, feature.int(), level.to(queries), shape, check_invariants=False)
-        products: Tensor = rows @ queries.T
+        with torch.autocast("cpu", enabled=False):
+            products: Tensor = rows @ queries.T
         return products.T.contiguous()
     terms = queries.index_select(1, feature.int()) * level.to(queries)
     row = _rows(counts, level.shape[0])

@@ -20,7 +20,7 @@ def waves(places: int = 240) -> Tensor:
 
 @pytest.mark.parametrize("transform", ["dft", "dct"])
 @pytest.mark.parametrize("metric", ["cosine", "l2"])
-@pytest.mark.parametrize("chunk", ["route", 70])
+@pytest.mark.parametrize("chunk", [10_000, 70])
 def test_the_sum_of_all_periods_is_the_map_s_score(transform: str, metric: str, chunk: object) -> None:
     torch.manual_seed(0)
     route = SpectralMapper(None, 0.5, chunk, transform, metric)(waves() + 0.3 * torch.randn(240, 4) + 1)  # type: ignore[arg-type]

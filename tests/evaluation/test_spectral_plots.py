@@ -36,7 +36,7 @@ def route(seed: int) -> Tensor:
     return (angle + 0.7).sin() * torch.tensor([3.5, 2, 3, 4, 5, 0.1]) + 0.1 * noise
 
 
-def localized(chunk: int | str = "route", scored: bool = True) -> Localization:
+def localized(chunk: int = 10_000, scored: bool = True) -> Localization:
     model = DejaVu(whitening="none", mapper=SpectralMapper(None, 1.0, chunk)).learn(route(0))  # type: ignore[arg-type]
     truth = as_ground_truth(offset_truth(PLACES, PLACES)) if scored else None
     match = model.localize(route(1))
@@ -49,7 +49,7 @@ def map_of(run: Localization) -> SpectralMap:
     return run.model.map
 
 
-@pytest.mark.parametrize("chunk", ["route", 150])
+@pytest.mark.parametrize("chunk", [10_000, 150])
 def test_the_lines_that_are_marked_are_those_of_the_map(chunk: int | str) -> None:
     run = localized(chunk)
     held = map_of(run)

@@ -119,7 +119,7 @@ def test_descriptors_of_tiles_are_those_of_the_frames(tiled: tuple[DejaVu, dict[
 
 def test_a_step_holds_the_share_that_is_asked_for() -> None:
     route = smooth(2000, 32)
-    for chunk in ("route", 500):
+    for chunk in (10_000, 500):
         step = step_that_holds(0.8, ArrayTraverse(route), chunk)  # type: ignore[arg-type]
         kept = SpectralMapper(None, step=step, chunk=chunk)(route)  # type: ignore[arg-type]
         back = torch.cat([kept.rebuilt(g) for g in range(len(kept.chunks))])
@@ -157,7 +157,7 @@ def test_an_index_finds_the_nearest_and_tells_its_bytes(factory: str, tmp_path: 
 
 def test_a_null_tells_the_frames_that_it_shuffled(tmp_path: Path) -> None:
     route = smooth(600, 16)
-    null = Mapped(8.0, "route", shuffled=True)
+    null = Mapped(8.0, 10_000, shuffled=True)
     null.learn(ArrayTraverse(route), tmp_path / "kept")
     found = null.load(tmp_path / "kept", "cpu").find(route[::20])
     assert ((found.place - torch.arange(0, 600, 20)).abs() <= 5).double().mean() > 0.9

@@ -14,6 +14,7 @@ from torch import Tensor
 from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
 from dejavu_torch.maps import layer_search, template_map
 from dejavu_torch.maps.layer_search import _circles, lowest, sliding_minimum
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
 
@@ -118,7 +119,7 @@ def test_localize_takes_it_and_gives_what_the_scan_gives() -> None:
     assert model.localize(queries).accepted.sum() == 1
     # everything that needs other scores makes them
     seen: list[tuple[int, ...]] = []
-    list(model.matches_of([queries], look=lambda scores: seen.append(tuple(scores.shape))))
+    model.found(queries, Matching(on_scores=lambda scores: seen.append(tuple(scores.shape))))
     assert seen == [(3, 60_000)]
     assert torch.equal(model.candidates(queries, k=2).index[:, 0], found.index)
     assert model.localize(queries, sequence=SequenceMatcher(1)).index.tolist() == found.index.tolist()

@@ -103,7 +103,7 @@ def test_positions_count_in_the_budget_of_a_map() -> None:
     assert taken == 4 * len(REFERENCE)
     assert 0.98 * 12 <= summary.route_bytes / 101 <= 12
     # a null has no positions, nor their bytes
-    null = model.map.mapper_of_equal_size()(torch.randn(101, model.map.dimension)).summary()
+    null = SpectralMapper.of_equal_size(model.map)(torch.randn(101, model.map.dimension)).summary()
     assert null.route_bytes == pytest.approx(summary.route_bytes - taken, rel=0.03)
 
 
@@ -120,8 +120,8 @@ def test_the_map_has_the_table_of_the_traverse(model: DejaVu) -> None:
     frames = torch.arange(len(REFERENCE))
     assert torch.equal(model.map.positions, even.positions)
     assert torch.equal(model.map.frame_of(torch.arange(101)), even.frame)
-    assert torch.equal(model.map.borders[:-1], even.frame)
-    assert int(model.map.borders[-1]) == len(REFERENCE)
+    assert torch.equal(model.map.table.borders[:-1], even.frame)
+    assert int(model.map.table.borders[-1]) == len(REFERENCE)
     assert torch.equal(model.map.place_of(frames), place_of(even.positions, frames))
 
 

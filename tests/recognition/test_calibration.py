@@ -200,8 +200,8 @@ def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.Mon
     seen: list[Tensor] = []
     views = Views(as_traverse(route + 0.2 * torch.randn_like(route)), torch.arange(2000))
     model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(route)
-    monkeypatch.setattr("dejavu_torch.model.LONGEST_TRIAL", 20)
-    monkeypatch.setattr("dejavu_torch.model.CALIBRATION_SCORES", 400 * 2000)
+    monkeypatch.setattr("dejavu_torch.learning.LONGEST_SEGMENT", 20)
+    monkeypatch.setattr("dejavu_torch.learning.CALIBRATION_SCORES", 400 * 2000)
 
     def noted(route: object, trials: Iterable[Trial], another: bool) -> Calibration:
         seen.extend(trial.places for trial in trials)

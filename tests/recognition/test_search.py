@@ -39,14 +39,14 @@ class Scored(PlaceMap):
 
     def __init__(self, table: Tensor, size: int) -> None:
         super().__init__(table.shape[1], 1)
-        self.table, self.size, self.batches = table, size, list[int]()
+        self.rows, self.size, self.batches = table, size, list[int]()
 
     @property
     def block_places(self) -> int:
         return self.size
 
     def scores(self, queries: Tensor) -> Tensor:
-        return self.table[queries[:, 0].long()]
+        return self.rows[queries[:, 0].long()]
 
     def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> Any:
         self.batches.append(len(queries))
@@ -56,7 +56,7 @@ class Scored(PlaceMap):
 
 
 def rows_of(route: Scored) -> Tensor:
-    return torch.arange(float(len(route.table)))[:, None]
+    return torch.arange(float(len(route.rows)))[:, None]
 
 
 def table(rows: int, places: int, values: int, seed: int) -> Tensor:
@@ -136,7 +136,7 @@ def test_many_of_the_best_are_taken_from_all_scores(monkeypatch: pytest.MonkeyPa
     route = Scored(torch.rand(21, 2000), 1000)
     for k, radius, batches in ((3, 5, [21]), (6, 100, [])):
         found = Localizer(route, Matching(k=k, radius=radius))(rows_of(route))
-        assert torch.equal(found.index, best_candidates(route.table, k, radius).index)
+        assert torch.equal(found.index, best_candidates(route.rows, k, radius).index)
         assert route.batches == batches
         route.batches.clear()
     monkeypatch.setattr(localizer, "SCORES_AT_ONCE", 8 * localizer.LISTED * (2 * (2 * 5 + 1) + 1))

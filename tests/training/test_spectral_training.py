@@ -55,7 +55,7 @@ class Plain(SpectralMapper):
 
 def levels(model: DejaVu) -> torch.Tensor:
     assert isinstance(model.map, SpectralMap)
-    return model.map.levels
+    return model.map.level
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_the_descriptor_is_that_of_a_training_with_a_code(tmp_path: Path) -> Non
 def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path: Path) -> None:
     model = fit(tmp_path, spectral(), data_of(), max_steps=3, **EVERY)
     features = model.extract_all(ArrayTraverse(footage()))
-    assert torch.equal(levels(model), SpectralMapper(20.0)(features).levels)
+    assert torch.equal(levels(model), SpectralMapper(20.0)(features).level)
 
 
 def test_making_a_map_changes_nothing_and_gives_the_same_again(tmp_path: Path) -> None:
