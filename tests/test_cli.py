@@ -475,7 +475,11 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     ),
     "learn a.npy --map m.safetensors --whitening.bits 5": ("shrinkage=null", "bits=5"),
     "learn a.npy --map m.safetensors --mapper HOG": ("--mapper is HOG", "Mapper"),
-    "learn a.npy --map m.safetensors --mapper.chunk some": ("--mapper.chunk is some", "integer or route"),
+    "learn a.npy --map m.safetensors --mapper.chunk some": (
+        "--mapper.chunk is some",
+        "number of places",
+        "10000",
+    ),
     "learn a.npy --map m.safetensors --config local_maxima --mapper.periods Foo": (
         "--mapper.periods is Foo",
     ),
@@ -654,7 +658,11 @@ def test_missing_config(
         ("mapper: [\n", "bad.yaml"),
         ("batch_size: many\n", "many"),
         ("batch_size: 0\n", "batch_size is 0"),
-        (f"mapper: {MAPPER}metric: manhattan}}}}\n", "'manhattan'"),
+        (f"mapper: {MAPPER}metric: manhattan}}}}\n", "manhattan"),
+        (
+            "mapper: {class_path: SpectralMapper, init_args: {chunk: route}}\n",
+            "a number of places, such as 10000",
+        ),
     ],
 )
 def test_bad_config(text: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -96,7 +96,6 @@ def test_calibration_of_the_new_places(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("d.npy --append whole.safetensors", ["whole.safetensors: ", "whole route", "--mapper.chunk 1024"]),
         ("d.npy --append templates.safetensors", ["templates.safetensors", "'templates'", "'spectral'"]),
         ("d.npy --append absent.safetensors", ["absent.safetensors"]),
         ("d.npy --append a.npy", ["a.npy", "no map file"]),

@@ -24,7 +24,7 @@ from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features import views
 from dejavu_torch.maps.file import read_map
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 
 ROUTE = "sim:aerial?frames=96"
 SECOND = "sim:aerial?frames=96&traverse=1"

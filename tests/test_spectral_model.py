@@ -16,7 +16,8 @@ from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.views import AugmentedTraverse, Views
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import second_traverse
-from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.types import Traverse
 
 FRAMES = 300

@@ -252,9 +252,8 @@ class SpectralMap(PlaceMap):
     def _coded_levels(self, chunk: int) -> Stream:
         line, feature, _ = self.lines(chunk)
         small, _ = to_int8(self.level[self._inside(chunk)].to(torch.int32))
-        start, stop = self.chunks[chunk]
-        levels = small.new_zeros(stop - start, self.dimension).index_put((line, feature), small)
-        return encode(levels)
+        levels = small.new_zeros(self._length(chunk), self.dimension)
+        return encode(levels.index_put((line, feature), small))
 
     def _add_streams(self, streams: Sequence[Stream]) -> None:
         table = self.stream_table.new_tensor([[len(one.bytes), one.checksum] for one in streams])
@@ -360,6 +359,13 @@ class SpectralMap(PlaceMap):
         return Lines(
             _rows(self.counts[start:stop], len(level)), self.feature[some].long(), level * self.steps[chunk]
         )
+
+    @property
+    def levels(self) -> Tensor:
+        """(N,K), rows [start, stop) the lines of that chunk, in steps, zeros too: as large as the route."""
+        line = _rows(self.counts, len(self.level))
+        levels = self.level.new_zeros(self.places, self.dimension)
+        return levels.index_put((line, self.feature.long()), self.level)
 
     def _inside(self, chunk: int) -> slice:
         return slice(self._bounds[chunk], self._bounds[chunk + 1])
@@ -644,8 +650,8 @@ def check_sizes(places: int, coefficients: int = 0) -> None:
     """
     if max(places, coefficients) > LARGEST:
         raise InputError(
-            f"the map has {places} places and {coefficients} coefficients; expected at most {LARGEST} of each: "
-            "make several maps"
+            f"the map has {places} places and {coefficients} coefficients; expected at most {LARGEST} of "
+            "each: make several maps"
         )
 
 
@@ -661,8 +667,8 @@ def check_settings(metric: str, transform: str, chunk: int, resolution: float) -
         raise InputError(f"transform {transform!r} is unknown; expected 'dft' or 'dct'")
     if not isinstance(chunk, int) or isinstance(chunk, bool) or chunk < 2:
         raise InputError(
-            f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000; a larger one than the "
-            "route makes one chunk"
+            f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000; one larger than "
+            "the route makes one chunk"
         )
     if not 0 <= resolution < math.inf:
         raise InputError(f"resolution is {resolution}; expected a number of places, 0 or more")

@@ -24,7 +24,8 @@ from dejavu_torch.evaluation.pictures import (
 )
 from dejavu_torch.evaluation.report import PICTURES
 from dejavu_torch.evaluation.score_plots import Stored
-from dejavu_torch.maps.spectral import SpectralMap, SpectralMapper
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of
 
 PLACES = 240

@@ -22,7 +22,7 @@ from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.experiments.compare import compare
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.maps.distance import phase_distances
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import FrequencyLayer, Training, Traverse
 

@@ -122,7 +122,7 @@ def test_a_step_holds_the_share_that_is_asked_for() -> None:
     for chunk in (10_000, 500):
         step = step_that_holds(0.8, ArrayTraverse(route), chunk)  # type: ignore[arg-type]
         kept = SpectralMapper(None, step=step, chunk=chunk)(route)  # type: ignore[arg-type]
-        back = torch.cat([kept.rebuilt(g) for g in range(len(kept.chunks))])
+        back = torch.cat([kept.decode(g) for g in range(len(kept.chunks))])
         lost = (back - route).square().sum() / (route - route.mean(0)).square().sum()
         assert float(lost) == pytest.approx(0.2, abs=0.02)
 

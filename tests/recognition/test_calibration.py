@@ -207,7 +207,7 @@ def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.Mon
         seen.extend(trial.places for trial in trials)
         return NEVER
 
-    monkeypatch.setattr("dejavu_torch.model.calibrated", noted)
+    monkeypatch.setattr("dejavu_torch.learning.calibrated", noted)
     model.calibrate(None, views)
     starts = torch.stack(seen)[:, 0]
     assert len(seen) == 20

@@ -34,7 +34,7 @@ from dejavu_torch.evaluation.baselines import baselines_of
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.training.export import LastCheckpoint
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.stages import CodeStage, DescriptorStage, WhiteningStage

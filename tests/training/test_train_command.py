@@ -25,7 +25,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.file import read_map
-from dejavu_torch.maps.spectral import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 
 
 def figures(path: Path) -> dict[str, list[float]]:
