@@ -130,7 +130,8 @@ def test_the_command_begins_again_once_and_then_gives_up(
         np.save(path, ALIKE.numpy())
     source = str(paths[0]) if routes == 1 else f"[{','.join(map(str, paths))}]"
     words = ["fit", "--config", "train.yaml", "--data.source", source, "--model.mapper", "SpectralMapper"]
-    words += ["--trainer.max_steps", STEPS, "--trainer.limit_val_batches", 0, "--model.lr", 0.003, "--seed_everything", 2]
+    words += ["--trainer.max_steps", STEPS, "--trainer.limit_val_batches", 0, "--model.lr", 0.003]
+    words += ["--seed_everything", 2]
     words += ["--trainer.default_root_dir", tmp_path / "run"]
     with pytest.raises(SystemExit) as stop:
         main(["train", *map(str, words)])
