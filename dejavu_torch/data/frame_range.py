@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST
+from dejavu_torch.data.selection import Selection
 from dejavu_torch.types import InputError, Traverse
 
 
@@ -35,7 +36,7 @@ class IndexedTraverse(Traverse):
             yield self.read(there[first : first + size])
 
 
-class FrameRange(Traverse):
+class FrameRange(Selection):
     """The frames [start, stop) of a traverse, every step-th of them; names and positions follow.
 
     Args:
@@ -57,6 +58,8 @@ class FrameRange(Traverse):
         (3, tensor([1., 3., 5.]))
     """
 
+    frame: range
+
     def __init__(self, traverse: Traverse, start: int = 0, stop: int = 0, step: int = 1) -> None:
         length = traverse.length
         stops = stop == 0 or start < stop
@@ -67,47 +70,23 @@ class FrameRange(Traverse):
             part = f"a part of its {'' if length is None else f'{length} '}frames"
             expected = "a step of at least 1" if step < 1 else part
             raise InputError(f"{traverse.name}: {told}; expected {expected}")
-        self.traverse = traverse
         end = stop or length or LARGEST
-        self.frames = range(
-            start, end, min(step, max(1, end - start))
-        )  # a longer one takes one frame as well
+        # a longer step takes one frame as well
+        super().__init__(traverse, range(start, end, min(step, max(1, end - start))))
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
-        if length is not None:
-            self.length = len(self.frames)
-        self.seeks, self.sized = traverse.seeks, traverse.sized
-        if traverse.place is not None:
-            self.place = traverse.place[start : stop or None : self.frames.step].contiguous()
+        if length is None:
+            self.length = None
         if traverse.cut is not None:
-            self.cut = traverse.cut[0], traverse.cut[1][start : stop or None : self.frames.step]
-        self._least = len(self.frames) if stop else 1
+            self.cut = traverse.cut[0], traverse.cut[1][start : stop or None : self.frame.step]
+        self._least = len(self.frame) if stop else 1
 
     def batches(self, size: int) -> Iterator[Tensor]:
         count = 0
-        for batch in self.traverse.select(self.frames, size):
+        for batch in super().batches(size):
             count += len(batch)
             yield batch
         if count < self._least:
             raise InputError(f"{self.name} holds {count} frames; expected {self._least} or more")
 
-    def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        part = self.frames[start:stop]
-        if part:
-            yield from self.traverse.select(part, self.batch_size())
-
-    @property
-    def frame_shape(self) -> tuple[int, ...]:
-        return self.traverse.frame_shape
-
     def identity(self) -> str:
-        return f"{self.frames} of {self.traverse.identity()}"
-
-    def state(self, start: int, stop: int) -> str:
-        part = self.frames[start:stop]
-        return self.traverse.state(part[0], part[-1] + 1) if part else ""
-
-    def frame_name(self, i: int) -> str:
-        return self.traverse.frame_name(self.frames[i])
-
-    def frame_time(self, i: int) -> float:
-        return self.traverse.frame_time(self.frames[i])
+        return f"{self.frame} of {self.traverse.identity()}"

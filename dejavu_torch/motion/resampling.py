@@ -6,11 +6,11 @@ import logging
 from collections.abc import Iterator
 from hashlib import blake2b
 
-import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.positions import NEAR, shown_frames
+from dejavu_torch.data.selection import Selection, picked
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
@@ -20,23 +20,21 @@ MOST = 20  # steps a frame, on average
 DOUBTFUL = 0.2  # steps backwards for each one forward
 
 
-class ResampledTraverse(Traverse):
+class ResampledTraverse(Selection):
     """The frames of another traverse, resampled by distance: at even steps along the ground.
 
-    The other traverse is read through once to measure the distances, and again each time the frames are asked
-    for.
+    The other traverse is read once to measure the distances, and again each time the frames are asked for.
 
     Args:
         traverse: frames, in order.
-        odometry: measures the ground, and says the step.
+        odometry: measures the ground, and has the default of the step.
         batch_size: frames in memory at a time while measuring.
         step: pixels of ground, in place of the odometry's; as for the queries of a map.
         progress: show a progress bar on a terminal.
 
     Shape: frames (M,C,H,W). positions: (F,) float32, how many steps each frame of the other traverse lies
         from the first. frame: (M,) int64, the frame of the other traverse nearest to each step, which is
-        shown. place: (M,) float64, the other traverse's place of it, None where it has none. step: pixels of
-        ground.
+        shown. place: (M,) float64, its place, None if unknown. step: pixels of ground.
 
     Convention: distances count from frame 0, in the direction in which the camera gets further from it. Each
         step is taken where it is first reached: standing, and going back and forth, add no frames.
@@ -47,6 +45,8 @@ class ResampledTraverse(Traverse):
     """
 
     length: int
+    frame: Tensor
+    skips = False  # gaps are short
 
     def __init__(
         self,
@@ -56,63 +56,31 @@ class ResampledTraverse(Traverse):
         step: float | None = None,
         progress: bool = False,
     ) -> None:
-        self.traverse, self.odometry, self.name = traverse, odometry, traverse.name
-        self.seeks = traverse.seeks
+        self.odometry = odometry
         distance = odometry.distances(traverse, batch_size, progress).distance
         if -distance.min() > distance.max():  # a camera that looks back
             distance = -distance
         moved, frames = distance.diff(), len(distance)
         if not moved.any():
-            raise InputError(f"{self.name} stands still in all of its {frames} frames; expected motion")
+            raise InputError(f"{traverse.name} stands still in all of its {frames} frames; expected motion")
+        _warn_doubtful(moved, traverse.name)
         step = odometry.step if step is None else step
         self.step = float(moved.abs()[moved != 0].median()) if step is None else float(step)
-        _warn_doubtful(moved, self.name)
         self.positions = (distance / self.step).float()
-        most = float(self.positions.max())
-        if not 1 <= most + NEAR < MOST * frames:
+        if not 1 <= float(self.positions.max()) + NEAR < MOST * frames:
             raise InputError(
-                f"{self.name} moves by {float(distance.max()):.3g} pixels of ground in {frames} frames; "
+                f"{traverse.name} moves by {float(distance.max()):.3g} pixels of ground in {frames} frames; "
                 f"expected at least one step, {self.step:g}, and at most {MOST} a frame"
             )
-        self.frame = shown_frames(self.positions)
-        self.length = len(self.frame)
-        if traverse.place is not None:
-            self.place = traverse.place.double()[self.frame]
+        super().__init__(traverse, shown_frames(self.positions))
+        self.place = None if self.place is None else self.place.double()
 
     def identity(self) -> str:
         digest = blake2b(self.positions.numpy().tobytes(), digest_size=8).hexdigest()
         return f"{self.traverse.identity()} at steps {digest}"
 
-    def state(self, start: int, stop: int) -> str:
-        frames = self.frame[start:stop]
-        return self.traverse.state(int(frames[0]), int(frames[-1]) + 1) if len(frames) else ""
-
-    def frame_name(self, i: int) -> str:
-        return self.traverse.frame_name(int(self.frame[i]))
-
-    @property
-    def frame_shape(self) -> tuple[int, ...]:
-        return self.traverse.frame_shape
-
     def batches(self, size: int) -> Iterator[Tensor]:
-        yield from _shown(self.traverse.batches(size), 0, self.frame, size)
-
-    def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        frames = self.frame[start:stop]
-        if len(frames):
-            first, last = int(frames[0]), int(frames[-1])
-            yield from _shown(self.traverse.between(first, last + 1), first, frames, self.batch_size())
-
-
-def _shown(batches: Iterator[Tensor], first: int, frames: Tensor, size: int) -> Iterator[Tensor]:
-    """The frames of these numbers, never decreasing, out of batches that begin with frame `first`."""
-    for batch in batches:
-        ready = int(torch.searchsorted(frames, first + len(batch)))
-        for part in frames[:ready].split(size) if ready else ():
-            yield batch[part - first]
-        first, frames = first + len(batch), frames[ready:]
-        if not len(frames):
-            return
+        return picked(self.traverse.batches(size), range(len(self.positions)), self.frame, size)
 
 
 def _warn_doubtful(moved: Tensor, name: str) -> None:
