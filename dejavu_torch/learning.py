@@ -423,13 +423,18 @@ class Checkpoint:
         if self.path.exists():
             self._refuse()
 
-    def save(self, route: SpectralMap, whitening: Whitening | None, now: bool = False) -> None:
-        """Write the partial map, if there is one, and it is time to.
+    @property
+    def due(self) -> bool:
+        """Whether the partial map was last written over `SAVED` seconds ago."""
+        return monotonic() - self.written > SAVED
+
+    def save(self, route: SpectralMap, whitening: Whitening | None) -> None:
+        """Write the partial map, if it has places.
 
         Raises:
             InputError: the system refuses it; what was there before stays.
         """
-        if not route.places or not (now or monotonic() - self.written > SAVED):
+        if not route.places:
             return
         tensors = {f"map.{name}": tensor for name, tensor in route.packed().items()}
         if whitening is not None:
@@ -570,16 +575,26 @@ def extend(
     """
     if len(route.chunks) == coder.total:  # as after a kill at the end
         return
+    held: list[Chunk] = []
+
+    def add() -> None:
+        route.extend(held)
+        held.clear()
+        if checkpoint is not None:
+            checkpoint.save(route, coder.describer.whitening)
+
     try:
         for chunk in code(coder, traverse, len(route.chunks), progress):
-            route.extend([chunk])
-            if checkpoint is not None:
-                checkpoint.save(route, coder.describer.whitening, now=route.places == coder.frames)
+            held.append(chunk)
+            # short chunks together, since the map grows by copies
+            if sum(one.places for one in held) >= SAMPLE or (checkpoint is not None and checkpoint.due):
+                add()
+        add()
     except InputError as error:
         if checkpoint is None:
             raise
         with suppress(InputError):  # as on a full disk
-            checkpoint.save(route, coder.describer.whitening, now=True)
+            add()
         if not checkpoint.kept:
             raise
         kept = f"{checkpoint.kept} of {coder.frames} places are kept in {checkpoint.path} for the next run"

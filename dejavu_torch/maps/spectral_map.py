@@ -188,7 +188,7 @@ class SpectralMap(PlaceMap):
         self._encode()
         decoded = [self._decoded(chunk) for chunk in chunks]
         self._add(decoded, [chunk.places for chunk in chunks], [chunk.step for chunk in chunks])
-        self._add_streams([chunk.stream for chunk in chunks])
+        self._add_streams([chunk.stream for chunk in chunks], [chunk.escapes for chunk in chunks])
         self._check_norms()
         self.energy += sum(chunk.energy for chunk in chunks)
         self.error += sum(chunk.error for chunk in chunks)
@@ -247,20 +247,20 @@ class SpectralMap(PlaceMap):
         """Bring the streams up to date with the coefficients."""
         first = len(self.stream_table)
         if first < len(self.chunks):
-            self._add_streams([self._coded_levels(g) for g in range(first, len(self.chunks))])
+            streams, escapes = zip(*map(self._coded_levels, range(first, len(self.chunks))), strict=True)
+            self._add_streams(streams, escapes)
 
-    def _coded_levels(self, chunk: int) -> Stream:
+    def _coded_levels(self, chunk: int) -> tuple[Stream, Tensor]:
         line, feature, _ = self.lines(chunk)
-        small, _ = to_int8(self.level[self._inside(chunk)].to(torch.int32))
+        small, escapes = to_int8(self.level[self._inside(chunk)].to(torch.int32))
         levels = small.new_zeros(self._length(chunk), self.dimension)
-        return encode(levels.index_put((line, feature), small))
+        return encode(levels.index_put((line, feature), small)), escapes
 
-    def _add_streams(self, streams: Sequence[Stream]) -> None:
+    def _add_streams(self, streams: Sequence[Stream], escapes: Sequence[Tensor]) -> None:
         table = self.stream_table.new_tensor([[len(one.bytes), one.checksum] for one in streams])
         self.stream_table = torch.cat([self.stream_table, table])
         self.streams = torch.cat([self.streams, *(one.bytes.to(self.streams.device) for one in streams)])
-        large = self.level[self.level.to(torch.int32).abs() > 127]
-        self.escapes = large.to(torch.int32)
+        self.escapes = torch.cat([self.escapes, *(one.to(self.escapes) for one in escapes)])
 
     def coded(self) -> list[Chunk]:
         """The chunks as a file holds them: what `extend` takes."""
