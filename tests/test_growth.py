@@ -33,6 +33,7 @@ from dejavu_torch.maps.mapfile import read_map, write_map
 from dejavu_torch.maps.merged import MergedMap
 from dejavu_torch.maps.spectral import SpectralMap, code_chunk
 from dejavu_torch.recognition.calibration import Calibration, Platt
+from dejavu_torch.resize import resize_frames
 from dejavu_torch.streaming import coder
 from dejavu_torch.types import Traverse
 
@@ -148,7 +149,8 @@ def test_names_follow_and_parts_without_names_stay_without() -> None:
 
 
 def test_a_calibration_goes_and_comes_again_from_the_new_places() -> None:
-    frames = torch.rand(120, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    coarse = torch.rand(120, 1, 6, 6, generator=torch.Generator().manual_seed(0))
+    frames = resize_frames(coarse, (32, 32))  # smooth, so that a changed frame still shows its place
     mapper = SpectralMapper(40.0, chunk=20)
     model = DejaVu(HOG(resize=(32, 32)), "none", mapper, precision=0.9).learn(frames[:80])
     model.calibrate(frames[:80])
