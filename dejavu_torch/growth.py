@@ -91,7 +91,7 @@ def append(
     part, found = SpectralMap(route.means, **route.settings(), step=route.step), None
     if checkpoint is not None:
         sums = checksums(route.packed(), route.get_extra_state())
-        found = checkpoint.open(run_key(model, added, visits=visits) | digests(map=sums))
+        found = checkpoint.open(run_key(model, added, visits=visits) | digests(map=sums), added)
     if found is not None:
         part.load_packed({name[4:]: t for name, t in found[0].items() if name[:4] == "map."}, found[1]["map"])
     visits = visits and model.describer.read_anywhere(visits, text)
@@ -105,7 +105,7 @@ def append(
     frames = len(positions) or places
     names = [model.frame_names, names_of(source_of(added), frames)]
     model.frame_names = _joined_names(names, [route.table.frames, frames])
-    model.map, model.calibration = grown, None
+    model.map, model.find, model.calibration = grown, None, None
     return model.eval()
 
 
@@ -184,7 +184,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     made.positions = route.positions
     made.count_visits((counts + seen).to(route.visits.device))
     made.check()
-    model.map, model.calibration = made, None
+    model.map, model.find, model.calibration = made, None, None
     model.eval()
     return int((seen > 0).sum())
 

@@ -384,8 +384,8 @@ class Checkpoint:
 
     Args:
         path: of the map; the partial one is `FILE.part` beside it.
-        key: digests of all that the chunks are made of, by what it is. A source that was changed in between
-            is recognised by its name, frames and settings alone.
+        key: digests of all that the chunks are made of, by what it is. Of the source only the files of
+            finished chunks have to be as they were: one that cannot be read may be replaced.
     """
 
     def __init__(self, path: Path) -> None:
@@ -394,11 +394,13 @@ class Checkpoint:
         self.written, self.kept = monotonic(), 0
         self.opened = False
 
-    def open(self, key: Mapping[str, str]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-        """What the run of this key has finished, tensors and state; None if nothing.
+    def open(
+        self, key: Mapping[str, str], traverse: Traverse
+    ) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+        """What the run of this key has finished of a traverse, tensors and state; None if nothing.
 
         Raises:
-            InputError: the file is of a run with another key, or of none.
+            InputError: the file is of a run with another key, or of none, or finished frames were changed.
         """
         self.key, self.opened, found = key, True, None
         if self.path.exists():
@@ -411,6 +413,8 @@ class Checkpoint:
             if known != key:
                 other = [name for name in {**key, **known} if key.get(name) != known.get(name)]
                 self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
+            if state["seen"] != traverse.state(0, state["map"]["places"]):
+                self._refuse(": frames of its source were changed")
             found = tensors, state
         return found
 
@@ -428,8 +432,8 @@ class Checkpoint:
         """Whether the partial map was last written over `SAVED` seconds ago."""
         return monotonic() - self.written > SAVED
 
-    def save(self, route: SpectralMap, whitening: Whitening | None) -> None:
-        """Write the partial map, if it has places.
+    def save(self, route: SpectralMap, whitening: Whitening | None, traverse: Traverse) -> None:
+        """Write the partial map of a traverse, if it has places.
 
         Raises:
             InputError: the system refuses it; what was there before stays.
@@ -440,6 +444,7 @@ class Checkpoint:
         if whitening is not None:
             tensors |= {f"whitening.{name}": tensor for name, tensor in whitening.state_dict().items()}
         extra = {name: getattr(route, name) for name in ("needed", "energy", "error")}
+        extra["seen"] = traverse.state(0, route.places)
         write_map(
             self.path, tensors, {"run": dict(self.key), "state": {"map": route.get_extra_state(), **extra}}
         )
@@ -481,7 +486,7 @@ def learn_map(
         frames = traverse.count()
         if frames > max(SAMPLE, mapper.chunk):
             counts = visits and observation_counts(visits, frames)
-            found = run[0].open(run[1]()) if run else None
+            found = run[0].open(run[1](), traverse) if run else None
             visits = visits and describer.read_anywhere(visits, progress)
             with in_one_thread():
                 route = _resumed(describer, mapper, found) or _fitted(
@@ -578,10 +583,12 @@ def extend(
     held: list[Chunk] = []
 
     def add() -> None:
+        if not held:
+            return
         route.extend(held)
         held.clear()
         if checkpoint is not None:
-            checkpoint.save(route, coder.describer.whitening)
+            checkpoint.save(route, coder.describer.whitening, traverse)
 
     try:
         for chunk in code(coder, traverse, len(route.chunks), progress):
@@ -590,12 +597,11 @@ def extend(
             if sum(one.places for one in held) >= SAMPLE or (checkpoint is not None and checkpoint.due):
                 add()
         add()
-    except InputError as error:
-        if checkpoint is None:
-            raise
-        with suppress(InputError):  # as on a full disk
-            add()
-        if not checkpoint.kept:
+    except BaseException as error:  # also if the user interrupts it
+        if checkpoint is not None:
+            with suppress(InputError):  # as on a full disk
+                add()
+        if checkpoint is None or not checkpoint.kept or not isinstance(error, InputError):
             raise
         kept = f"{checkpoint.kept} of {coder.frames} places are kept in {checkpoint.path} for the next run"
         raise InputError(f"{error}; {kept}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import logging
 import math
@@ -206,15 +207,17 @@ class DejaVu(nn.Module):
             InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
-        before = None if self.whitening is None else self.whitening.state_dict()
+        state = None if self.whitening is None else copy.deepcopy(self.whitening.state_dict())
+        before = self.whitening, self._reduces
         self._reduce(traverse)
         run = None if checkpoint is None else (checkpoint, lambda: run_key(self, traverse, second, visits))
         text = "learning" if progress else None
         try:
             route = learn_map(self.describer, self.mapper, traverse, second, visits, text, run, code)
-        except InputError:  # the map that there was is of its own whitening
-            if self.whitening is not None and before is not None:
-                self.whitening.load_state_dict(before)
+        except InputError:  # the map that there was has its own whitening
+            self.whitening, self._reduces = before
+            if self.whitening is not None and state is not None:
+                self.whitening.load_state_dict(state)
             raise
         return self._take(route, traverse)
 

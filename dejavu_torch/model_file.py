@@ -388,12 +388,16 @@ def run_key(
     fixed = model.whitening is not None and model.whitening.fixed
     weights = weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {})
     sums = checksums(weights, header)
+    header["device"] = model.describer.device.type
     sources = {
-        name: views and [views.traverse.identity(), views.places.tolist()]
+        name: views
+        and [views.traverse.identity(), views.traverse.state(0, len(views.places)), views.places.tolist()]
         for name, views in (("second", second), ("visits", visits))
     }
-    source = [traverse.identity(), traverse.count()]
-    return digests(source=source, **sources) | {"settings": sums.pop(FILE_HEADER), **sums}
+    return digests(source=[traverse.identity(), traverse.count()], **sources) | {
+        "settings": sums.pop(FILE_HEADER),
+        **sums,
+    }
 
 
 def _code_of(cls: type[nn.Module]) -> str:

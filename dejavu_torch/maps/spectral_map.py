@@ -92,7 +92,7 @@ class SpectralMap(PlaceMap):
     this map keeps whichever lines of the spectrum are worth their bytes: transform coding with one step for
     all lines, which is reverse water-filling (Cover and Thomas, section 10.3.3).
 
-    Buffers, the tensors of a file:
+    Buffers, the tensors of a file; the streams are coded when `state_dict` or `coded` asks for them:
         lengths: (G,) int64, places of each chunk. steps: (G,) float32, of each chunk.
         streams, stream_table, escapes: coded levels; bytes and checksum of each chunk; levels beyond int8.
         means: (R,K) bfloat16, of the descriptors of each route: the lines code the difference.
@@ -190,8 +190,9 @@ class SpectralMap(PlaceMap):
         self._add(decoded, [chunk.places for chunk in chunks], [chunk.step for chunk in chunks])
         self._add_streams([chunk.stream for chunk in chunks], [chunk.escapes for chunk in chunks])
         self._check_norms()
-        self.energy += sum(chunk.energy for chunk in chunks)
-        self.error += sum(chunk.error for chunk in chunks)
+        known = all(chunk.energy for chunk in chunks) and (self.energy > 0 or len(chunks) == len(self.chunks))
+        self.energy = self.energy + sum(chunk.energy for chunk in chunks) if known else 0.0
+        self.error = self.error + sum(chunk.error for chunk in chunks) if known else 0.0
 
     @property
     def held(self) -> float | None:
@@ -275,7 +276,7 @@ class SpectralMap(PlaceMap):
 
     def of_chunks(self, chunks: Iterable[Chunk]) -> SpectralMap:
         """A map of other chunks with the mean and settings of this one, on its device."""
-        made = SpectralMap(self.means, **self.settings()).train(self.training)
+        made = SpectralMap(self.means, **self.settings()).to(self.means.device).train(self.training)
         made.extend(chunks)
         return made
 
@@ -293,6 +294,7 @@ class SpectralMap(PlaceMap):
                 problem = f"{what} of {names[other]}: {seen[other]}; expected {seen[0]}, as of {names[0]}"
                 raise InputError(f"the map does not fit together: {problem}")
         route = cls(torch.cat([part.means for part in parts]), **parts[0].settings())
+        route.to(route.means.device)
         route._routes = tuple(
             RouteState(name, len(part.chunks), len(part.positions) or part.places)
             for name, part in zip(names, parts, strict=True)
