@@ -193,15 +193,17 @@ def found_by(model: DejaVu, queries: Tensor, searcher: ClusterSearcher | None = 
 def test_parts_of_a_map_on_workers_find_what_the_whole_does(cluster: Cluster) -> None:
     # more than a block of a scan, with ties between the chunks of one part, and of both
     again = torch.cat([route() * (1 + i / 9) for i in range(64 // 8)], 1)[:500].repeat(20, 1)
-    steps = {0.3: (CHUNK, again), 0.2: (40, again[:600])}
+    other = torch.randn(300, again.shape[1], generator=torch.Generator().manual_seed(7))
+    steps = {0.3: (CHUNK, again), 0.2: (40, again[:600]), 0.1: (30, other)}
     models = [
         DejaVu(None, "none", SpectralMapper(None, step, chunk)).learn(rows)
         for step, (chunk, rows) in steps.items()
     ]
-    model = merge(models, ["one", "two"])
-    queries = torch.cat([again[:90:7], again[480:700:9] + 0.1, again[:500:31]])
+    model = merge(models, ["one", "two", "three"])
+    queries = torch.cat([again[:90:7], again[480:700:9] + 0.1, again[:500:31], other[::31]])
     whole = found_by(model, queries)
     assert int((whole[2][:, 1] - whole[2][:, 0]).remainder(500).eq(0).sum()) > 20
+    assert torch.equal(whole[0][-10:], 10_600 + torch.arange(0, 300, 31))
     searcher = ClusterSearcher(cluster, model.map)
     assert len(searcher.actors) == 2
     assert all(map(torch.equal, found_by(model, queries, searcher), whole))
