@@ -394,8 +394,8 @@ def test_even_steps_of_merged_routes() -> None:
 
 
 def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
-    models = routes("a", "b")
-    merged = merge(models, ["a", "b"])
+    models = routes("a", "b", "c")
+    merged = merge(models, ["a", "b", "c"])
     queries = walk(30, seed=4)
     for speeds in ((1.0,), (0.8, 1.0, -1.2)):
         matcher = SequenceMatcher(7, speeds)
@@ -404,6 +404,9 @@ def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
         whole = torch.cat(list(matcher.stream(map(merged.map.scores, queries_of(merged, queries)))))
         assert not torch.equal(whole, expected)  # as one route's places they would count
         assert torch.equal(merged.localize(queries, sequence=matcher).index, expected.argmin(1))
+        seen: list[Tensor] = []
+        merged.localizer(merged.matching(matcher)._replace(on_scores=seen.append))(merged.whitened(queries))
+        torch.testing.assert_close(torch.cat(seen), expected, atol=1e-5, rtol=0)
     assert merged.localize(queries, sequence=PlaceFilter()).index.shape == (30,)
 
 
