@@ -202,6 +202,7 @@ class ClusterSearch:
             )
         actor = cluster.ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Searcher)
         self.cluster, self.actors, first = cluster, [], 0
+        self.parts: list[Any] = []  # held for actors that are started again
         for worker in range(cluster.workers):
             stop = next(
                 (
@@ -212,8 +213,8 @@ class ClusterSearch:
                 len(route.chunks),
             )
             if stop > first:
-                part = cluster.ray.put(route.between(first, stop).cpu())
-                self.actors.append(actor.remote(part, route.chunks[first][0]))
+                self.parts.append(cluster.ray.put(route.between(first, stop).cpu()))
+                self.actors.append(actor.remote(self.parts[-1], route.chunks[first][0]))
             first = max(first, stop)
 
     @torch.no_grad()

@@ -253,7 +253,7 @@ MUTANTS = [
     Mutant(
         "Appending places drops the calibration of the map, which was made for fewer places.",
         "dejavu_torch/growth.py",
-        "model.map, model.calibration = grown, None",
+        "model.map, model.find, model.calibration = grown, None, None",
         "model.map = grown",
         ("tests/test_growth.py::test_a_calibration_goes_and_comes_again_from_the_new_places",),
     ),
