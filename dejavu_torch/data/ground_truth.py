@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from dejavu_torch.memory import check_room
 from dejavu_torch.types import GroundTruth, InputError, Traverse
 
 PAIRS_AT_ONCE = 2**20
-BYTES_A_PLACE = 32  # of a table of right places, and of what is computed of it
+PLACE_BYTES = 32  # of each place in a table of right places, with what is computed from it
 
 
 def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
@@ -35,24 +35,20 @@ def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
 
 
 def padded(rows: Iterable[Tensor]) -> Tensor:
-    """Places of each query, (n,) int64, as a table (Q,R), -1 as padding.
-
-    Raises:
-        InputError: a table for which there is no room.
-    """
+    """Places of each query, (n,) int64, as a table (Q,R), -1 as padding; refuses one too large for memory."""
     rows = list(rows)
     check_table(len(rows), max(map(len, rows), default=0))
     return pad_sequence(rows, batch_first=True, padding_value=-1)
 
 
 def check_table(queries: int, places: int) -> None:
-    """Refuse, before it is made, a ground truth of more places a query than there is room for."""
-    needed = BYTES_A_PLACE * queries * places
+    """Refuse a ground truth of more places a query than there is room for, before it is made."""
+    needed = PLACE_BYTES * queries * places
     check_room(needed, f"a ground truth of up to {places} places for each of {queries} queries")
 
 
 def offset_truth(queries: int | Tensor, frames: int | None, offset: int = 0) -> Tensor:
-    """Query i is frame i + offset; where there is no such frame, the query has no right answer (-1).
+    """Query i is frame i + offset; -1, no right answer, if there is no such frame.
 
     Args:
         queries: how many, or (Q,) int64 the number of each. frames: of the reference, None where unknown.
@@ -102,13 +98,11 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
         [[0, 1]]
     """
     rows: list[Tensor] = []
-    most = 0
     for part in query.double().split(max(1, PAIRS_AT_ONCE // max(1, len(reference)))):
         # matrix products would cancel the metres of large coordinates
         distance = torch.cdist(part, reference.double(), compute_mode="donot_use_mm_for_euclid_dist")
         near = distance <= radius
-        most = max(most, int(near.sum(1).max()))
-        check_table(len(query), most)
+        check_table(len(query), int(near.sum(1).max()))
         rows += _columns(near)
     return padded(rows)
 
@@ -124,27 +118,19 @@ def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
         >>> is_right(torch.tensor([5, 6, -1]), torch.tensor([[0], [0], [0]]), tolerance=5).tolist()
         [True, False, False]
     """
-    near = (index[:, None] - truth).abs() <= min(
-        tolerance, LARGEST
-    )  # what int64 cannot hold would compare wrong
+    tolerance = min(tolerance, LARGEST)  # what int64 cannot hold would compare wrong
+    near = (index[:, None] - truth).abs() <= tolerance
     return (near & (truth >= 0) & (index >= 0)[:, None]).any(1)
 
 
 def counted(index: Tensor, truth: GroundTruth, tolerance: int) -> Tensor:
-    """Which queries a score counts: those that are judged and do not report an ignored place.
-
-    Shape: (Q,) -> (Q,) bool.
-    """
+    """Which queries a score counts, judged ones that do not report an ignored place: (Q,) -> (Q,) bool."""
     ignored = is_right(index, truth.ignored, 0)
     return truth.judged & (is_right(index, truth.positives, tolerance) | ~ignored)
 
 
 def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tensor]) -> GroundTruth:
-    """A ground truth that counts reference frames as one that counts places.
-
-    Args:
-        place_of: the place nearest to each frame, -1 for none, as `PlaceMap.place_of`.
-    """
+    """A ground truth in reference frames as one in places, by `PlaceMap.place_of`."""
     return truth._replace(positives=place_of(truth.positives), ignored=place_of(truth.ignored))
 
 
@@ -152,23 +138,21 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
 
 
 class Request(NamedTuple):
-    """What a ground truth is needed for; see `find_ground_truth`."""
+    """What a ground truth is needed for; see `find_ground_truth`.
+
+    numbers: (Q,) int64, the frame of each query. every: whether they are all frames of their source.
+    """
 
     reference: Traverse | None
     query: Traverse | None
     frames: int | None
-    queries: int | Tensor
+    numbers: Tensor
+    every: bool
     interpolate: bool
     resampled: bool
-    aligned: bool
-
-    @property
-    def numbers(self) -> Tensor:
-        """(Q,) int64, the frame of each query."""
-        return torch.arange(self.queries) if isinstance(self.queries, int) else self.queries
 
     def numbers_below(self, count: int) -> Tensor:
-        """The same, where the query's traverse has so many frames."""
+        """The numbers, if the query's traverse has so many frames."""
         last = int(self.numbers.max())
         if last >= count:
             raise InputError(f"there is a query {last}; expected numbers below {count}")
@@ -178,26 +162,28 @@ class Request(NamedTuple):
 class Format(NamedTuple):
     """One way to give a ground truth as text.
 
-    expected: how a message names it. fits: whether a text is one. read: what it means. describe: in words.
+    expected: its name in messages. parse: what a text says, None if it is of another format. read: the ground
+    truth from that. describe: in words.
     """
 
     expected: str
-    fits: Callable[[str], bool]
-    read: Callable[[str, Request], GroundTruth]
-    describe: Callable[[str], str] = str
+    parse: Callable[[str], Any]
+    read: Callable[[Any, Request], GroundTruth]
+    describe: Callable[[Any], str] = str
 
 
-def check_ground_truth(truth: str, interpolate: bool = False) -> Format:
-    """The format of a text; refuses one that is no ground truth early, before long work.
+def check_ground_truth(truth: str, interpolate: bool = False) -> tuple[Format, Any]:
+    """The format of a text and what it says; refuses one that is no ground truth early, before long work.
 
     Raises:
         InputError: none of `FORMATS`, a file that cannot be opened, or interpolation of anything but a .csv.
     """
     for format in FORMATS:
-        if format.fits(truth):
+        said = format.parse(truth)
+        if said is not None:
             if interpolate and format.read is not read_table:
                 raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
-            return format
+            return format, said
     raise InputError(f"truth {truth!r} is not known; expected {_expected()}")
 
 
@@ -218,23 +204,22 @@ def find_ground_truth(
 
             - an integer offset: place = query + offset;
             - a `.csv` of `query,place[,place...]`, with or without such a header: every listed place is
-              right, so no other columns. A query listed without a place, or with -1, has no right answer; a
-              query not listed is not known, and is left out of the scores;
+              right. A query listed without a place, or with -1, has no right answer; a query not listed is
+              not known, and is left out of the scores;
             - an `.npz` with the boolean matrices (reference frames, query frames) `GThard` and/or `GTsoft`,
-              as the visual place recognition tutorial of Schubert et al. keeps them. What is in GThard is
-              right (in GTsoft, if that is the only one); what is in GTsoft only counts neither way;
+              as in the visual place recognition tutorial of Schubert et al. What is in GThard is right (in
+              GTsoft, if that is the only one); what is in GTsoft only counts neither way;
             - `utm:25`: every reference frame within 25 metres (inclusive; `utm` alone means 25) by the UTM
               coordinates in the names of both traverses' images, `@easting@northing@...@.jpg`;
             - None: the positions that both traverses carry; else frame i is place i where they say so, see
               `say_aligned`, are equally long and nothing is resampled; else there is no ground truth.
-        reference, query: the sources, not resampled; None where there is none at hand.
+        reference, query: the sources, not resampled, or None.
         frames: how many frames the reference has, None where unknown.
         queries: how many, or (Q,) int64 the frame of each query in its source.
         interpolate: a query between two that the .csv lists gets the place between theirs, rounded.
         resampled: queries and places are resampled by distance: a query frame that is listed but shown by no
-            query then speaks for the nearest one that is shown and not listed.
-        aligned: of two traverses that are equally long, frame i is place i whatever they say, as where a user
-            names one as another traverse of the same places.
+            query then counts for the nearest one that is shown and not listed.
+        aligned: frame i is place i of any two traverses that are equally long.
 
     Convention 11: a ground truth counts frames of the sources, whether or not they are resampled; see
         `ground_truth_in_places`. The tolerance of the scores applies on top, inclusive.
@@ -247,37 +232,36 @@ def find_ground_truth(
         >>> find_ground_truth("-1", None, None, frames=3, queries=3).positives.tolist()
         [[-1], [0], [1]]
     """
-    request = Request(reference, query, frames, queries, interpolate, resampled, aligned)
+    numbers, every = (torch.arange(queries), True) if isinstance(queries, int) else (queries, False)
+    request = Request(reference, query, frames, numbers, every, interpolate, resampled)
     if truth is None:
-        return _default(request)
-    format = check_ground_truth(truth, interpolate)
-    found = format.read(truth, request)
+        return _default(request, aligned)
+    format, said = check_ground_truth(truth, interpolate)
+    found = format.read(said, request)
     if not (found.positives >= 0).any():
-        raise InputError(f"no query has a right answer: {format.describe(truth)}")
+        raise InputError(f"no query has a right answer: {format.describe(said)}")
     return found
 
 
-def _default(request: Request) -> GroundTruth | None:
-    reference, query, queries = request.reference, request.query, request.queries
+def _default(request: Request, aligned: bool) -> GroundTruth | None:
+    reference, query, frames = request.reference, request.query, request.frames
     if reference is None or query is None:
         return None
     if reference.place is not None and query.place is not None:
         position = query.place[request.numbers_below(len(query.place))]
         return as_ground_truth(position_truth(reference.place, position))
-    count = queries if isinstance(queries, int) else query.length
-    if request.resampled or count is None or count != request.frames:
+    count = len(request.numbers) if request.every else query.length
+    if request.resampled or count is None or count != frames:
         return None
-    if not (request.aligned or say_aligned(reference, query, count)):
-        return None
-    return as_ground_truth(offset_truth(queries, request.frames))
+    alike = aligned or say_aligned(reference, query, count)
+    return as_ground_truth(offset_truth(request.numbers, frames)) if alike else None
 
 
 def say_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
     """Whether two traverses of so many frames say themselves that frame i of both shows the same place.
 
-    They do where both were cut alike, each out of a long image, or where the frames of both have the same
-    names, all different. Times, as of the frames of a video, are no such names: any two recordings share
-    them.
+    They do if both were cut alike, each out of a long image, or if their frames have the same names, all
+    different. Times, as of the frames of a video, are no such names: any two recordings share them.
 
     Example:
         >>> from dejavu_torch.data.source import open_source
@@ -308,7 +292,8 @@ def describe_ground_truth(truth: str | None, interpolate: bool = False, position
     if truth is None:
         carried = "the positions that both traverses carry"
         return carried if positions else "place = query, as the sources say themselves"
-    words = check_ground_truth(truth).describe(truth)
+    format, said = check_ground_truth(truth)
+    words = format.describe(said)
     return f"{words}, interpolated" if interpolate else words
 
 
@@ -322,26 +307,24 @@ def offset_of(truth: str | None, positions: bool = False) -> int | None:
 # offsets and coordinates --------------------------------------------------------------------------------
 
 
-def read_offset(truth: str, request: Request) -> GroundTruth:
+def read_offset(offset: int, request: Request) -> GroundTruth:
     """An integer: place = query + offset."""
     numbers, frames = request.numbers, request.frames
-    positives = offset_truth(numbers, frames, int(truth))
+    positives = offset_truth(numbers, frames, offset)
     if not (positives >= 0).any():
         last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
         expected = f"an offset from {-int(numbers.max())}{last}"
-        raise InputError(f"no query has a right answer with truth {truth}; expected {expected}")
+        raise InputError(f"no query has a right answer with truth {offset}; expected {expected}")
     return as_ground_truth(positives)
 
 
-def read_coordinates(truth: str, request: Request) -> GroundTruth:
+def read_coordinates(radius: float, request: Request) -> GroundTruth:
     """`utm:25`: every reference frame within 25 metres."""
     if request.reference is None or request.query is None:
-        raise InputError(f"truth {truth} lies in the names of images; expected both traverses")
+        raise InputError(f"truth utm:{radius:g} lies in the names of images; expected both traverses")
     query = utm_coordinates(request.query)
-    near = near_truth(
-        utm_coordinates(request.reference), query[request.numbers_below(len(query))], _radius(truth) or 0.0
-    )
-    return as_ground_truth(near)
+    query = query[request.numbers_below(len(query))]
+    return as_ground_truth(near_truth(utm_coordinates(request.reference), query, radius))
 
 
 def utm_coordinates(traverse: Traverse) -> Tensor:
@@ -364,46 +347,31 @@ def utm_coordinates(traverse: Traverse) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def _offset(truth: str) -> int | None:
-    try:
-        offset = int(truth)
-    except ValueError:
-        return None
-    return offset if abs(offset) < LARGEST else None
-
-
-def _radius(truth: str) -> float | None:
-    name, colon, radius = truth.partition(":")
-    metres = as_number(radius) if colon else 25.0
-    return metres if name == "utm" and metres is not None and metres >= 0 else None
-
-
 # tables -------------------------------------------------------------------------------------------------
 
 
 def read_table(truth: str, request: Request) -> GroundTruth:
     """A csv of `query,place[,place...]`."""
-    path, numbers, interpolate = Path(truth), request.numbers, request.interpolate
-    listed = _listed(path, request.frames, interpolate)
+    path, numbers = Path(truth), request.numbers
+    listed = _listed(path, request.frames, request.interpolate)
     first, last = min(listed), max(listed)
-    if interpolate:
+    queries = numbers.tolist()
+    if request.interpolate:
         knots = sorted(listed)
         between = np.interp(numbers.numpy(), knots, [listed[query][0] for query in knots]).tolist()
-        judged = (numbers >= first) & (numbers <= last)
-        sets = [[place] if inside else [] for place, inside in zip(between, judged.tolist(), strict=True)]
+        places = {query: [at] for query, at in zip(queries, between, strict=True) if first <= query <= last}
     else:
-        if request.resampled:
-            length = None if request.query is None else request.query.length
-            if length is not None and last >= length:
-                raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
-            listed = _at_shown(listed, numbers)
-        judged = torch.tensor([query in listed for query in numbers.tolist()])
-        sets = [listed.get(query, []) for query in numbers.tolist()]
+        length = None if request.query is None else request.query.length
+        if request.resampled and length is not None and last >= length:
+            raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
+        places = _at_shown(listed, numbers) if request.resampled else listed
+    judged = torch.tensor([query in places for query in queries])
     if not judged.any():
         wanted = f"{int(numbers.min())} to {int(numbers.max())}"
         raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
-    rows = (torch.tensor([_rounded(place) for place in places], dtype=torch.int64) for places in sets)
-    return as_ground_truth(padded(rows))._replace(judged=judged)
+    rows = ([_rounded(place) for place in places.get(query, ())] for query in queries)
+    found = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
+    return as_ground_truth(found)._replace(judged=judged)
 
 
 def _at_shown(listed: dict[int, list[float]], frames: Tensor) -> dict[int, list[float]]:
@@ -424,13 +392,8 @@ def _listed(path: Path, frames: int | None, interpolate: bool) -> dict[int, list
     listed: dict[int, list[float]] = {}
     for line, cells in _table_rows(path):
         where = f"{path}, line {line}"
-        values = []
-        for cell in cells:
-            value = as_number(cell)
-            if value is None:
-                raise InputError(f"{where}: {cell!r} is no frame number; expected query,place")
-            values.append(value)
-        query, found = values[0], [place for place in values[1:] if place != -1]
+        query, *found = (_frame_number(cell, where) for cell in cells)
+        found = [place for place in found if place != -1]
         if query < 0 or query % 1:
             raise InputError(f"{where}: query {cells[0]}; expected a whole number of at least 0")
         if query in listed:
@@ -460,8 +423,7 @@ def _table_rows(path: Path) -> list[tuple[int, list[str]]]:
         cells = [cell.strip() for cell in line.strip(" ").split(separator)]
         while cells and not cells[-1]:
             del cells[-1]
-        if cells:
-            rows.append((number, cells))
+        rows += [(number, cells)] if cells else []
     if rows and all(as_number(cell) is None for cell in rows[0][1]):
         number, names = rows.pop(0)
         first, *others = [name.lower() for name in names]
@@ -471,6 +433,13 @@ def _table_rows(path: Path) -> list[tuple[int, list[str]]]:
                 f"{path}, line {number}: columns {','.join(names)}; expected query,place[,place...]"
             )
     return rows
+
+
+def _frame_number(cell: str, where: str) -> float:
+    value = as_number(cell)
+    if value is None:
+        raise InputError(f"{where}: {cell!r} is no frame number; expected query,place")
+    return value
 
 
 def _rounded(place: float) -> int:
@@ -491,9 +460,9 @@ def read_matrices(truth: str, request: Request) -> GroundTruth:
     return found._replace(ignored=padded(_columns(soft[0] & ~hard))) if soft else found
 
 
-def _columns(which: Tensor) -> Iterator[Tensor]:
+def _columns(which: Tensor) -> list[Tensor]:
     """(Q,N) bool -> Q of (n,) int64, the columns that are true in each row."""
-    return (row.nonzero()[:, 0] for row in which)
+    return [row.nonzero()[:, 0] for row in which]
 
 
 def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
@@ -507,12 +476,10 @@ def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
                 continue
             entry = archive.getinfo(f"{name}.npy")
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(
-                    "another compression than that of numpy"
-                )  # which a few bytes can make endless
+                raise ValueError("another compression than numpy's")  # a few bytes of it can be endless
             with archive.open(entry) as file:
                 shape, kind, by_columns, start = read_header(file.read(HEADER))
-            _check_shape(f"{path}: {name}", shape, kind, request.frames, request.queries)
+            _check_shape(f"{path}: {name} is {shape} {kind}", shape, kind, request)
             count = math.prod(shape)
             if start + count * kind.itemsize != entry.file_size:
                 raise ValueError(f"{name} is {shape} {kind} in {entry.file_size} bytes")
@@ -527,23 +494,20 @@ def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
     return found
 
 
-def _check_shape(
-    name: str, sides: tuple[int, ...], kind: np.dtype, frames: int | None, queries: int | Tensor
-) -> None:
-    count = queries if isinstance(queries, int) else int(queries.max()) + 1
-    seen = f"{name} is {sides} {kind}"
+def _check_shape(seen: str, shape: tuple[int, ...], kind: np.dtype, request: Request) -> None:
+    """Refuse what is no matrix (reference frames, query frames), and say if it is transposed."""
+    frames, count = request.frames, int(request.numbers.max()) + 1
     rows = "reference frames" if frames is None else frames
     wanted = f"expected a matrix of ({rows}, {count}), a column a query frame"
-    if len(sides) != 2 or kind.kind not in "biuf":
+    if len(shape) != 2 or kind.kind not in "biuf":
         raise InputError(f"{seen}; {wanted}")
 
     def fits(rows: int, columns: int) -> bool:
         # queries that are given by number may be some of those in the matrix
-        enough = columns == count or (columns > count and not isinstance(queries, int))
+        enough = columns == count or (columns > count and not request.every)
         return enough and frames in (None, rows)
 
-    shape = sides[0], sides[1]
-    # where the reference is not known, as many rows as queries speak for a transposed matrix
+    # as many rows as queries speak for a transposed matrix if the reference is not known
     if not fits(*shape) or (frames is None and shape[1] != count == shape[0]):
         raise InputError(f"{seen}; {wanted}{'; transposed it fits' if fits(*shape[::-1]) else ''}")
 
@@ -551,21 +515,34 @@ def _check_shape(
 # the registry -------------------------------------------------------------------------------------------
 
 
-def _file(suffix: str, truth: str) -> bool:
-    """Whether a text names a file of a kind; refuses one that cannot be opened."""
+def _offset(truth: str) -> int | None:
+    try:
+        offset = int(truth)
+    except ValueError:
+        return None
+    return offset if abs(offset) < LARGEST else None
+
+
+def _radius(truth: str) -> float | None:
+    name, colon, radius = truth.partition(":")
+    metres = as_number(radius) if colon else 25.0
+    return metres if name == "utm" and metres is not None and metres >= 0 else None
+
+
+def _file(suffix: str, truth: str) -> str | None:
+    """The text if it names a file of a kind; refuses one that cannot be opened."""
     if Path(truth).suffix.lower() != suffix:
-        return False
+        return None
     check_regular(Path(truth), _expected())
-    return True
+    return truth
 
 
-def _describe_offset(truth: str) -> str:
-    offset = int(truth)
+def _describe_offset(offset: int) -> str:
     return "place = query" + (f" {'-' if offset < 0 else '+'} {abs(offset)}" if offset else "")
 
 
-def _describe_radius(truth: str) -> str:
-    return f"within {_radius(truth):g} m by the coordinates in image names"
+def _describe_radius(radius: float) -> str:
+    return f"within {radius:g} m by the coordinates in image names"
 
 
 def _expected() -> str:
@@ -574,15 +551,8 @@ def _expected() -> str:
 
 
 FORMATS = (
-    Format(
-        "an integer offset such as 0", lambda text: _offset(text) is not None, read_offset, _describe_offset
-    ),
+    Format("an integer offset such as 0", _offset, read_offset, _describe_offset),
     Format("a .csv of query,place", partial(_file, ".csv"), read_table),
     Format("an .npz with GThard", partial(_file, ".npz"), read_matrices),
-    Format(
-        "utm:25 for coordinates in image names",
-        lambda text: _radius(text) is not None,
-        read_coordinates,
-        _describe_radius,
-    ),
+    Format("utm:25 for coordinates in image names", _radius, read_coordinates, _describe_radius),
 )
