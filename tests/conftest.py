@@ -17,6 +17,8 @@ from PIL import Image
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+collect_ignore = ["mutants"]  # it has no tests, and runs them
+
 # commands and notebooks run in processes of their own, beside each other
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
