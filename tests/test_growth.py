@@ -493,6 +493,7 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was(tmp_path: Path)
             {"routes": [extra["routes"][0], extra["routes"][1] | {"frames": 131}]},
             ("routes of [100, 131] frames", "expected 230"),
         ),
+        ({"routes": ["a", "b"]}, ("routes are ['a', 'b']", "name, chunks and frames")),
         ({"kind": "merged"}, ("'merged'", "'spectral'")),
     ):
         with refused(*words):

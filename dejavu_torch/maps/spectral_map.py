@@ -27,6 +27,7 @@ STRONGEST = 10  # periods that a summary names
 LARGEST = 2**31 - 1  # places of a map, and its coefficients: what int32 holds
 BLOCK = 2**19  # numbers computed at a time: they stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk that are computed at a time
+TOGETHER = 16  # queries at least that are multiplied with lines at a time
 COPIES = 4  # numbers held for a place and a query: line, transform, score, is it best
 COUNTING = (torch.uint8, torch.int16, torch.int32)
 FILE = {  # dtype and dimensions of the tensors of a file
@@ -460,7 +461,10 @@ class SpectralMap(PlaceMap):
         for run in self._runs(chunks, rows):
             begin, end = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
             with torch.autocast(queries.device.type, enabled=False):
-                products = self.products(queries, run)
+                some = [queries]
+                if not torch.compiler.is_compiling():  # what is held for the others stays in the cache
+                    some = [*queries.split(max(TOGETHER, BLOCK // (end - begin)))]
+                products = torch.cat([self.products(part, run) for part in some])
                 if self.metric == "cosine":
                     inverse = self.inverse_norms(begin, end).to(queries)
                     scores = torch.addcmul(queries.new_ones(()), products, inverse, value=-1)
@@ -489,7 +493,12 @@ class SpectralMap(PlaceMap):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """See `PlaceMap`."""
         super().set_extra_state(state)
-        self._routes = tuple(RouteState(**one) for one in state.get("routes", ()))
+        routes = state.get("routes", ())
+        try:
+            self._routes = tuple(RouteState(**one) for one in routes)
+        except TypeError as error:
+            seen = f"the map's routes are {routes!r:.60}"
+            raise InputError(f"{seen}; expected name, chunks and frames of each") from error
 
     def _save_to_state_dict(self, *args: Any) -> None:
         self._encode()
