@@ -307,8 +307,8 @@ MUTANTS = [
     Mutant(
         "The tolerance is inclusive.",
         "dejavu_torch/data/ground_truth.py",
-        "near = (index[:, None] - truth).abs() <= min(",
-        "near = (index[:, None] - truth).abs() < min(",
+        "near = (index[:, None] - truth).abs() <= tolerance",
+        "near = (index[:, None] - truth).abs() < tolerance",
         ("tests/evaluation/test_curves.py::test_convention_5_tolerance_is_inclusive_in_every_score",),
     ),
     Mutant(
