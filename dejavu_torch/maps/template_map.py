@@ -284,6 +284,11 @@ class TemplateMap(PlaceMap):
         scores = self.combine(distances)
         return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
+    @property
+    def block_places(self) -> int:
+        """See `PlaceMap`: a number for each place in each layer of a segment."""
+        return self.places * max([1, *(len(segment.layers) for segment in self.segments)])
+
     def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
         """See `PlaceMap`: from the layers that cover these places."""
         inside = [segment for segment in self.segments if segment.start < stop and segment.stop > start]
