@@ -86,7 +86,7 @@ def plot_spectrogram(
         values: (N,) the feature. spectra: its spectrum in each chunk, power (K,1).
         kept: for each chunk the periods kept; they are marked. shortest: the shortest period shown.
         feature: its number.
-        borders: (N+1,) see `PlaceMap.borders`. unit: of the periods.
+        borders: (N+1,) see `FrameTable.borders`. unit: of the periods.
 
     Convention: where chunks overlap, each column ends where the next begins.
     """

@@ -32,7 +32,7 @@ def plot_chunks(plan: Plan, borders: Tensor, unit: str) -> Plot:
     """Chunks along the route and the periods found in each; the wider a bar, the more features.
 
     Args:
-        borders: (N+1,) see `PlaceMap.borders`. unit: of the periods.
+        borders: (N+1,) see `FrameTable.borders`. unit: of the periods.
     """
     figure, axis = canvas(3.6)
     axis.set(xlim=(0, int(borders[-1])), xlabel=PLACE, ylabel=f"period ({unit})")
@@ -68,7 +68,7 @@ def plot_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) ->
     """Layers of one chunk and their phases along it (figure 2 of the paper).
 
     Args:
-        borders: (N+1,) see `PlaceMap.borders`. unit: of the periods.
+        borders: (N+1,) see `FrameTable.borders`. unit: of the periods.
 
     Convention: one row a layer, those of most features, by period; the colour is the phase, so that a
     column of colours is what names a place.
@@ -102,7 +102,7 @@ def plot_activations(
     Args:
         layers: two layers of one chunk. scores: for each (n,) eq. 3 at the chunk's places.
         fused: (n,) eq. 4 at the same places. query: number of the query frame.
-        borders: (N+1,) see `PlaceMap.borders`. places: the right places of the query, marked.
+        borders: (N+1,) see `FrameTable.borders`. places: the right places of the query, marked.
         strip: (C,H,n) one image column for each frame of the chunk, drawn above; None leaves it out.
         rates: how often each is right, written above it; None leaves it out.
     """
@@ -132,7 +132,7 @@ def plot_answers(
 
     Args:
         curves: title, scores (n,) and colour of each. query: number of the query frame.
-        borders: (N+1,) see `PlaceMap.borders`. places: the right places of the query, marked.
+        borders: (N+1,) see `FrameTable.borders`. places: the right places of the query, marked.
         strip: (C,H,n) one image column for each frame of the chunk, drawn above; None leaves it out.
         sharey: one scale for all rows.
     """

@@ -250,7 +250,7 @@ def plot_score_matrix(
 
     Args:
         truth: None where nothing is known.
-        borders: (N+1,) see `PlaceMap.borders`. queries: (Q,) the frame of each query, in order.
+        borders: (N+1,) see `FrameTable.borders`. queries: (Q,) the frame of each query, in order.
         example: drawn below, enlarged.
     """
     figure, axes = canvas(3.8) if example is None else canvas(6.9, 2)
@@ -359,7 +359,7 @@ def plot_posterior(
 
     Args:
         truth: None where nothing is known.
-        borders: (N+1,) see `PlaceMap.borders`. queries: (Q,) the frame of each query, in order.
+        borders: (N+1,) see `FrameTable.borders`. queries: (Q,) the frame of each query, in order.
     """
     figure, axes = canvas(5.2, 2, sharex=True, height_ratios=(4, 1))
     axis, below = axes
@@ -397,7 +397,7 @@ def plot_coverage(
     Args:
         truth: (Q,R) right places, or a GroundTruth, or None where nothing is known: the colours are then the
             probabilities, if there are any.
-        borders: (N+1,) see `PlaceMap.borders`; (1,) the number of frames where places are frames.
+        borders: (N+1,) see `FrameTable.borders`; (1,) the number of frames where places are frames.
         queries: (Q,) the frame of each query. unit: of the tolerance.
     """
     figure, axis = canvas(3.8)
