@@ -26,7 +26,7 @@ from dejavu_torch.cluster import Cluster, ClusterSearch, code_on
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.views import Views
-from dejavu_torch.growth import merge
+from dejavu_torch.growth import learn_mean, merge
 from dejavu_torch.learning import Checkpoint, Sample
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
@@ -108,6 +108,14 @@ def test_workers_write_the_file_of_one_process(kind: str, cluster: Cluster, tmp_
     other = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
     other.learn(traverse, code=partial(code_on, cluster))  # type: ignore[arg-type]
     assert file_of(other, tmp_path) == file_of(whitened, tmp_path)
+
+
+def test_workers_average_a_second_traverse_in(cluster: Cluster, tmp_path: Path) -> None:
+    visits = Views(ArrayTraverse(route() + 0.1), torch.arange(PLACES))
+    models = [DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK)) for _ in range(2)]
+    here = learn_mean(models[0], route(), visits)
+    there = learn_mean(models[1], route(), visits, code=partial(code_on, cluster))
+    assert file_of(there, tmp_path) == file_of(here, tmp_path)
 
 
 def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Module, tmp_path: Path) -> None:
