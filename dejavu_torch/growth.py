@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from functools import partial
 from itertools import count
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import as_traverse
-from dejavu_torch.data.ground_truth import find_ground_truth, ground_truth_in_places
+from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.names import names_of
-from dejavu_torch.data.positions import place_of, positions_behind
+from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import (
     Checkpoint,
@@ -26,11 +25,12 @@ from dejavu_torch.learning import (
     with_visits,
 )
 from dejavu_torch.maps.file import checksums, digests
+from dejavu_torch.maps.frame_table import FrameTable
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import difference, recipe_of, run_key
-from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
+from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -49,23 +49,20 @@ def append(
 ) -> DejaVu:
     """Add the places of a traverse after those of a model's map, which stay as they are.
 
-    Whitening, mean and step of the lines stay; the new places are coded in chunks of their own. Nothing is
-    lost but the calibration, which is for fewer places: see `DejaVu.calibrate` and its `places`.
-
     Args:
         model: its map is spectral, and of one route.
-        traverse: as of `DejaVu.learn`, of frames like the map's. Where the map's places are even steps along
-            the ground it is resampled likewise, and its first frame is the next place.
-        progress: show a progress bar on a terminal.
-        checkpoint, code: as of `DejaVu.learn`.
+        traverse: frames like the map's. If the map's places are even steps along the ground it is resampled
+            likewise, and its first frame is the next place.
+        progress, checkpoint, code: see `DejaVu.learn`.
         visits: frames of another traverse of its places, averaged in before the coding, see `learn_mean`.
 
     Returns:
-        The model, in eval mode. What is refused leaves it as it was.
+        The model, in eval mode, without a calibration, which was of fewer places. What is refused leaves it
+        as it was.
 
-    Convention: where the map's places are a multiple of `chunk`, its file is, byte for byte, that of all
-        places learned at once with this whitening, mean and step. Else its last chunk stays short. One chunk
-        of descriptors is in memory at a time.
+    Convention: whitening, mean and step stay. If the map's places are a multiple of `chunk`, its file is,
+        byte for byte, that of all places learned at once with these. One chunk of descriptors is in memory
+        at a time.
 
     Raises:
         InputError: a map that cannot grow, or a traverse that does not fit it.
@@ -77,7 +74,7 @@ def append(
         >>> append(model, wave[400:]).localize(wave[[50, 450]]).index
         tensor([ 50, 450])
     """
-    route = one_route(model, "append to")
+    route, describer = one_route(model, "append to"), model.describer
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_alike(model, added)
     places = added.count()
@@ -88,14 +85,12 @@ def append(
         _check_alike(model, visits.traverse)
         counts += observation_counts(visits, places)
     text = "learning" if progress else None
-    part, found = SpectralMap(route.means, **route.settings(), step=route.step), None
+    part = SpectralMap(route.means, **route.settings(), step=route.step)
     if checkpoint is not None:
         sums = checksums(route.packed(), route.get_extra_state())
-        found = checkpoint.open(run_key(model, added, visits=visits) | digests(map=sums), added)
-    if found is not None:
-        part.load_packed({name[4:]: t for name, t in found[0].items() if name[:4] == "map."}, found[1]["map"])
-    visits = visits and model.describer.read_anywhere(visits, text)
-    coder = ChunkCoder.like(route, model.describer, places, visits)
+        key = run_key(model, added, visits=visits) | digests(map=sums)
+        checkpoint.open(key, added, part, model.whitening)
+    coder = ChunkCoder.like(route, describer, places, visits and describer.seekable(visits, text))
     extend(part, coder, added, text, checkpoint, code)
     grown = route.of_chunks([*route.coded(), *part.coded()])
     grown.count_visits(torch.cat([route.visit_counts, counts.to(route.visits.device)]))
@@ -105,8 +100,7 @@ def append(
     frames = len(positions) or places
     names = [model.frame_names, names_of(source_of(added), frames)]
     model.frame_names = _joined_names(names, [route.table.frames, frames])
-    model.map, model.find, model.calibration = grown, None, None
-    return model.eval()
+    return model.replace_map(grown)
 
 
 def learn_mean(
@@ -122,12 +116,9 @@ def learn_mean(
 
     Args:
         visits: frames of another traverse and the places that they show, as `associate` finds them. A place
-            that k of them show is the mean of k + 1 descriptors.
-        traverse, progress, second, checkpoint, code: as of `DejaVu.learn`. Whitening learns from these, not
+            that k of them show is the mean of k + 1 descriptors, as `map.visit_counts` tells.
+        traverse, progress, second, checkpoint, code: see `DejaVu.learn`. Whitening learns from these, not
             from `visits`.
-
-    Returns:
-        The model; `map.visit_counts` says how many visits each place is the mean of.
 
     Raises:
         InputError: as `DejaVu.learn`, a mapper of templates, which are means already, or visits that do not
@@ -150,18 +141,17 @@ def learn_mean(
 
 @torch.no_grad()
 def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
-    """Average another visit into a map that is there: decoded, averaged and coded again at the same step.
+    """Average another visit into a map: decoded, averaged and coded again at the same step.
 
-    A chunk that no frame shows stays as it is. What the coding left out is not there to be averaged: where
-    the traverses are at hand, `learn_mean` of them makes a better map.
+    A chunk that no frame shows stays as it is. `learn_mean` of the traverses makes a better map, as it
+    averages what the coding left out, too.
 
     Args:
-        model: its map is spectral. visits: as `shown_on_map` finds them. progress: show a progress bar on a
-            terminal.
+        model: its map is spectral; the calibration, which is of the map before, is removed. visits: as
+            `associate` finds them. progress: show a progress bar on a terminal.
 
     Returns:
-        How many places are the mean of more visits than before. The calibration is gone: it was of another
-        map. The model is in eval mode.
+        How many places are the mean of more visits than before.
 
     Raises:
         InputError: no spectral map of one route, or visits that do not fit.
@@ -184,16 +174,15 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     made.positions = route.positions
     made.count_visits((counts + seen).to(route.visits.device))
     made.check()
-    model.map, model.find, model.calibration = made, None, None
-    model.eval()
+    model.replace_map(made)
     return int((seen > 0).sum())
 
 
-def associate(model: DejaVu, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
-    """Which places of a reference another traverse shows; resampled where the reference is.
+def associate(model: DejaVu, reference: Traverse | None, second: Traverse, truth: str | None = None) -> Views:
+    """Which places of a reference, or of a map, another traverse shows; resampled as these are.
 
     Args:
-        reference: as `DejaVu.resample` gives it.
+        reference: as `DejaVu.resample` gives it; None is the model's map, of one route.
         truth: which frames of the reference it shows, see `find_ground_truth`; None, of one that is as
             long: frame i is place i. Of several for one frame the first counts; frames that show none are
             left out.
@@ -201,28 +190,48 @@ def associate(model: DejaVu, reference: Traverse, second: Traverse, truth: str |
     Raises:
         InputError: nothing says which places it shows, or it shows none.
     """
-    shape = model.fit(reference, model.frame_shape if model.map.places else None).frame_shape
-    second = model.resample(second, getattr(reference, "step", None), shape=shape)
-    frames, shown = reference.count(), second.count()
-    found = ground_truth_of(truth, reference, second, frames, shown, aligned=True)
-    if found is None:
-        steps = " at even steps" if isinstance(reference, ResampledTraverse) else ""
+    if reference is None:
+        table, shape, step = one_route(model, "average visits into").table, model.frame_shape, model.step
+    else:
+        table = FrameTable(reference.count(), positions_of(reference))
+        shape = model.fit(reference, model.frame_shape if model.map.places else None).frame_shape
+        step = getattr(reference, "step", None)
+    name = "the map" if reference is None else reference.name
+    second = model.resample(second, step, shape=shape)
+    shown, source = second.count(), None if reference is None else source_of(reference)
+    numbers = second.frame if isinstance(second, ResampledTraverse) else shown
+    found = find_ground_truth(
+        truth, source, source_of(second), table.frames, numbers, resampled=step is not None, aligned=True
+    )
+    if found is not None:
+        places = table.place_of(found.positives[:, 0])
+    elif reference is None and step is None and table.frames == shown:
+        places = torch.arange(shown)
+    else:
+        steps = " at even steps" if step is not None else ""
         raise InputError(
-            f"{second.name} has {shown} frames and {reference.name} {frames}{steps}; expected as "
-            "many, frame i being place i, or a truth that says which places it shows"
+            f"{second.name} has {shown} frames and {name} {table.frames}{steps}; expected as many, frame i "
+            "being place i, or a truth that says which places it shows"
         )
-    if isinstance(reference, ResampledTraverse):
-        found = ground_truth_in_places(found, partial(place_of, reference.positions))
-    places = found.positives[:, 0]
     if not (places >= 0).any():
-        raise InputError(f"no frame of {second.name} shows a place of {reference.name}; expected some")
+        raise InputError(f"no frame of {second.name} shows a place of {name}; expected some")
     return Views(second, places)
+
+
+def second_traverse(model: DejaVu, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
+    """As `associate`, for the whitening to learn from.
+
+    Raises:
+        InputError: no whitening that could learn from it, or as `associate`.
+    """
+    model.describer.require_learning(second.name)
+    return associate(model, reference, second, truth)
 
 
 def calibrate_if_possible(
     model: DejaVu, reference: Traverse, views: Views | None = None, places: Tensor | None = None
 ) -> None:
-    """As `DejaVu.calibrate`; without views a map stays as it is that is calibrated, or cannot be by its own
+    """As `DejaVu.calibrate`; without views a map is left as it is if it is calibrated, or cannot be by its
     reference."""
     if views is not None:
         model.calibrate(reference, views)
@@ -231,45 +240,6 @@ def calibrate_if_possible(
             model.calibrate(reference, places=places)
         except InputError as error:
             log.warning("the map is not calibrated: %s", error)
-
-
-def second_traverse(model: DejaVu, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
-    """As `associate`, for the whitening to learn from.
-
-    Raises:
-        InputError: no whitening that could learn from it, or as of `associate`.
-    """
-    model.describer.require_learning(second.name)
-    return associate(model, reference, second, truth)
-
-
-def shown_on_map(model: DejaVu, traverse: Traverse, truth: str | None = None) -> Views:
-    """As `associate`, for a map whose reference is not at hand.
-
-    Args:
-        truth: None is frame i at place i, where there are as many and places are frames.
-
-    Raises:
-        InputError: nothing says which places the frames show, or they show none.
-    """
-    route = one_route(model, "average visits into")
-    traverse = model.resample(traverse, model.step, shape=model.frame_shape)
-    frames, shown = route.table.frames, traverse.count()
-    resampled = model.step is not None
-    numbers = traverse.frame if isinstance(traverse, ResampledTraverse) else shown
-    if truth is not None:
-        found = find_ground_truth(truth, None, source_of(traverse), frames, numbers, False, resampled)
-        assert found is not None
-        places = route.place_of(found.positives[:, 0])
-        if not (places >= 0).any():
-            raise InputError(f"no frame of {traverse.name} shows a place of the map; expected some")
-        return Views(traverse, places)
-    if resampled or frames != shown:
-        seen = f"{traverse.name} has {shown} frames and the map {frames}{' at even steps' * resampled}"
-        raise InputError(
-            f"{seen}; expected as many, frame i being place i, or a truth that says what they show"
-        )
-    return Views(traverse, torch.arange(shown))
 
 
 def one_route(model: DejaVu, verb: str) -> SpectralMap:
@@ -286,10 +256,8 @@ def one_route(model: DejaVu, verb: str) -> SpectralMap:
         seen = f"the map is merged of the routes {names}"
         raise InputError(f"{seen}; expected to {verb} the map of a route, and to merge it")
     if not isinstance(route, SpectralMap):
-        seen = f"there is a map of kind {route.kind!r}"
-        raise InputError(
-            f"{seen}; expected one of kind {SpectralMap.kind!r} to {verb}, or to learn the route anew"
-        )
+        seen = f"there is a map of kind {route.kind!r}; expected one of kind {SpectralMap.kind!r} to {verb}"
+        raise InputError(f"{seen}, or to learn the route anew")
     return route
 
 
@@ -303,9 +271,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
             number: "route", "route-2".
 
     Returns:
-        A model whose `map.routes` are the routes. Scores of a route's places are those of its own map. A
-        threshold is kept where all have it. Calibration and precision hold for one route and are not kept;
-        a line says so.
+        A model whose `map.routes` are the routes, each with the scores of its own map. A threshold is kept if
+        all have it. Calibration and precision, which hold for one route, are not; a warning says so.
 
     Raises:
         InputError: fewer than two models, one without a map or of another kind, or models that differ in what
@@ -320,18 +287,14 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     if len(models) < 2 or len(names) != len(models):
         seen = f"{len(models)} maps and {len(names)} names to merge"
         raise InputError(f"{seen}; expected at least two maps, and a name for each")
-    first = models[0]
-    parts: list[SpectralMap] = []
-    taken: list[str] = []
+    first, parts = models[0], dict[str, SpectralMap]()
     for name, model in zip(names, models, strict=True):
-        own = _routes_of(model, name)
-        problem = "" if model is first else _unlike(first, model)
+        own, problem = _routes_of(model, name), _unlike(first, model)
         if problem:
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
         for wanted, part in own:
-            taken.append(_another(wanted, taken))
-            parts.append(part)
-    _check_count(sum(part.places for part in parts), first.step is not None)
+            parts[_another(wanted, parts)] = part
+    _check_count(sum(part.places for part in parts.values()), first.step is not None)
     thresholds = {model.threshold for model in models}
     merged = DejaVu(
         **first.settings()
@@ -339,7 +302,6 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         | {"threshold": first.threshold if len(thresholds) == 1 else None}
     )
     merged.weight_bits = first.weight_bits
-    merged.map = SpectralMap.merged(parts, taken)
     merged.frame_shape, merged.step = first.frame_shape, first.step
     merged.trained = first.trained if all(model.trained == first.trained for model in models) else None
     frames = [model.map.table.frames for model in models]
@@ -353,11 +315,11 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         log.warning(
             "the merged map has no %s: each holds only for the route it was made for", ", ".join(lost)
         )
-    return merged.eval()
+    return merged.replace_map(SpectralMap.merged([*parts.values()], [*parts]))
 
 
 def _routes_of(model: DejaVu, name: str) -> list[tuple[str, SpectralMap]]:
-    """Name and map of each route of a model's map; `name` where it is one."""
+    """Name and map of each route of a model's map; `name` for a single one."""
     route = model.map
     if not isinstance(route, SpectralMap) or not route.places:
         seen = f"a map of kind {route.kind!r}" if route.places else "no map"
@@ -365,34 +327,34 @@ def _routes_of(model: DejaVu, name: str) -> list[tuple[str, SpectralMap]]:
     return [(one.name, route.part(one.name)) for one in route.routes] or [(name, route)]
 
 
-def _another(name: str, taken: Sequence[str]) -> str:
-    """A name that is not taken: itself, or with the first free number after it."""
-    if name not in taken:
-        return name
-    return next(one for one in (f"{name}-{i}" for i in count(2)) if one not in taken)
+def _another(name: str, known: dict[str, SpectralMap]) -> str:
+    """The name itself, or with the first free number after it."""
+    return name if name not in known else next(f"{name}-{i}" for i in count(2) if f"{name}-{i}" not in known)
 
 
 def _unlike(first: DejaVu, other: DejaVu) -> str:
-    """What of two models makes other descriptors, or scores otherwise, in words; empty where nothing does."""
+    """What of two models makes other descriptors, or other scores, in words; "" if nothing does."""
+    if other is first:
+        return ""
     for what in ("preprocess", "features", "whitening", "velocity"):
         one, two = getattr(first, what), getattr(other, what)
-        if (one is None) != (two is None):
+        if one is None and two is None:
+            continue
+        if one is None or two is None:
             has = [f"has {'no ' if part is None else ''}{what}" for part in (one, two)]
             return f"the one {has[0]}, the other {has[1]}; expected the same"
-        if one is None:
-            continue
         stored, given = recipe_of(one), recipe_of(two)
         if stored != given:
             return f"their {what} differ: {difference(stored, given)}"
-        if not _same_tensors(one, two):
+        if _digest(one) != _digest(two):
             way = "--whitening" if what == "whitening" else "--descriptor"
             learned = f"as `dejavu learn ROUTE {way} MAP` takes it from another map"
             return f"their {what} were learned apart, with other numbers; expected the same, {learned}"
-    own, theirs = (_routes_of(model, "")[0][1] for model in (first, other))
+    own, theirs = first.map.settings(), other.map.settings()
     for what, mine, yours in (
-        ("metric", own.metric, theirs.metric),
-        ("transform", own.transform, theirs.transform),
-        ("dimensions of a descriptor", own.dimension, theirs.dimension),
+        ("metric", own["metric"], theirs["metric"]),
+        ("transform", own["transform"], theirs["transform"]),
+        ("dimensions of a descriptor", first.map.dimension, other.map.dimension),
         ("steps between places, in pixels of ground,", first.step, other.step),
     ):
         if mine != yours:
@@ -405,17 +367,13 @@ def _unlike(first: DejaVu, other: DejaVu) -> str:
     return ""
 
 
-def _same_tensors(one: torch.nn.Module, two: torch.nn.Module) -> bool:
-    """Whether what two modules hold is alike."""
-    states = one.state_dict(), two.state_dict()
-    return states[0].keys() == states[1].keys() and all(
-        torch.equal(value, states[1][name]) if isinstance(value, Tensor) else value == states[1][name]
-        for name, value in states[0].items()
-    )
+def _digest(module: nn.Module) -> dict[str, str]:
+    state = module.state_dict().items()
+    return checksums({name: value for name, value in state if isinstance(value, Tensor)}, None)
 
 
 def _joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
-    """Names of the frames of several parts; "" where a part has none."""
+    """Names of the frames of several parts; "" for those of a part without names."""
     if not any(parts):
         return []
     return [name for part, count in zip(parts, frames, strict=True) for name in part or [""] * count]
@@ -430,13 +388,13 @@ def _check_count(places: int, resampled: bool) -> None:
 
 def _check_alike(model: DejaVu, added: Traverse) -> None:
     """Refuse frames that are not like those that the map was learned from."""
-    shape, own = added.frame_shape, model.frame_shape
     if model.step is not None and not isinstance(added, ResampledTraverse):
         seen = (
             f"{added.name} has ready features or a single frame, whose steps along the ground nothing tells"
         )
         raise InputError(f"{seen}; expected frames, as the map's places are at even steps")
-    own = shape if own is None else own  # of a map that was learned from descriptors
+    shape = added.frame_shape
+    own = model.frame_shape or shape  # of a map that was learned from descriptors
     if len(own) != len(shape):
         kinds = {1: "ready features", 3: "frames"}
         seen = f"{added.name} holds {kinds[len(shape)]}, the map was learned from {kinds[len(own)]}"
@@ -444,10 +402,7 @@ def _check_alike(model: DejaVu, added: Traverse) -> None:
     if not _alike(model, own, shape):
         seen, known = (" x ".join(map(str, one)) for one in (shape, own))
         raise InputError(f"{added.name} has frames of {seen}; expected {known}, as the map was learned from")
-    numbers = next(model.describer._replace(batch_size=1).features(added)).shape[1]
-    expected = model.map.dimension
-    if model.whitening is not None and model.whitening.learned:
-        expected = len(model.whitening.projection)
+    numbers, expected = model.describer.count_features(added), model.features_per_frame
     if numbers != expected:
         seen = f"{added.name} gives {numbers} features a frame"
         raise InputError(f"{seen}; expected {expected}, as the map was learned from")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from itertools import chain
+from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from time import monotonic
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +24,6 @@ from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
-from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.types import InputError, Traverse
@@ -34,46 +34,42 @@ SAMPLE = 10_000  # frames that a route is fitted on; a route that has no more is
 STRETCHES = 4  # of a sample, at least
 ROWS = 4096  # descriptors on the device at a time
 FEW = IN_MEMORY // 4  # bytes of descriptors kept in memory
-OFF = 0.02  # of the bytes per place asked for: worth a word
-LONGEST_SEGMENT = 512  # queries that a filter follows, to be calibrated by
+OFF = 0.02  # deviation from the bytes per place asked for that is logged
+LONGEST_SEGMENT = 512  # queries that a filter follows in a calibration
 SEGMENT_SCORES = 2**22  # of the queries of a segment at all places
-CALIBRATION_SCORES = 2**30  # of all frames that a map is calibrated by, at all places
+CALIBRATION_SCORES = 2**30  # of all frames of a calibration at all places
 SAVED = 60  # seconds from one writing of a partial map to the next
+
+OnFirst = Callable[[Tensor, Tensor], None]  # of the first batch of frames, and its features
 
 
 class Describer(NamedTuple):
     """How a model describes frames: all that a process needs for it.
 
     pipeline: (B,C,H,W) -> (B,D), preprocess and features. whitening: (B,D) -> (B,K), None for none.
-    batch_size: frames at a time. device: of the model. bright: traverses whose frames were said to be bright.
+    batch_size: frames at a time. device: of the model. warned: (traverse, line) that were logged already.
     """
 
     pipeline: nn.Module
     whitening: Whitening | None
     batch_size: int
     device: torch.device
-    bright: set[str]
+    warned: set[tuple[str, str]]
 
     def features(
-        self,
-        traverse: Traverse,
-        progress: str | None = None,
-        on_first: Callable[[Tensor, Tensor], None] | None = None,
+        self, traverse: Traverse, progress: str | None = None, on_first: OnFirst | None = None
     ) -> Iterator[Tensor]:
         """Features of a traverse in batches (B,D), without gradients; see `feature_batches`."""
         return feature_batches(traverse, self.pipeline, self.batch_size, self.device, progress, on_first)
 
     def descriptors(
-        self,
-        traverse: Traverse,
-        progress: str | None = None,
-        on_first: Callable[[Tensor, Tensor], None] | None = None,
+        self, traverse: Traverse, progress: str | None = None, on_first: OnFirst | None = None
     ) -> Iterator[Tensor]:
         """Descriptors of a traverse in batches (B,K), without gradients."""
         return map(self.whitened, self.features(traverse, progress, on_first))
 
     def whitened(self, features: Tensor) -> Tensor:
-        """Descriptors of features, (B,D) -> (B,K); the features themselves without whitening."""
+        """Features (B,D) -> descriptors (B,K)."""
         return features if self.whitening is None else self.whitening(features)
 
     def require_learning(self, name: str) -> None:
@@ -88,8 +84,8 @@ class Describer(NamedTuple):
 
     def warn_of_bright(self, frames: Tensor, name: str) -> None:
         """Once for each traverse, see `warn_of_bright`."""
-        if name not in self.bright and warn_of_bright(frames, name):
-            self.bright.add(name)
+        if (name, "bright") not in self.warned and warn_of_bright(frames, name):
+            self.warned.add((name, "bright"))
 
     def reference(
         self,
@@ -98,14 +94,14 @@ class Describer(NamedTuple):
         progress: str | None = None,
         spectral: bool = True,
     ) -> Tensor:
-        """Descriptors (N,K) of a reference, from which the whitening is learned first, if it is.
+        """Descriptors (N,K) of a reference; the whitening is learned from it first, unless it is fixed.
 
         Args:
-            second: as of `DejaVu.learn`. spectral: whether a spectral map is made of them: features beyond
-                `concatenate`'s share of the memory then whiten by a sample, and many descriptors lie in a
-                temporary file, whitened ones as float16, which is finer than any step.
+            second: see `DejaVu.learn`. spectral: for a spectral map whitening learns from a sample if the
+                features exceed the memory, and many descriptors lie in a temporary file, as float16 if they
+                are whitened, which is finer than any step.
         """
-
+        learns = self.whitening is not None and not self.whitening.fixed
         if second is not None:
             self.require_learning(second.traverse.name)
 
@@ -113,21 +109,16 @@ class Describer(NamedTuple):
             self.warn_of_bright(frames, traverse.name)
             check_alone(self.pipeline, frames, features, traverse.name)
 
-        def stored(descriptors: Iterator[Tensor]) -> Tensor:
-            if spectral:
-                return concatenate(descriptors, FEW, half=self.whitening is not None)
-            return concatenate(descriptors)
-
-        if self.whitening is None or self.whitening.fixed:
-            return stored(self.descriptors(traverse, progress, check_first))
-        if spectral and self._has_many_features(traverse):
+        if learns and not (spectral and self._has_many_features(traverse)):
+            features = concatenate(self.features(traverse, progress, check_first))
+            self._learn_whitening(features, traverse, second, progress)
+            return concatenate(self.whitened(part.to(self.device)) for part in features.split(ROWS))
+        if learns:
             sample = Sample.of(traverse.count(), SAMPLE)
             own = second and sample.views(second)
             self.reference(Selection(traverse, sample.frame), own, progress and "sampling")
-            return stored(self.descriptors(traverse, progress))
-        features = concatenate(self.features(traverse, progress, check_first))
-        self._learn_whitening(features, traverse, second, progress)
-        return concatenate(self.whitened(part.to(self.device)) for part in features.split(ROWS))
+        batches = self.descriptors(traverse, progress, None if learns else check_first)
+        return concatenate(batches, FEW, self.whitening is not None) if spectral else concatenate(batches)
 
     def _learn_whitening(
         self, features: Tensor, traverse: Traverse, second: Views | None, progress: str | None
@@ -150,7 +141,7 @@ class Describer(NamedTuple):
         whitening.to(self.device)
 
     def _has_many_features(self, traverse: Traverse) -> bool:
-        """Whether the features of a traverse are too many to be held, so that a sample has to do."""
+        """Whether the features of a traverse exceed the memory."""
         if traverse.length is not None and traverse.length <= SAMPLE:
             return False
         one = next(self.features(Selection(traverse, torch.zeros(1, dtype=torch.int64))))
@@ -173,8 +164,8 @@ class Describer(NamedTuple):
         shown = views.places.to(rows.device) >= 0
         return rows[shown], views.places[shown.to(views.places.device)]
 
-    def read_anywhere(self, views: Views, progress: str | None = None) -> Views:
-        """Views that can be read anywhere: as they are, or the features of all, which may lie in a file."""
+    def seekable(self, views: Views, progress: str | None = None) -> Views:
+        """Views of a traverse that seeks: as they are, or the features of all, which may lie in a file."""
         if views.traverse.seeks:
             return views
         features = concatenate(self.features(views.traverse, progress and "averaging"))
@@ -186,8 +177,7 @@ class Describer(NamedTuple):
         Raises:
             InputError: naming both.
         """
-        one = self._replace(batch_size=1)
-        counts = [next(one.features(traverse)).shape[1] for traverse in (reference, query)]
+        counts = [self.count_features(traverse) for traverse in (reference, query)]
         if counts[0] != counts[1]:
             seen = " and ".join(
                 f"{traverse.name} gives {count} features a frame of "
@@ -197,11 +187,15 @@ class Describer(NamedTuple):
             raise InputError(f"{seen}; expected as many, as frames of one size give")
         return counts[0]
 
+    def count_features(self, traverse: Traverse) -> int:
+        """D, of the first frame."""
+        return next(self._replace(batch_size=1).features(traverse)).shape[1]
+
 
 class Sample(NamedTuple):
-    """Evenly spaced stretches of a route; whole chunks of it, where these are short enough.
+    """Evenly spaced stretches of a route; whole chunks of it, if these are short enough.
 
-    frame: (n,) int64, the frames. stretch: how many each stretch has.
+    frame: (n,) int64, the frames. stretch: frames of each stretch.
     """
 
     frame: Tensor
@@ -209,7 +203,7 @@ class Sample(NamedTuple):
 
     @classmethod
     def of(cls, frames: int, chunk: int) -> Sample:
-        """The sample of a route of over `SAMPLE` frames, coded in chunks of so many.
+        """The sample of a route of over `SAMPLE` frames that is coded in chunks of `chunk`.
 
         Example:
             >>> sample = Sample.of(100_000, chunk=1000)
@@ -229,7 +223,7 @@ class Sample(NamedTuple):
         return Views(Selection(views.traverse, shown), at[shown])
 
     def views(self, second: Views) -> Views:
-        """As `shown`, to learn from.
+        """As `shown`.
 
         Raises:
             InputError: it shows nothing of the sample.
@@ -242,24 +236,20 @@ class Sample(NamedTuple):
 
 
 class ChunkCoder(NamedTuple):
-    """All that makes coded chunks from frames, once whitening, mean and step are known.
+    """Codes chunks of frames, once whitening, mean and step are known: here, in a process, on a machine.
 
-    describer: of the model. frames: N, of the route. chunk: places of a chunk.
-    mean, step, transform, resolution: as of `code_chunk`.
-    visits: frames of another traverse, averaged with those of the places that they show, if not None; read a
-        chunk's frames at a time, so that it has to be one that `seeks`.
+    describer: of the model. frames: N, of the route. chunk: places of a chunk. code: descriptors (W,K) of a
+    chunk -> Chunk. visits: frames of a traverse that `seeks`, averaged with those of the places that they
+    show; None averages nothing.
 
-    Convention: batches begin where a chunk does, so that what precedes a chunk changes nothing in it.
-        Matrix products round differently by the number of threads: work `in_one_thread`.
+    Convention: no batch spans two chunks, so that what precedes a chunk changes nothing in it. Matrix
+        products round differently by the number of threads: work `in_one_thread`.
     """
 
     describer: Describer
     frames: int
     chunk: int
-    mean: Tensor
-    step: float
-    transform: Transform
-    resolution: float
+    code: Callable[[Tensor], Chunk]
     visits: Views | None = None
 
     @classmethod
@@ -267,8 +257,9 @@ class ChunkCoder(NamedTuple):
         cls, route: SpectralMap, describer: Describer, frames: int, visits: Views | None = None
     ) -> ChunkCoder:
         """For so many frames of a map's route, or of places to append to it."""
-        coding = route.chunk, route.means[-1], route.step, route.transform, route.resolution
-        return cls(describer, frames, *coding, visits)
+        settings = {"transform": route.transform, "resolution": route.resolution}
+        code = partial(code_chunk, mean=route.means[-1], step=route.step, **settings)  # type: ignore[arg-type]
+        return cls(describer, frames, route.chunk, code, visits)
 
     @property
     def total(self) -> int:
@@ -281,27 +272,24 @@ class ChunkCoder(NamedTuple):
 
     @torch.no_grad()
     def chunks(self, traverse: Traverse, wanted: range, progress: str | None = None) -> Iterator[Chunk]:
-        """The chunks of these numbers, one after another, holding no more than one.
-
-        Args:
-            progress: see `feature_batches`.
+        """The chunks of these numbers in order; memory holds one.
 
         Raises:
-            InputError: frames that cannot be read, or as of `feature_batches` and `code_chunk`.
+            InputError: frames that cannot be read, or as `feature_batches` and `code_chunk`.
         """
-        part = _ByChunks(traverse, *self.span(wanted), self.chunk)
+        start, stop = self.span(wanted)
+        part = _ByChunks(traverse, start, stop, self.chunk)
         held: list[Tensor] = []
-        done = 0
+        done = start
         for rows in self.describer.descriptors(part, progress):
             held.append(rows)
             done += len(rows)
-            if done % self.chunk == 0 or done == part.length:
+            if done % self.chunk == 0 or done == stop:
                 rows = torch.cat(held)
-                rows = self._averaged(rows, part.start + done - len(rows))
-                yield code_chunk(rows, self.mean, self.step, self.transform, self.resolution)
+                yield self.code(self._averaged(rows, done - len(rows)))
                 held = []
-        if done < part.length:
-            seen = f"{traverse.name} ended at frame {part.start + done}"
+        if done < stop:
+            seen = f"{traverse.name} ended at frame {done}"
             raise InputError(f"{seen}; expected {self.frames} frames, as it had before")
 
     def _averaged(self, rows: Tensor, start: int) -> Tensor:
@@ -320,10 +308,7 @@ class ChunkCoder(NamedTuple):
 
 
 class _ByChunks(Traverse):
-    """The frames [start, stop) of a traverse, in batches none of which spans two chunks.
-
-    Batches are as large as they may be, so that their borders do not depend on how the traverse is read.
-    """
+    """The frames [start, stop) of a traverse, in batches as large as may be that do not span two chunks."""
 
     length: int
 
@@ -333,23 +318,18 @@ class _ByChunks(Traverse):
         self.frame = getattr(traverse, "frame", range(stop))[start:stop]  # of the source, for messages
 
     def batches(self, size: int) -> Iterator[Tensor]:
-        held: list[Tensor] = []
-        done, wanted = 0, min(size, self.chunk, self.length)
         span = range(self.start, self.start + self.length)
-        # what cannot be read is then read with no chunk but its own
+        # frames that cannot be read are then read with no chunk but their own
         step = self.chunk if self.traverse.seeks else self.length
         parts = (self.traverse.select(span[i : i + step], size) for i in range(0, self.length, step))
-        for batch in chain.from_iterable(parts):
-            while len(batch):
-                part, batch = batch[:wanted], batch[wanted:]
-                held.append(part)
-                wanted -= len(part)
-                done += len(part)
-                if not wanted:
-                    yield held[0] if len(held) == 1 else torch.cat(held)
-                    held, wanted = [], min(size, self.chunk - done % self.chunk, self.length - done)
-        if held:  # the traverse ended early
-            yield torch.cat(held)
+        frames, done = chain.from_iterable(chain.from_iterable(parts)), 0
+        while done < self.length:
+            wanted = min(size, self.chunk - done % self.chunk, self.length - done)
+            batch = [*islice(frames, wanted)]
+            if not batch:  # the traverse ended early
+                return
+            yield torch.stack(batch)
+            done += len(batch)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
@@ -363,7 +343,7 @@ Code = Callable[[ChunkCoder, Traverse, int, str | None], Iterator[Chunk]]
 def code_here(
     coder: ChunkCoder, traverse: Traverse, first: int, progress: str | None = None
 ) -> Iterator[Chunk]:
-    """The chunks of a traverse from number `first` on, made in this process."""
+    """The chunks of a traverse from number `first` on, coded in this process."""
     with in_one_thread():
         yield from coder.chunks(traverse, range(first, coder.total), progress)
 
@@ -380,12 +360,13 @@ def in_one_thread() -> Iterator[None]:
 
 
 class Checkpoint:
-    """The partial map of a long run in a file, from which the same command goes on after a kill.
+    """The partial map of a long run, `FILE.part`, from which the same command continues after a kill.
 
     Args:
-        path: of the map; the partial one is `FILE.part` beside it.
-        key: digests of all that the chunks are made of, by what it is. Of the source only the files of
-            finished chunks have to be as they were: one that cannot be read may be replaced.
+        path: of the map.
+
+    Convention: a run is the same if digests of everything that makes the chunks are. Of the source only the
+        files of finished chunks must be unchanged: one that cannot be read may be replaced.
     """
 
     def __init__(self, path: Path) -> None:
@@ -395,31 +376,37 @@ class Checkpoint:
         self.opened = False
 
     def open(
-        self, key: Mapping[str, str], traverse: Traverse
-    ) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-        """What the run of this key has finished of a traverse, tensors and state; None if nothing.
+        self, key: Mapping[str, str], traverse: Traverse, route: SpectralMap, whitening: Whitening | None
+    ) -> bool:
+        """Load what the run of this key has finished of a traverse; False if nothing.
+
+        Args:
+            route: an empty map, and `whitening`, to load into.
 
         Raises:
             InputError: the file is of a run with another key, or of none, or finished frames were changed.
         """
-        self.key, self.opened, found = key, True, None
-        if self.path.exists():
-            try:
-                tensors, header = read_map(self.path)
-                known, state = header["run"], header["state"]
-            except (InputError, KeyError) as error:
-                seen = f"{self.path} is no partial map"
-                raise InputError(f"{seen}; expected none to be there") from error
-            if known != key:
-                other = [name for name in {**key, **known} if key.get(name) != known.get(name)]
-                self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
-            if state["seen"] != traverse.state(0, state["map"]["places"]):
-                self._refuse(": frames of its source were changed")
-            found = tensors, state
-        return found
+        self.key, self.opened = key, True
+        if not self.path.exists():
+            return False
+        try:
+            tensors, header = read_map(self.path)
+            known, state = header["run"], header["state"]
+        except (InputError, KeyError) as error:
+            raise InputError(f"{self.path} is no partial map; expected none to be there") from error
+        if known != key:
+            other = [name for name in {**key, **known} if key.get(name) != known.get(name)]
+            self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
+        if state["seen"] != traverse.state(0, state["map"]["places"]):
+            self._refuse(": frames of its source were changed")
+        if whitening is not None:
+            whitening.load_state_dict(part_of(tensors, "whitening"))
+        route.load_packed(part_of(tensors, "map"), state["map"])
+        route.needed, route.energy, route.error = state["needed"], state["energy"], state["error"]
+        return True
 
     def check_unused(self) -> None:
-        """Refuse a run without checkpoints where there is the partial map of another.
+        """Refuse a run without checkpoints if there is the partial map of another.
 
         Raises:
             InputError: naming the file.
@@ -443,11 +430,9 @@ class Checkpoint:
         tensors = {f"map.{name}": tensor for name, tensor in route.packed().items()}
         if whitening is not None:
             tensors |= {f"whitening.{name}": tensor for name, tensor in whitening.state_dict().items()}
-        extra = {name: getattr(route, name) for name in ("needed", "energy", "error")}
-        extra["seen"] = traverse.state(0, route.places)
-        write_map(
-            self.path, tensors, {"run": dict(self.key), "state": {"map": route.get_extra_state(), **extra}}
-        )
+        state = {name: getattr(route, name) for name in ("needed", "energy", "error")}
+        state |= {"map": route.get_extra_state(), "seen": traverse.state(0, route.places)}
+        write_map(self.path, tensors, {"run": dict(self.key), "state": state})
         self.written, self.kept = monotonic(), route.places
 
     def remove(self) -> None:
@@ -467,48 +452,43 @@ def learn_map(
     second: Views | None = None,
     visits: Views | None = None,
     progress: str | None = None,
-    run: tuple[Checkpoint, Callable[[], Mapping[str, str]]] | None = None,
+    checkpoint: Checkpoint | None = None,
+    key: Callable[[], Mapping[str, str]] = dict,
     code: Code = code_here,
 ) -> PlaceMap:
-    """The map of a traverse, and the describer's whitening for it.
+    """The map of a traverse; the describer's whitening is learned for it.
 
-    A route of up to `SAMPLE` frames, or of one chunk, is described as a whole, and its map is made from that.
-    Of a longer one a sample is described and fitted, and then each chunk described, coded and added, so that
-    memory holds a chunk, the sample and the map.
+    A route of up to `SAMPLE` frames, or of one chunk, is described and coded as a whole. Of a longer one a
+    sample is described and fitted, and then each chunk described, coded and added, so that memory holds a
+    chunk, the sample and the map.
 
     Args:
-        second, visits, code: see `DejaVu.learn`.
-        run: where a long run keeps its partial map, and what makes its key.
+        second, visits, checkpoint, code: see `DejaVu.learn`. key: digests of the run, see `Checkpoint`.
     """
-    overhead = positions_of(traverse).nbytes
-    mapper = mapper.with_overhead(overhead, is_ready(traverse))
-    if isinstance(mapper, SpectralMapper):
-        frames = traverse.count()
-        if frames > max(SAMPLE, mapper.chunk):
-            counts = visits and observation_counts(visits, frames)
-            found = run[0].open(run[1](), traverse) if run else None
-            visits = visits and describer.read_anywhere(visits, progress)
-            with in_one_thread():
-                route = _resumed(describer, mapper, found) or _fitted(
-                    describer, mapper, traverse, frames, second, visits, progress, overhead
-                )
-            coder = ChunkCoder.like(route, describer, frames, visits)
-            extend(route, coder, traverse, progress, run and run[0], code)
-            if counts is not None:
-                route.count_visits(1 + counts)
-            _tell_reached(route, mapper)
-            return route
-    if run is not None:
-        run[0].check_unused()
-    descriptors = describer.reference(traverse, second, progress, isinstance(mapper, SpectralMapper))
-    if visits is None:
-        return learn_descriptors(mapper, descriptors)
-    counts = observation_counts(visits, len(descriptors))
-    seen = describer.visits(visits, descriptors.shape[1], progress)
-    means = with_visits(descriptors.float(), torch.ones(len(descriptors)), *seen)
-    whole = learn_descriptors(mapper, means)
-    whole.count_visits(1 + counts)
-    return whole
+    mapper = mapper.with_overhead(positions_of(traverse).nbytes, is_ready(traverse))
+    spectral = isinstance(mapper, SpectralMapper)
+    if isinstance(mapper, SpectralMapper) and (frames := traverse.count()) > max(SAMPLE, mapper.chunk):
+        counts = visits and observation_counts(visits, frames)
+        long = mapper.empty().to(describer.device)
+        with in_one_thread():
+            if checkpoint is None or not checkpoint.open(key(), traverse, long, describer.whitening):
+                long = _fitted(describer, mapper, traverse, frames, second, visits, progress)
+        coder = ChunkCoder.like(long, describer, frames, visits and describer.seekable(visits, progress))
+        extend(long, coder, traverse, progress, checkpoint, code)
+        _log_reached(long, mapper)
+        route: PlaceMap = long
+    else:
+        if checkpoint is not None:
+            checkpoint.check_unused()
+        descriptors = describer.reference(traverse, second, progress, spectral)
+        counts = visits and observation_counts(visits, len(descriptors))
+        if visits is not None:
+            seen = describer.visits(visits, descriptors.shape[1], progress)
+            descriptors = with_visits(descriptors.float(), torch.ones(len(descriptors)), *seen)
+        route = learn_descriptors(mapper, descriptors)
+    if counts is not None:
+        route.count_visits(1 + counts)
+    return route
 
 
 @torch.no_grad()
@@ -519,25 +499,11 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
         InputError: a map of other sizes.
     """
     route: PlaceMap = mapper(descriptors)
-    if route.places != len(descriptors) or route.dimension != descriptors.shape[1]:
+    if (route.places, route.dimension) != tuple(descriptors.shape):
         raise InputError(
             f"{type(mapper).__name__} made a map of {route.places} places of {route.dimension} "
             f"features from features {tuple(descriptors.shape)}; expected as many"
         )
-    return route
-
-
-def _resumed(
-    describer: Describer, mapper: SpectralMapper, found: tuple[dict[str, Tensor], dict[str, Any]] | None
-) -> SpectralMap | None:
-    if found is None:
-        return None
-    tensors, state = found
-    if describer.whitening is not None:
-        describer.whitening.load_state_dict(part_of(tensors, "whitening"))
-    route = mapper.empty().to(describer.device)
-    route.load_packed(part_of(tensors, "map"), state["map"])
-    route.needed, route.energy, route.error = state["needed"], state["energy"], state["error"]
     return route
 
 
@@ -549,7 +515,6 @@ def _fitted(
     second: Views | None,
     visits: Views | None,
     progress: str | None,
-    overhead: int,
 ) -> SpectralMap:
     """Whitening, mean and step of a long route, from a sample of it: a map without places."""
     sample = Sample.of(frames, mapper.chunk)
@@ -558,11 +523,10 @@ def _fitted(
     if visits is not None and len((shown := sample.shown(visits)).places):
         seen = describer.visits(shown, descriptors.shape[1])
         descriptors = with_visits(descriptors.float(), torch.ones(len(descriptors)), *seen)
-    # what the file holds once counts for the sample by its share alone
+    # of what the file holds once, the sample pays its share alone
     share, once = len(descriptors) / frames, 2 * descriptors.shape[1]
-    counted = round(share * overhead - (1 - share) * once)
-    route = mapper.with_overhead(counted, mapper.ready).fit(descriptors, sample.stretch)
-    return route.to(describer.device)
+    counted = round(share * mapper.overhead - (1 - share) * once)
+    return mapper.with_overhead(counted, mapper.ready).fit(descriptors, sample.stretch).to(describer.device)
 
 
 def extend(
@@ -583,12 +547,11 @@ def extend(
     held: list[Chunk] = []
 
     def add() -> None:
-        if not held:
-            return
-        route.extend(held)
-        held.clear()
-        if checkpoint is not None:
-            checkpoint.save(route, coder.describer.whitening, traverse)
+        if held:
+            route.extend(held)
+            held.clear()
+            if checkpoint is not None:
+                checkpoint.save(route, coder.describer.whitening, traverse)
 
     try:
         for chunk in code(coder, traverse, len(route.chunks), progress):
@@ -598,19 +561,19 @@ def extend(
                 add()
         add()
     except BaseException as error:  # also if the user interrupts it
-        if checkpoint is not None:
-            with suppress(InputError):  # as on a full disk
-                add()
-        if checkpoint is None or not checkpoint.kept or not isinstance(error, InputError):
+        if checkpoint is None:
+            raise
+        with suppress(InputError):  # as on a full disk
+            add()
+        if not checkpoint.kept or not isinstance(error, InputError):
             raise
         kept = f"{checkpoint.kept} of {coder.frames} places are kept in {checkpoint.path} for the next run"
         raise InputError(f"{error}; {kept}") from error
 
 
-def _tell_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
-    """The bytes of a long route and what it holds, where the sample promised other bytes."""
-    wanted, places = mapper.budget, route.places
-    summary = route.summary()
+def _log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
+    """The bytes of a long route, and the variance that it holds, if the sample promised other bytes."""
+    wanted, places, summary = mapper.budget, route.places, route.summary()
     if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
         return
     overhead = mapper.overhead if 2 * mapper.overhead <= wanted * places else 0
@@ -645,7 +608,7 @@ def observation_counts(visits: Views, places: int) -> Tensor:
 
 
 def is_ready(traverse: Traverse | None) -> bool:
-    """Whether a traverse is known to hold ready features, not frames."""
+    """Whether a traverse holds ready features, not frames."""
     return traverse is not None and len(traverse.frame_shape) == 1
 
 
@@ -670,26 +633,22 @@ def calibration_of(
     views: Views | None = None,
     places: Tensor | None = None,
 ) -> Calibration:
-    """How probably answers of a map are right, by how much they stand out; see `DejaVu.calibrate`."""
+    """How probably answers of a map are right, by their confidence; see `DejaVu.calibrate`."""
     if views is None:
         if reference is None:
             raise InputError("neither a reference nor views to calibrate by; expected one of them")
-        whitening = describer.whitening
-        strengths = STRENGTHS if whitening is None else whitening.strengths
+        strengths = STRENGTHS if describer.whitening is None else describer.whitening.strengths
         places = torch.arange(route.places) if places is None else places
         stretches = Stretches(reference, len(places), strengths, places=route.places)
         views = Views(stretches, places[stretches.places])
-    name, another = views.traverse.name, not isinstance(views.traverse, Stretches)
+    observation_counts(views, route.places)  # refuses places beyond the map's
+    another = not isinstance(views.traverse, Stretches)
     if isinstance(views.traverse, Stretches):
         length = views.traverse.stretch
     else:
         length = max(STRETCH, min(LONGEST_SEGMENT, SEGMENT_SCORES // route.places))
-    if len(views.places) and int(views.places.max()) >= route.places:
-        shown = f"{name} shows place {int(views.places.max())}"
-        raise InputError(f"{shown}; expected one of the map's {route.places}")
-    if another:
         views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // route.places))
-    descriptors = concatenate(describer.descriptors(views.traverse))
+    name, descriptors = views.traverse.name, concatenate(describer.descriptors(views.traverse))
     if len(descriptors) != len(views.places):
         seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
         raise InputError(f"{seen}; expected as many")
@@ -701,8 +660,7 @@ def calibration_of(
 
 
 def _segments_of(views: Views, length: int, most: int) -> Views:
-    """Evenly spaced segments of views, of that length and about `most` frames in all; all if there are no
-    more."""
+    """Evenly spaced segments of views, about `most` frames in all."""
     count, wanted = len(views.places) // length, max(1, most // length)
     if count <= wanted:
         return views

@@ -7,6 +7,7 @@ import inspect
 import logging
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from torch.nn.parameter import is_lazy
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
-from dejavu_torch.features.extract import check_queries, features_of
+from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
@@ -74,20 +75,18 @@ class DejaVu(nn.Module):
 
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
-        whitening: makes few numbers of the features, learned anew with each map unless it is `fixed`; "none"
-            keeps the features, though of ready ones of over 256 numbers a SpectralMapper gets the principal
-            components, as of `Whitening(views=0)`; None is Whitening ahead of a SpectralMapper, "none" ahead
-            of templates.
+        whitening: reduces features to few numbers, learned anew with each map unless it is `fixed`; None is
+            Whitening for a SpectralMapper and "none" for templates; "none" keeps the features, though a
+            SpectralMapper gets the principal components of ready ones of over 256 numbers.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
-        threshold: accept a match when its score is below; infinity accepts every finite score.
-        precision: accept a match instead where it is at least as probably right, above 0 and below 1; of a
-            map that is calibrated, see `calibrate`. Without either, a calibrated map accepts from .5 on, and
-            any other every finite score, see `acceptance`.
+        threshold: accept a match if its score is below; infinity accepts every finite score.
+        precision: accept a match instead if it is at least as probably right, above 0 and below 1; the map
+            has to be calibrated. See `acceptance` for neither.
         batch_size: frames in memory at a time.
-        preprocess: size, colour and contrast of the frames ahead of the features; None is Preprocess with its
-            defaults, which reduces the longer side to 160 pixels and changes nothing else.
+        preprocess: size, colour and contrast of the frames; None is Preprocess with its defaults, which
+            reduces the longer side to 160 pixels and changes nothing else.
         velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
-            None takes the frames as they are.
+            None uses the frames as they are.
         weight_bits: of each weight of the features in the file; 8 rounds them in place, with a scale for each
             output channel.
 
@@ -123,9 +122,8 @@ class DejaVu(nn.Module):
         if whitening not in (None, "none") and not isinstance(whitening, Whitening):
             raise InputError(f"the whitening is {whitening!r}; expected a Whitening, 'none' or None")
         if mapper is not None and not isinstance(mapper, Mapper):
-            raise InputError(
-                f"the mapper is a {type(mapper).__name__}; expected a Mapper such as TemplateMapper"
-            )
+            seen = f"the mapper is a {type(mapper).__name__}"
+            raise InputError(f"{seen}; expected a Mapper such as TemplateMapper")
         if not isinstance(batch_size, int) or batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
         if threshold is not None and not threshold > -math.inf:
@@ -151,6 +149,7 @@ class DejaVu(nn.Module):
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
+        self._whitens = self.whitening is not None  # else it may be made for a route, see `_describer_of`
         self.threshold = None if threshold is None else float(min(threshold, HIGHEST))
         self.precision = precision
         self.batch_size = batch_size
@@ -158,15 +157,11 @@ class DejaVu(nn.Module):
         self.map: PlaceMap = self.mapper.empty()
         self.step: float | None = None  # pixels of ground from one place of the map to the next
         self.frame_shape: tuple[int, ...] | None = None  # of the reference, or (D,) of ready features
-        self.frame_names: list[str] = []  # of the reference's frames; empty where they have none
+        self.frame_names: list[str] = []  # of the reference's frames; empty if they have none
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
-        self.find: Callable[[Tensor, int], Best] | None = (
-            None  # finds places in place of `search`, as a cluster
-        )
-        self._reduces = False  # whether `_reduce` has set the whitening
-        self._told: set[tuple[str, str]] = set()  # lines that are said once
-        self._bright: set[str] = set()  # traverses that were said to be bright
+        self.find: Callable[[Tensor, int], Best] | None = None  # in place of `search`, as a cluster does
+        self._warned: set[tuple[str, str]] = set()  # traverse and line of warnings that are logged once
 
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
@@ -186,48 +181,40 @@ class DejaVu(nn.Module):
 
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
-            second: another traverse of the same places, from which whitening learns, in place of augmented
-                copies, what changes between two visits; `growth.second_traverse` makes it.
+            second: another traverse of the same places, from which whitening learns what changes between two
+                visits, in place of augmented copies; `growth.second_traverse` makes it.
             progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
-            checkpoint: where a long route keeps its partial map, so that learning goes on from there after a
-                kill; it is the caller's to remove.
-            code: what makes the chunks of a long route: `code_here`, or a cluster.
+            checkpoint: keeps the partial map of a long route, from which learning continues after a kill; it
+                is the caller's to remove.
+            code: what codes the chunks of a long route: `code_here`, or a cluster.
             visits: see `growth.learn_mean`.
 
         Returns:
-            self, in eval mode, with the map in `self.map`. A route in which nothing repeats gives a template
-            map without layers, on which every place scores +inf. Features beyond `concatenate`'s share of
-            the memory spill to a temporary file; descriptors stay in it, (N,K) and a few temporary copies.
+            self, in eval mode, with the map in `self.map`. If nothing repeats in a route, its template map
+            has no layers, and every place scores +inf.
 
-        Convention: of a route of over `SAMPLE` frames, and over one chunk, a spectral map learns whitening,
-            mean and step from a sample, see `learning.Sample`, and its chunks are made one by one. Memory
-            holds a chunk, the sample and the map, whatever the number of frames.
+        Convention: memory holds the descriptors (N,K) and a few copies of them; of a route of over `SAMPLE`
+            frames, and over one chunk, a spectral map learns whitening, mean and step from a sample, see
+            `learning.Sample`, and memory holds a chunk, the sample and the map.
 
         Raises:
-            InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames.
+            InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames. The
+                model is left as it was.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
-        state = None if self.whitening is None else copy.deepcopy(self.whitening.state_dict())
-        before = self.whitening, self._reduces
-        self._reduce(traverse)
-        run = None if checkpoint is None else (checkpoint, lambda: run_key(self, traverse, second, visits))
-        text = "learning" if progress else None
-        try:
-            route = learn_map(self.describer, self.mapper, traverse, second, visits, text, run, code)
-        except InputError:  # the map that there was has its own whitening
-            self.whitening, self._reduces = before
-            if self.whitening is not None and state is not None:
-                self.whitening.load_state_dict(state)
-            raise
+        describer, text = self._describer_of(traverse), "learning" if progress else None
+        key = partial(run_key, self, traverse, second, visits)
+        route = learn_map(describer, self.mapper, traverse, second, visits, text, checkpoint, key, code)
+        self._keep(describer.whitening)
         return self._take(route, traverse)
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
-        """As `learn`, from descriptors that are there already. It ends in eval mode.
+        """As `learn`, from descriptors that are there already.
 
         Args:
-            features: (N,K) float, whitened where the model whitens.
-            traverse: what they come from, where known: the map then knows what frames to expect, and,
-                where they were resampled, which frame each place shows.
+            features: (N,K) float, whitened if the model whitens.
+            traverse: what they come from, if known: then the map knows which frames to expect, and which
+                frame each place of resampled ones shows.
         """
         overhead = positions_of(traverse).nbytes
         mapper = self.mapper.with_overhead(overhead, is_ready(traverse))
@@ -239,13 +226,15 @@ class DejaVu(nn.Module):
         """Descriptors (N,K) of the reference, the whitening learned from it: what `learn_features` takes.
 
         Args:
-            second: as of `learn`. progress: text of a progress bar on a terminal; None shows nothing.
+            second: see `learn`. progress: text of a progress bar on a terminal; None shows nothing.
 
         Raises:
             InputError: as `learn`, or a second traverse that no whitening learns from.
         """
-        self._reduce(traverse)
-        return self.describer.reference(traverse, second, progress, isinstance(self.mapper, SpectralMapper))
+        describer = self._describer_of(traverse)
+        found = describer.reference(traverse, second, progress, isinstance(self.mapper, SpectralMapper))
+        self._keep(describer.whitening)
+        return found
 
     @property
     def describer(self) -> Describer:
@@ -253,16 +242,26 @@ class DejaVu(nn.Module):
         pixels = math.prod(own_size(self.features) or (1,))  # fewer frames at a time if these become large
         batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
         pipeline = nn.Sequential(self.preprocess, self.features)
-        return Describer(pipeline, self.whitening, batch, self.map.positions.device, self._bright)
+        return Describer(pipeline, self.whitening, batch, self.map.positions.device, self._warned)
 
-    def _reduce(self, traverse: Traverse) -> None:
-        """Ready features too wide for a spectral map become principal components without whitening, too."""
-        ready = is_ready(traverse) and isinstance(self.mapper, SpectralMapper)
-        wide = ready and traverse.frame_shape[0] > WIDEST
-        if wide and self.whitening is None:
-            self.whitening, self._reduces = Whitening(views=0).to(self.map.positions.device), True
-        elif self._reduces and not wide:  # of a route that was learned before
-            self.whitening, self._reduces = None, False
+    def _describer_of(self, traverse: Traverse) -> Describer:
+        """As `describer`, to learn from a traverse, with a whitening of its own unless it is fixed.
+
+        Ready features too wide for a spectral map become principal components without whitening, too.
+        """
+        whitening = copy.deepcopy(self.whitening) if self._whitens else None
+        if whitening is not None and whitening.fixed:
+            whitening = self.whitening
+        wide = is_ready(traverse) and traverse.frame_shape[0] > WIDEST
+        if whitening is None and wide and isinstance(self.mapper, SpectralMapper):
+            whitening = Whitening(views=0).to(self.map.positions.device)
+        return self.describer._replace(whitening=whitening)
+
+    def _keep(self, learned: Whitening | None) -> None:
+        if self.whitening is not None and self._whitens and learned is not None:
+            self.whitening.load_state_dict(learned.state_dict())  # it may be the user's, too
+        else:
+            self.whitening = learned
 
     def take_whitening(self, other: DejaVu) -> None:
         """Describe as another model does: its whitening as it is, and what is ahead of it.
@@ -274,7 +273,7 @@ class DejaVu(nn.Module):
             raise InputError("its map was learned without whitening; expected one that was learned with it")
         self.preprocess, self.features, self.whitening = other.preprocess, other.features, other.whitening
         self.weight_bits = other.weight_bits
-        self.whitening.fixed = True
+        self.whitening.fixed = self._whitens = True
 
     def take_descriptor(self, other: DejaVu) -> None:
         """Make features as another model does, such as one trained on many routes; whitening is learned anew.
@@ -326,9 +325,9 @@ class DejaVu(nn.Module):
         if size == own:
             return traverse
         line = f"frames of {own[0]} x {own[1]} pixels are brought to {size[0]} x {size[1]}, {why}"
-        if (traverse.name, line) not in self._told:
+        if (traverse.name, line) not in self._warned:
             log.warning("%s: %s", traverse.name, line)
-            self._told.add((traverse.name, line))
+            self._warned.add((traverse.name, line))
         return at_size(traverse, size)
 
     def _take(self, route: PlaceMap, traverse: Traverse | None) -> DejaVu:
@@ -348,8 +347,12 @@ class DejaVu(nn.Module):
         self.step = traverse.step if isinstance(traverse, ResampledTraverse) else None
         frames = len(positions) or route.places
         self.frame_names = [] if traverse is None else names_of(source_of(traverse), frames)
-        self.map, self.find, self.frame_shape = route, None, shape or None
-        self.trained = self.calibration = None
+        self.frame_shape, self.trained = shape or None, None
+        return self.replace_map(route)
+
+    def replace_map(self, route: PlaceMap) -> DejaVu:
+        """Another map of the same frames, without what was known of the one before; in eval mode."""
+        self.map, self.find, self.calibration = route, None, None
         return self.eval()
 
     def calibrate(
@@ -437,19 +440,16 @@ class DejaVu(nn.Module):
     def localize_descriptors(
         self,
         descriptors: Tensor,
-        sequence: SequenceModel | None = None,
+        matching: Matching | SequenceModel | None = None,
         order: Tensor | None = None,
-        search: Search = "auto",
     ) -> Match:
-        """As `localize`, of descriptors (Q,K) as the map's own are: whitened where the model whitens.
+        """As `localize`, of descriptors (Q,K) as the map's own are: whitened if the model whitens.
 
         Args:
-            order: (N,) which frame each place of a shuffled map is; the match then counts frames.
+            matching: or the sequence of `localize`. order: (N,) which frame each place of a shuffled map is;
+                the match then counts frames.
         """
-        return self.found(descriptors, self.matching(sequence, search), order)
-
-    def found(self, descriptors: Tensor, matching: Matching, order: Tensor | None = None) -> Match:
-        """What a matching finds, of descriptors and in an order as of `localize_descriptors`."""
+        matching = matching if isinstance(matching, Matching) else self.matching(matching)
         localizer = self.localizer(matching)
         if order is None:
             return localizer(descriptors)
@@ -555,6 +555,12 @@ class DejaVu(nn.Module):
         """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""
         return concatenate(self.describer.descriptors(traverse, progress))
 
+    @property
+    def features_per_frame(self) -> int:
+        """D, that the map was learned from."""
+        learned = self.whitening is not None and self.whitening.learned
+        return len(self.whitening.projection) if learned and self.whitening else self.map.dimension
+
     def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
         """Refuse queries that do not fit the map, and warn of frames of another size that do.
 
@@ -562,10 +568,18 @@ class DejaVu(nn.Module):
             shape: of one query, (C,H,W) or (D,). dimension: D, how many features it gives.
             name: of the queries, for the message.
         """
-        resized = getattr(self.features, "resize", None) is not None
-        whitening = self.whitening
-        own = len(whitening.projection) if whitening is not None else self.map.dimension
-        check_queries(shape, dimension, self.frame_shape, own, resized, name)
+        reference, expected = self.frame_shape, self.features_per_frame
+        if reference is None or len(shape) != 3:
+            return
+        if len(reference) == 1:
+            seen = f"{name} holds frames, but the map was learned from ready features"
+            raise InputError(f"{seen}; expected features (Q, {expected})")
+        own, other = (" x ".join(map(str, one)) for one in (shape, reference))
+        if dimension != expected:
+            seen = f"{name}: frames of {own} give {dimension} features"
+            raise InputError(f"{seen}; the map expects {expected}, as frames of {other} give")
+        if shape[1:] != reference[1:] and getattr(self.features, "resize", None) is None:
+            log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
 
     def frame_name(self, frame: int) -> str:
         """The name of a reference frame, such as its file's; empty where it has none."""

@@ -29,7 +29,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.growth import append, average, learn_mean, merge, shown_on_map
+from dejavu_torch.growth import append, associate, average, learn_mean, merge
 from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.spectral import code_chunk
@@ -224,7 +224,7 @@ def test_only_a_chunk_of_descriptors_is_held(monkeypatch: pytest.MonkeyPatch) ->
     model, sizes = learned(walk(64)), []
     code = learning.code_chunk
     monkeypatch.setattr(
-        learning, "code_chunk", lambda part, *rest: sizes.append(len(part)) or code(part, *rest)
+        learning, "code_chunk", lambda part, **rest: sizes.append(len(part)) or code(part, **rest)
     )
     append(model, walk(1000, seed=2))
     assert sizes == [*[64] * 15, 40]
@@ -244,7 +244,7 @@ def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
     sizes = []
     code = learning.code_chunk
     monkeypatch.setattr(
-        learning, "code_chunk", lambda rows, *rest: sizes.append(len(rows)) or code(rows, *rest)
+        learning, "code_chunk", lambda rows, **rest: sizes.append(len(rows)) or code(rows, **rest)
     )
     append(part, open_source("sim:aerial?frames=130&start=80"))
     assert sizes == [40, 10]  # a chunk of descriptors at a time
@@ -588,7 +588,7 @@ def test_averaging_makes_what_is_found_again_surer() -> None:
     plain = learned(visits[0], 100)
     mean = learned(visits[0], 100)
     for seen in visits[1:]:
-        average(mean, shown_on_map(mean, ArrayTraverse(seen, "seen")))
+        average(mean, associate(mean, None, ArrayTraverse(seen, "seen")))
     whole = DejaVu(whitening="none", mapper=SpectralMapper(4.0, chunk=100))
     learn_mean(whole, visits[0], Views(ArrayTraverse(torch.cat(visits[1:]), "all"), here.repeat(3)))
     right = [float((m.localize(query).index - here).abs().le(3).float().mean()) for m in (plain, mean, whole)]
@@ -621,18 +621,18 @@ def test_counts_follow_where_a_map_grows(tmp_path: Path) -> None:
 def test_which_places_a_visit_shows(tmp_path: Path) -> None:
     model, again = learned(walk(100)), ArrayTraverse(walk(100, seed=1), "again")
     few = ArrayTraverse(walk(30), "few")
-    assert shown_on_map(model, again).places.tolist() == list(range(100))
-    assert shown_on_map(model, few, "80").places.tolist() == [*range(80, 100), *[-1] * 10]
+    assert associate(model, None, again).places.tolist() == list(range(100))
+    assert associate(model, None, few, "80").places.tolist() == [*range(80, 100), *[-1] * 10]
     (tmp_path / "t.csv").write_text("query,place\n0,7\n3,9\n")
-    assert shown_on_map(model, few, str(tmp_path / "t.csv")).places[:5].tolist() == [7, -1, -1, 9, -1]
+    assert associate(model, None, few, str(tmp_path / "t.csv")).places[:5].tolist() == [7, -1, -1, 9, -1]
     with refused("few has 30 frames", "the map 100", "truth"):
-        shown_on_map(model, few)
+        associate(model, None, few)
     moved = DejaVu(HOG(), "none", SpectralMapper(200.0, chunk=20), velocity=camera())
     route = ArrayTraverse(footage(REFERENCE), "route")
     moved.learn(route)
     with refused("at even steps"):
-        shown_on_map(moved, route)
-    views = shown_on_map(moved, route, "0")
+        associate(moved, None, route)
+    views = associate(moved, None, route, "0")
     assert (views.places - torch.arange(101)).abs().max() <= 1
     assert average(moved, views) == len(views.places.unique())
     assert (int(moved.map.visit_counts.sum()), len(moved.map.positions)) == (202, len(REFERENCE))

@@ -60,9 +60,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The places of each chunk that is coded."""
     seen: list[int] = []
 
-    def counted(descriptors: Tensor, *rest: object) -> object:
+    def counted(descriptors: Tensor, **rest: object) -> object:
         seen.append(len(descriptors))
-        return code_chunk(descriptors, *rest)  # type: ignore[arg-type]
+        return code_chunk(descriptors, **rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(learning, "code_chunk", counted)
     return seen

@@ -166,13 +166,13 @@ def run_learn(
         traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
     else:
         with _truth_by("--average_truth"):
-            visits = growth.shown_on_map(model, open_source(str(average)), average_truth)
+            visits = growth.associate(model, None, open_source(str(average)), average_truth)
         traverse, views = visits.traverse, None
         _check_calibration(model, traverse, calibration, precision)
         known = None
         if calibration not in UNREAD:
             with _truth_by("--calibration_truth"):
-                known = growth.shown_on_map(model, open_source(str(calibration)), calibration_truth)
+                known = growth.associate(model, None, open_source(str(calibration)), calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
     with _coding(cluster) as code:

@@ -149,7 +149,7 @@ def baselines_of(
 
     def null(name: str, same_plan: bool = False) -> Baseline:
         control, order = null_model(model, reference, seed, same_plan)
-        return Baseline(f"null: {name}", control.found(query, matching, order))
+        return Baseline(f"null: {name}", control.localize_descriptors(query, matching, order))
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:

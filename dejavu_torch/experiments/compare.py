@@ -161,7 +161,7 @@ def compare(
         ranks = max(top, min(max(RANKS), model.map.places))
         matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
         wanted = model.matching(sequence)._replace(lengths=matching.lengths, k=ranks, radius=tolerance)
-        candidates = model.found(queries, wanted)
+        candidates = model.localize_descriptors(queries, wanted)
     match = candidates.map(lambda column: column[:, 0])
     off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
     if distractors and not off_map:
@@ -226,7 +226,7 @@ def _described(
 def _probability(model: DejaVu, traverse: Traverse, sequence: SequenceModel | None) -> Tensor:
     """Of what is found for frames that are not on the map, (n,)."""
     frames = Fitted(traverse, model.frame_shape or ())
-    found = model.found(model.extract_all(frames), model.matching(sequence)).probability
+    found = model.localize_descriptors(model.extract_all(frames), sequence).probability
     assert found is not None
     return found
 
@@ -320,7 +320,7 @@ def _contend(run: Localization, name: str, found: Match, model: DejaVu) -> Conte
 
 def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
     """Another model that learns the run's reference."""
-    found = other.learn(run.reference).found(other.extract_all(run.query), run.matching)
+    found = other.learn(run.reference).localize_descriptors(other.extract_all(run.query), run.matching)
     return _contend(run, name, found, other)
 
 

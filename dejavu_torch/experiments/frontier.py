@@ -374,7 +374,9 @@ def _among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer
 
 def _by_map(route: Route, model: DejaVu, matching: Matching) -> Answer:
     """A map on descriptors of its own."""
-    found = model.found(model.extract_all(route.query), matching).renumbered(model.map.table.scored)
+    found = model.localize_descriptors(model.extract_all(route.query), matching).renumbered(
+        model.map.table.scored
+    )
     summary = model.summary()
     return Answer(found, summary.route_bytes, summary.fixed_bytes)
 

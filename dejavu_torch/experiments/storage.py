@@ -103,7 +103,7 @@ def _coded(
         model.learn_features(features)
     except InputError:  # more than floats, or less than the mean
         return
-    found = model.found(run.query_features, run.matching, order)
+    found = model.localize_descriptors(run.query_features, run.matching, order)
     yield found, sum(tensor.nbytes for tensor in model.map.packed().values())
 
 

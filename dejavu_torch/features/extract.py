@@ -124,38 +124,6 @@ def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) 
         )
 
 
-def check_queries(
-    shape: tuple[int, ...],
-    dimension: int,
-    reference: tuple[int, ...] | None,
-    expected: int,
-    resized: bool,
-    name: str,
-) -> None:
-    """Refuse queries that do not fit a map, and warn of frames of another size that do.
-
-    Args:
-        shape: of one query, (C,H,W) or (D,). dimension: of its features.
-        reference: shape of a frame of the reference, None if unknown. expected: features of the map.
-        resized: whether the features resize frames to one size.
-    """
-    if reference is None or len(shape) != 3:
-        return
-    if len(reference) == 1:
-        raise InputError(
-            f"{name} holds frames, but the map was learned from ready features; "
-            f"expected features (Q, {expected})"
-        )
-    own, other = (" x ".join(map(str, one)) for one in (shape, reference))
-    if dimension != expected:
-        raise InputError(
-            f"{name}: frames of {own} give {dimension} features; the map expects {expected}, as frames of "
-            f"{other} give"
-        )
-    if shape[1:] != reference[1:] and not resized:
-        log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
-
-
 @contextmanager
 def in_mode(module: nn.Module, training: bool) -> Iterator[None]:
     """The module in training or eval mode; afterwards every part is in its own mode again."""

@@ -70,4 +70,4 @@ def better(scores: Mapping[str, Scores]) -> list[str]:
 
 
 def _match(model: DejaVu, query: Traverse) -> Match:
-    return model.found(model.extract_all(query), SINGLE).renumbered(model.map.table.scored)
+    return model.localize_descriptors(model.extract_all(query), SINGLE).renumbered(model.map.table.scored)

@@ -252,9 +252,9 @@ MUTANTS = [
     ),
     Mutant(
         "Appending places drops the calibration of the map, which was made for fewer places.",
-        "dejavu_torch/growth.py",
-        "model.map, model.find, model.calibration = grown, None, None",
-        "model.map = grown",
+        "dejavu_torch/model.py",
+        "self.map, self.find, self.calibration = route, None, None",
+        "self.map = route",
         ("tests/test_growth.py::test_a_calibration_goes_and_comes_again_from_the_new_places",),
     ),
     Mutant(
@@ -282,8 +282,8 @@ MUTANTS = [
         "No batch spans two chunks of a long route: each has `chunk` places, also where that is no "
         "multiple of the batch size, and the bytes do not hang on where reading began.",
         "dejavu_torch/learning.py",
-        "held, wanted = [], min(size, self.chunk - done % self.chunk, self.length - done)",
-        "held, wanted = [], min(size, self.length - done)",
+        "wanted = min(size, self.chunk - done % self.chunk, self.length - done)",
+        "wanted = min(size, self.length - done)",
         ("tests/test_learning.py::-k bytes_do_not_hang_on_how or own_descriptors",),
     ),
     Mutant(
@@ -296,8 +296,8 @@ MUTANTS = [
     Mutant(
         "Chunks of a long route, and of appended places, are coded with the resolution of the map.",
         "dejavu_torch/learning.py",
-        "coding = route.chunk, route.means[-1], route.step, route.transform, route.resolution",
-        "coding = route.chunk, route.means[-1], route.step, route.transform, 0.0",
+        'settings = {"transform": route.transform, "resolution": route.resolution}',
+        'settings = {"transform": route.transform, "resolution": 0.0}',
         (
             "tests/test_growth.py::-k those_of_a_long_route or learned_at_once",
             "tests/maps/test_spectral.py::test_resolution_is_kept_and_extends_alike",

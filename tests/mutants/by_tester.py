@@ -286,8 +286,8 @@ MUTANTS = [
     Mutant(
         "Of routes of one name that are merged, each further one gets a number.",
         "dejavu_torch/growth.py",
-        "taken.append(_another(wanted, taken))",
-        "taken.append(wanted)",
+        "parts[_another(wanted, parts)] = part",
+        "parts[wanted] = part",
         ("tests/test_growth.py::test_merging_merged_maps_and_names_that_are_there",),
     ),
     Mutant(
@@ -300,8 +300,8 @@ MUTANTS = [
     Mutant(
         "A route that ends ahead of its last frame is refused, and no shorter map written.",
         "dejavu_torch/learning.py",
-        "if done < part.length:",
-        "if done > part.length:",
+        "if done < stop:",
+        "if done > stop:",
         ("tests/test_learning.py::test_a_route_that_ends_early_is_refused",),
     ),
     Mutant(
