@@ -9,10 +9,12 @@ import signal
 import socket
 import sys
 import sysconfig
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import reduce
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -201,21 +203,14 @@ class ClusterSearch:
                 f"a map of kind {route.kind!r} is not divided among workers; expected a spectral one"
             )
         actor = cluster.ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Searcher)
-        self.cluster, self.actors, first = cluster, [], 0
+        self.cluster, self.actors = cluster, []
         self.parts: list[Any] = []  # held for actors that are started again
-        for worker in range(cluster.workers):
-            stop = next(
-                (
-                    g
-                    for g, (start, _) in enumerate(route.chunks)
-                    if start * cluster.workers >= route.places * (worker + 1)
-                ),
-                len(route.chunks),
-            )
-            if stop > first:
+        starts, workers = [start for start, _ in route.chunks], cluster.workers
+        bounds = [bisect_left(starts, worker * route.places / workers) for worker in range(workers)]
+        for first, stop in pairwise([*bounds, len(starts)]):
+            if first < stop:
                 self.parts.append(cluster.ray.put(route.between(first, stop).cpu()))
-                self.actors.append(actor.remote(self.parts[-1], route.chunks[first][0]))
-            first = max(first, stop)
+                self.actors.append(actor.remote(self.parts[-1], starts[first]))
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, n: int) -> Best:
@@ -268,10 +263,8 @@ def _brief(error: Exception) -> str:
 
 
 def _processors() -> int:
-    """Processors that this process may use."""
-    with suppress(AttributeError):  # of Linux
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Processors that this process may use; not all systems tell."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _shared: dict[str, Any] = {}  # of a worker process: what it was sent last
@@ -314,12 +307,10 @@ def _by_value(ray: Any, values: Iterable[object]) -> Iterator[None]:
 
 def _modules_of(value: object) -> Iterator[ModuleType]:
     """The modules of the user's own files that the classes of a value, and of its parts, come from."""
-    parts: list[object] = [value]
     if isinstance(value, tuple | list):
-        parts += [part for one in value for part in _modules_of(one)]
-    if isinstance(value, nn.Module):
-        parts += [*value.modules()]
-    for part in parts:
+        for one in value:
+            yield from _modules_of(one)
+    for part in value.modules() if isinstance(value, nn.Module) else [value]:
         found = part if isinstance(part, ModuleType) else sys.modules.get(type(part).__module__)
         if found is not None and _is_own(found):
             yield found

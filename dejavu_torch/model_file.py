@@ -111,7 +111,7 @@ def recipe_of(module: nn.Module) -> Recipe:
 
 
 def recipes_of(model: Any) -> dict[str, Any]:
-    """The recipe of each part of a model, as JSON takes it."""
+    """The recipe of each part of a model, as JSON values."""
     parts = {name: getattr(model, name) for name in PARTS}
     return {name: None if part is None else recipe_of(part)._asdict() for name, part in parts.items()}
 
@@ -133,10 +133,10 @@ def difference(stored: Recipe, given: Recipe) -> str:
     if stored.class_path != given.class_path:
         return f"{stored.class_path}; got {given.class_path}"
     names = [name for name, value in stored.init_args.items() if given.init_args.get(name) != value]
-    expected, got = (
+    known, seen = (
         ", ".join(f"{name}={one.init_args.get(name)}" for name in names) for one in (stored, given)
     )
-    return f"{stored.class_path} of {expected}; got {got}"
+    return f"{stored.class_path} of {known}; got {seen}"
 
 
 def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
@@ -170,15 +170,13 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
     count = len(with_parts(recipe))
     if count > MOST_PARTS:
         raise InputError(f"the map's {name} is made of {count} parts; expected at most {MOST_PARTS}")
-    # only learning needs what found the periods: without a finder of this package the mapper has none
-    parts = {
-        key: part for key, part in _parts(recipe).items() if key != "periods" or part.class_path in REGISTRY
-    }
-    arguments |= {key: build(part, nn.Module, given) for key, part in parts.items()}
-    if not issubclass(cls, Mapper) or "periods" not in recipe.init_args or "periods" in parts:
-        return cls(**arguments)
-    module: Any = cls(**arguments | {"periods": None})
-    module.periods = None
+    for key, part in _parts(recipe).items():
+        # only learning needs what found the periods: without a finder of this package the mapper has none
+        foreign = key == "periods" and part.class_path not in REGISTRY
+        arguments[key] = None if foreign else build(part, nn.Module, given)
+    module: Any = cls(**arguments)
+    if "periods" in arguments:
+        module.periods = arguments["periods"]
     return module  # type: ignore[no-any-return]
 
 
@@ -234,8 +232,8 @@ def summary_of(model: Any) -> MapSummary:
     }
     fixed["names"] = len(header["names"] or "")
     summary: MapSummary = model.map.summary()
-    rest = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
-    return summary.with_parts(fixed=fixed | {"header": rest})
+    fixed["header"] = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
+    return summary.with_parts(fixed=fixed)
 
 
 def write_model(path: Path, model: Any) -> None:
@@ -286,7 +284,7 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
             raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
         model.weight_bits = 8 if len(weights) < len(tensors) else 32
         _check_rounded(model)
-        _set_state(model, header, len(model.map.positions) or model.map.places)
+        _set_state(model, header, model.map.table.frames)
         _check(model)
         return model  # type: ignore[no-any-return]
 
@@ -365,14 +363,10 @@ def _check(model: Any) -> None:
     resampled = model.velocity is not None and step is not None and step > 0
     if (len(positions) > 0) != resampled or (step is not None) != resampled:
         raise InputError(f"it has step {step} and {len(positions)} frame positions")
-    if (
-        whitening is not None
-        and whitening.learned
-        and whitening.dimension != (model.map.dimension or whitening.dimension)
-    ):
-        raise InputError(
-            f"its whitening makes {whitening.dimension} numbers; expected the map's {model.map.dimension}"
-        )
+    if whitening is not None and whitening.learned:
+        made, expected = whitening.dimension, model.map.dimension
+        if made != (expected or made):
+            raise InputError(f"its whitening makes {made} numbers; expected the map's {expected}")
     if shape is not None and (len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > FRAME_NUMBERS):
         raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 
@@ -384,20 +378,18 @@ def run_key(
     header = recipes_of(model)
     header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in model.modules()})))
     header |= {"batch_size": model.describer.batch_size, "sample": SAMPLE}
-    header |= {"version": __version__, "torch": torch.__version__}
+    header |= {"version": __version__, "torch": torch.__version__, "device": model.describer.device.type}
     fixed = model.whitening is not None and model.whitening.fixed
-    weights = weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {})
-    sums = checksums(weights, header)
-    header["device"] = model.describer.device.type
+    sums = checksums(
+        weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {}), header
+    )
     sources = {
         name: views
         and [views.traverse.identity(), views.traverse.state(0, len(views.places)), views.places.tolist()]
         for name, views in (("second", second), ("visits", visits))
     }
-    return digests(source=[traverse.identity(), traverse.count()], **sources) | {
-        "settings": sums.pop(FILE_HEADER),
-        **sums,
-    }
+    source = [traverse.identity(), traverse.count()]
+    return digests(source=source, **sources) | {"settings": sums.pop(FILE_HEADER), **sums}
 
 
 def _code_of(cls: type[nn.Module]) -> str:
