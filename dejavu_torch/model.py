@@ -264,7 +264,7 @@ class DejaVu(nn.Module):
             self.whitening = learned
 
     def take_whitening(self, other: DejaVu) -> None:
-        """Describe as another model does: its whitening as it is, and what is ahead of it.
+        """Describe as another model does: its preprocess, features and whitening, which stays as it is.
 
         Raises:
             InputError: the other has no whitening.
@@ -276,7 +276,8 @@ class DejaVu(nn.Module):
         self.whitening.fixed = self._whitens = True
 
     def take_descriptor(self, other: DejaVu) -> None:
-        """Make features as another model does, such as one trained on many routes; whitening is learned anew.
+        """Use the preprocess and features of another model, such as one trained on many routes; whitening is
+        learned anew.
 
         Example:
             >>> base = DejaVu(features=HOG(cell=16))
@@ -295,10 +296,11 @@ class DejaVu(nn.Module):
         progress: bool = False,
         shape: tuple[int, ...] | None = None,
     ) -> Traverse:
-        """A traverse as the model takes it: `fit`, then `resampled` by the model's `velocity`.
+        """A traverse in the form that the model learns or localizes: `fit`, then `resampled` by `velocity`.
 
         Args:
-            step, shape: of queries those of the map, `self.step` and `self.frame_shape`; None of a reference.
+            step, shape: for queries those of the map, `self.step` and `self.frame_shape`; None for a
+                reference.
         """
         return resampled(self.fit(traverse, shape), self.velocity, self.batch_size, step, progress)
 
@@ -306,13 +308,13 @@ class DejaVu(nn.Module):
         """Frames at the size of the map's, or of `preprocess.size`; images and videos are decoded at it.
 
         Args:
-            shape: (C,H,W) of the map's frames, or of the reference's. Frames of another aspect ratio, by over
-                5 %, stay as they are. None is a reference: the longer side of its frames is reduced to
-                `preprocess.size`, but no further than the features' own `resize`, or a block of HOG, and not
-                at all where the source asks for a size, such as `clip.mp4?width=320`.
+            shape: (C,H,W) of the map's frames, or of the reference's; frames of another aspect ratio, by over
+                5 %, stay as they are. None is a reference: the longer side is reduced to `preprocess.size`,
+                but not below the features' own `resize`, or a block of HOG, and not if the source asks for a
+                size, such as `clip.mp4?width=320`.
 
         Returns:
-            The traverse itself where its frames, or ready features, have that size.
+            The traverse itself if its frames, or ready features, have that size.
         """
         own = traverse.frame_shape[1:]
         if len(own) != 2 or isinstance(traverse, ResampledTraverse):
@@ -361,23 +363,22 @@ class DejaVu(nn.Module):
         views: Views | None = None,
         places: Tensor | None = None,
     ) -> DejaVu:
-        """Find out how probably answers are right that stand out so much; `Match.probability` then tells it.
+        """Learn how probably answers are right by their confidence, for `Match.probability`.
 
         Args:
-            reference: the traverse that the map was learned from. Every 10th stretch of 20 of its frames is
-                looked up in changed light and view: `Augmentation` of 1.5 times the strengths of the
-                whitening, which has seen the plain ones.
-            views: frames of another traverse of the same places instead, which tell of its own changes, or
-                other `Stretches` of the reference;
-                those that show no place are left out, and of very many all but evenly spaced stretches.
-            places: (n,) int64, which place each frame of the reference shows, -1 for none, as where it was
-                appended to other places; None is frame i at place i.
+            reference: the traverse that the map was learned from. Every 10th segment of 20 of its frames is
+                localized in changed light and view: `Augmentation` of 1.5 times the strengths of the
+                whitening, which has learned from the plain ones.
+            views: frames of another traverse of the same places instead, or other segments of the reference;
+                those that show no place are left out, and very many are sampled.
+            places: (n,) int64, which place each frame of the reference shows, -1 for none; None is frame i at
+                place i.
 
         Returns:
             self, with `self.calibration`.
 
         Raises:
-            InputError: no map, ready features, whose changes cannot be drawn, or no right answer.
+            InputError: no map, ready features, which cannot be augmented, or no right answer.
 
         Example:
             >>> from dejavu_torch import open_source
@@ -422,15 +423,14 @@ class DejaVu(nn.Module):
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
         Args:
-            queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D).
+            queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D). For a map of even steps they
+                are resampled likewise, see `resample`.
             progress: text of a progress bar on a terminal; None is no bar.
             sequence: scores consecutive queries together, as `SequenceMatcher` and `PlaceFilter` do; None
-                takes each by itself.
+                matches each by itself.
             search: how the best place of a single query is searched for, see `recognition.search`.
 
         Shape: -> Match of (Q,) on the CPU.
-
-        Convention: on a map of even steps the queries are resampled likewise first, see `resample`.
 
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
@@ -476,8 +476,7 @@ class DejaVu(nn.Module):
         k: int | None = None,
         apart: int = 5,
     ) -> Iterator[Match]:
-        """As `localize`, or with k as `candidates`, one batch of queries at a time: memory does not grow with
-        the queries."""
+        """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory."""
         self._require_map()
         if k is not None:
             check_candidates(k, apart, self.map.places)
@@ -506,9 +505,9 @@ class DejaVu(nn.Module):
         """The k best places of each query, no two of them near each other; the first is `localize`'s.
 
         Args:
-            queries, sequence, search: as of `localize`.
+            queries, sequence, search: see `localize`.
             k: how many, from 1 to the number of places.
-            apart: places, at least 0: any two candidates of a query differ by more.
+            apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
         Shape: -> Match of (Q,k) on the CPU.
 
@@ -523,16 +522,15 @@ class DejaVu(nn.Module):
         return Match.joined(self.matches(queries, None, sequence, search, k, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search = "auto") -> Matching:
-        """A way to match queries, with probabilities if the map is calibrated for it.
+        """How queries are matched, with probabilities if the map is calibrated for it.
 
         Raises:
-            InputError: a precision, but the map is not calibrated, or not for this way of matching.
+            InputError: a precision, but the map is not calibrated for this way of matching.
         """
         platt = self.calibration and self.calibration.of(sequence)
         if self.precision is not None and platt is None:
-            seen = "the map is not calibrated"
-            if self.calibration is not None:
-                seen = "the map is calibrated for single queries and for a filter that always searches"
+            other = "calibrated for single queries and for a filter that always searches"
+            seen = f"the map is {other if self.calibration else 'not calibrated'}"
             problem = f"the precision is {self.precision}, but {seen}"
             raise InputError(f"{problem}; expected a threshold in its place")
         return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search)
@@ -540,9 +538,9 @@ class DejaVu(nn.Module):
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, of single queries or of a sequence (convention 4).
 
-        By the threshold or precision that was given, or that the map's file has. Else, on a map that is
-        calibrated for this way of matching, where the probability is at least .5. Else what a filter by
-        itself takes for more likely than not, and of other ways every finite score.
+        By the threshold or precision that was given, or that the map's file has. Else with a probability of
+        at least .5, if the map is calibrated for this way of matching. Else those that a filter holds for
+        more likely than not, and otherwise every finite score.
         """
         threshold = self.threshold if sequence is None else sequence.threshold_of(self.threshold)
         if threshold is not None or self.precision is not None:
@@ -586,9 +584,8 @@ class DejaVu(nn.Module):
         return self.frame_names[frame] if self.frame_names else ""
 
     def save(self, path: str | Path) -> None:
-        """Write the map, with the feature module's weights, as one safetensors file.
-
-        Convention: a descriptor that was trained without a map is written as well, see `take_descriptor`.
+        """Write the map, or a trained descriptor without one, with the weights of the features, as one
+        safetensors file.
 
         Raises:
             InputError: nothing learnt yet, weights that were changed since they were rounded, or the file
@@ -603,8 +600,8 @@ class DejaVu(nn.Module):
         """Read a map file; the model is in eval mode.
 
         Args:
-            features: the module that made the map's features, needed where it is not one of this
-                package; its weights come from the file.
+            features: the module that made the map's features, needed if it is not of this package; its
+                weights come from the file.
 
         Raises:
             InputError: missing, truncated, foreign or newer file, or other features than the map's.
