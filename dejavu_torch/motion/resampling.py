@@ -26,7 +26,6 @@ class ResampledTraverse(Selection):
     The other traverse is read once to measure the distances, and again each time the frames are asked for.
 
     Args:
-        traverse: frames, in order.
         odometry: measures the ground, and has the default of the step.
         batch_size: frames in memory at a time while measuring.
         step: pixels of ground, in place of the odometry's; as for the queries of a map.
@@ -63,7 +62,13 @@ class ResampledTraverse(Selection):
         moved, frames = distance.diff(), len(distance)
         if not moved.any():
             raise InputError(f"{traverse.name} stands still in all of its {frames} frames; expected motion")
-        _warn_doubtful(moved, traverse.name)
+        forward, back = int((moved > 0).sum()), int((moved < 0).sum())
+        if back > DOUBTFUL * forward:
+            log.warning(
+                "%s: %d of %d steps go forward and %d backwards: do the corners show ground that comes "
+                "nearer?",
+                *(traverse.name, forward, len(moved), back),
+            )
         step = odometry.step if step is None else step
         self.step = float(moved.abs()[moved != 0].median()) if step is None else float(step)
         self.positions = (distance / self.step).float()
@@ -83,16 +88,6 @@ class ResampledTraverse(Selection):
         return picked(self.traverse.batches(size), range(len(self.positions)), self.frame, size)
 
 
-def _warn_doubtful(moved: Tensor, name: str) -> None:
-    """Warn of footage in which hardly any step goes forward, as where the corners show no ground."""
-    forward, back = int((moved > 0).sum()), int((moved < 0).sum())
-    if back > DOUBTFUL * forward:
-        log.warning(
-            "%s: %d of %d steps go forward and %d backwards: do the corners show ground that comes nearer?",
-            *(name, forward, len(moved), back),
-        )
-
-
 def resampled(
     traverse: Traverse,
     odometry: GroundOdometry | None,
@@ -100,14 +95,11 @@ def resampled(
     step: float | None = None,
     progress: bool = False,
 ) -> Traverse:
-    """A traverse at even steps along the ground; as it is without odometry, or where it is so already.
+    """A `ResampledTraverse`; the traverse itself without odometry, or if it is resampled already.
 
     Args:
         step: pixels of ground; None is the odometry's own. Queries need the map's: of them a single frame,
             and ready features, stay as they are.
-
-    Raises:
-        InputError: as `ResampledTraverse`.
     """
     if odometry is None or isinstance(traverse, ResampledTraverse):
         return traverse
@@ -135,12 +127,11 @@ def ground_truth_of(
     Args:
         places, queries: how many frames the traverses gave, needed where they do not know their lengths.
     """
-    frames = source_of(reference).length if places is None else places
+    frames, moved = reference.length if places is None else places, isinstance(reference, ResampledTraverse)
     if isinstance(reference, ResampledTraverse):
         frames = len(reference.positions)
     numbers = query.frame if isinstance(query, ResampledTraverse) else queries or query.length
     if numbers is None:
         raise InputError(f"{query.name} does not know how many frames it has; expected their number")
     sources = source_of(reference), source_of(query)
-    moved = reference is not sources[0]
     return find_ground_truth(truth, *sources, frames, numbers, interpolate, moved, aligned)
