@@ -19,7 +19,6 @@ from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
 from dejavu_torch.features.extract import check_queries, features_of
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
@@ -38,6 +37,7 @@ from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
+from dejavu_torch.memory import concatenate
 from dejavu_torch.model_file import (
     CLASSES,
     model_state,
@@ -365,7 +365,7 @@ class DejaVu(nn.Module):
                 looked up in changed light and view: `Augmentation` of 1.5 times the strengths of the
                 whitening, which has seen the plain ones.
             views: frames of another traverse of the same places instead, which tell of its own changes, or
-                other `Stretches` of the reference;
+                other `augmented_segments` of the reference;
                 those that show no place are left out, and of very many all but evenly spaced stretches.
             places: (n,) int64, which place each frame of the reference shows, -1 for none, as where it was
                 appended to other places; None is frame i at place i.

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from dejavu_torch.features.frames import settings_of
+from dejavu_torch.features.preprocess import settings_of
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.features.frames import settings_of
-from dejavu_torch.features.preprocess import select_channel
+from dejavu_torch.features.preprocess import select_channel, settings_of
 from dejavu_torch.features.truncate import members_of, run, tensors_in, up_to
 from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.resize import check_size, resize_frames
@@ -141,7 +140,6 @@ class Embedding(nn.Module):
         super().__init__()
         if not isinstance(network, nn.Module):
             raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
-        check_size(resize, 1, "Embedding got resize")
         coded = hidden == 0 if dimension is None else dimension >= 1
         if not coded or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
             raise InputError(
@@ -150,7 +148,7 @@ class Embedding(nn.Module):
                 f"hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
             )
         self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell
-        self.resize = (int(resize[0]), int(resize[1]))  # a map gives a list
+        self.resize = check_size(resize, 1, "Embedding got resize")
         self.hidden, self.noise, self.kept = hidden, noise, kept
         self.layer, self.mean, self.std, self.output = layer, mean, std, output
         # the settings say the same

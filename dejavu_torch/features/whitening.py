@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.features.frames import settings_of
+from dejavu_torch.features.preprocess import settings_of
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
@@ -255,19 +255,17 @@ class Whitening(nn.Module):
 
     def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
         """Set mean (D,), projection (D,K), rounded to `bits`, and the constant number, if any."""
-        largest = 2 ** (self.bits - 1) - 1
-        self.scale = projection.abs().amax(0) / largest
+        self.scale = projection.abs().amax(0) / (2 ** (self.bits - 1) - 1)
         whole = (projection / self.scale).round()
         self.projection = _packed(whole, self.bits)
         self.offset = (mean @ whole) * self.scale
         self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
-        buffers = dict(self.named_buffers(recurse=False))
-        _check_buffers(**{name: state.get(prefix + name, own) for name, own in buffers.items()})
-        for name, own in buffers.items():
-            if prefix + name in state:
-                setattr(self, name, torch.empty_like(state[prefix + name], device=own.device))
+        buffers = {name: state.get(prefix + name, own) for name, own in self.named_buffers(recurse=False)}
+        _check_buffers(**buffers)
+        for name, stored in buffers.items():
+            setattr(self, name, torch.empty_like(stored, device=self.scale.device))
         super()._load_from_state_dict(state, prefix, *args)
 
     def extra_repr(self) -> str:
