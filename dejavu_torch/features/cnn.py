@@ -15,18 +15,11 @@ FLAT = 2 / 255  # contrast below which nothing is blown up
 
 
 def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
-    """Each pixel minus the mean around it, divided by the contrast around it.
+    """Each pixel (B,C,H,W) minus the mean around it, divided by the contrast around it, mean about 0.
 
-    Mean and contrast are those of square cells, interpolated between the cells' centres, which is faster than
-    a window at every pixel (`normalise_patches`). All channels share the contrast.
-
-    Args:
-        cell: side of a cell, pixels.
-
-    Shape: (B,C,H,W) in [0, 1] -> (B,C,H,W), mean about 0.
-
-    Convention: a gain or an offset of brightness changes almost nothing; contrast below 2/255 is not
-    amplified.
+    Mean and contrast are those of square cells, of `cell` pixels a side, interpolated between the cells'
+    centres, which is faster than a window at every pixel (`normalise_patches`). All channels share the
+    contrast. A gain or an offset of brightness changes almost nothing; contrast below 2/255 is not amplified.
     """
     if cell < 1:
         raise InputError(f"local_contrast got a cell of {cell} pixels; expected at least 1")
@@ -42,10 +35,8 @@ def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
 
 
 class SmallCNN(nn.Module):
-    """Local contrast, strided convolutions, and one linear layer, which keeps where things are.
-
-    The features are standardised by their running mean and deviation over the training frames, so that they
-    share one scale in L1 distances.
+    """Local contrast, strided convolutions, and one linear layer, which keeps where things are. Features are
+    standardised by their running mean and deviation over the training frames, to share one scale.
 
     Args:
         dimension: D, number of features.
@@ -76,7 +67,7 @@ class SmallCNN(nn.Module):
         cell: int = 8,
     ) -> None:
         super().__init__()
-        check_size(resize, 1, "SmallCNN got resize")
+        self.resize = check_size(resize, 1, "SmallCNN got resize")
         self.follows = channels is None
         channels = 3 if channels is None else channels
         sizes = [dimension, channels, squeeze, *widths]
@@ -87,8 +78,7 @@ class SmallCNN(nn.Module):
                 "cell 0 or more"
             )
         self.dimension, self.channels, self.squeeze, self.cell = dimension, channels, squeeze, cell
-        self.resize = (int(resize[0]), int(resize[1]))  # a map gives lists
-        self.widths = tuple(int(width) for width in widths)
+        self.widths = tuple(int(width) for width in widths)  # a map gives a list
         layers: list[nn.Module] = []
         height, width = self.resize
         for before, after in zip((channels, *self.widths), self.widths, strict=False):
@@ -133,5 +123,4 @@ class SmallCNN(nn.Module):
         standardised: Tensor = self.standardise(features.float())
         return standardised
 
-    def extra_repr(self) -> str:
-        return settings_of(self)
+    extra_repr = settings_of

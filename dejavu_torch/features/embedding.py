@@ -22,8 +22,7 @@ SHOWN = 4  # shapes in a message
 class Coder(nn.Module):
     """Whitens a descriptor and maps it, by one hidden layer, to the code of its place.
 
-    The code of a place is arbitrary, so a descriptor that another day moved a little must still get the same
-    one. Training therefore adds noise to the whitened descriptor, in place of the days that it does not see.
+    That code is arbitrary: training adds noise to the whitened descriptor, for the days that it does not see.
 
     Args:
         inputs: K, of a descriptor. dimension: D, of the code, not standardised yet.
@@ -141,16 +140,15 @@ class Embedding(nn.Module):
         if not isinstance(network, nn.Module):
             raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
         coded = hidden == 0 if dimension is None else dimension >= 1
-        if not coded or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
-            raise InputError(
-                f"Embedding got dimension={dimension}, channels={channels}, grid={grid}, cell={cell}, "
-                f"hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 or more (with no dimension "
-                f"hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
-            )
-        self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell
         self.resize = check_size(resize, 1, "Embedding got resize")
+        self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell
         self.hidden, self.noise, self.kept = hidden, noise, kept
         self.layer, self.mean, self.std, self.output = layer, mean, std, output
+        if not coded or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
+            raise InputError(
+                f"Embedding got {self.extra_repr()}; expected 1 or 3 channels, cell and hidden of 0 or more "
+                f"(with no dimension hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
+            )
         # the settings say the same
         self.register_buffer("offset", _of_channels("mean", mean, channels, 0.0), persistent=False)
         self.register_buffer("factor", 1 / _of_channels("std", std, channels, 1.0), persistent=False)

@@ -32,7 +32,7 @@ def feature_batches(
     progress: str | None = None,
     on_first: Callable[[Tensor, Tensor], None] | None = None,
 ) -> Iterator[Tensor]:
-    """Features of the frames of a traverse, in order, without gradients.
+    """Features (B,D) of the frames of a traverse, in order, without gradients.
 
     Args:
         traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
@@ -41,8 +41,6 @@ def feature_batches(
         progress: what to call this work on stderr: a bar on a terminal, else a line now and then. Copies of
             one frame count once.
         on_first: called with the first batch and its features.
-
-    Shape: yields (B,D) float.
 
     Raises:
         InputError: features that are not (B,D) or not finite, or no frames at all.
@@ -127,12 +125,8 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
 
 
 def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
-    """Refuse a network, in eval mode, whose features of a frame depend on the other frames of the batch.
-
-    Raises:
-        InputError: those of the first frame differ by over 1e-3 of their length, or what its numbers round
-            by.
-    """
+    """Refuse a network, in eval mode, whose features of a frame depend on the other frames of the batch: by
+    over 1e-3 of their length, or what its numbers round by."""
     if frames.ndim != 4 or len(frames) < 2:
         return
     device = features.device.type
@@ -159,13 +153,8 @@ def check_queries(
     resized: bool,
     name: str,
 ) -> None:
-    """Refuse queries that do not fit a map, and warn of frames of another size that do.
-
-    Args:
-        shape: of one query, (C,H,W) or (D,). dimension: of its features.
-        reference: shape of a frame of the reference, None if unknown. expected: features of the map.
-        resized: whether the features resize frames to one size.
-    """
+    """Refuse queries, each of a shape (C,H,W) or (D,) and with so many features, that do not fit a map with a
+    reference of such a shape, None if unknown; warn of frames of another size that do, unless resized."""
     if reference is None or len(shape) != 3:
         return
     if len(reference) == 1:

@@ -46,12 +46,11 @@ class HOG(nn.Module):
         bins: Bins = "hard",
     ) -> None:
         super().__init__()
-        if bins not in get_args(Bins):
-            raise InputError(f"HOG got bins={bins!r}; expected 'hard' or 'linear'")
-        if min(orientations, cell, block) < 1 or orientations > MOST_ORIENTATIONS:
+        known = bins in get_args(Bins)
+        if not known or min(orientations, cell, block) < 1 or orientations > MOST_ORIENTATIONS:
             raise InputError(
-                f"HOG got orientations={orientations}, cell={cell}, block={block}; expected at least 1 each, "
-                f"and at most {MOST_ORIENTATIONS} orientations"
+                f"HOG got orientations={orientations}, cell={cell}, block={block}, bins={bins!r}; expected "
+                f"at least 1 each, at most {MOST_ORIENTATIONS} orientations, and bins 'hard' or 'linear'"
             )
         self.orientations, self.cell, self.block = orientations, cell, block
         self.resize = None if resize is None else check_size(resize, cell * block, "HOG got resize")
@@ -96,9 +95,8 @@ def hog(
 
 
 def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Differences f(x + 1) - f(x - 1) along rows and columns, 0 at the border, of the strongest channel:
-    (B,C,H,W) -> two of (B,H,W).
-    """
+    """Differences f(x + 1) - f(x - 1) down the rows and along the columns, 0 at the border, of the strongest
+    channel: (B,C,H,W) -> two of (B,H,W)."""
     rows, columns = torch.zeros_like(frames), torch.zeros_like(frames)
     rows[:, :, 1:-1] = frames[:, :, 2:] - frames[:, :, :-2]
     columns[..., 1:-1] = frames[..., 2:] - frames[..., :-2]

@@ -10,15 +10,14 @@ from dejavu_torch.types import InputError
 
 
 class PatchPixels(nn.Module):
-    """Pixels of frames made small, each patch with mean 0 and standard deviation 1, which is at least 1/255.
+    """Pixels of frames made small, each patch with mean 0 and standard deviation 1, which is at least 1/255
+    (Milford and Wyeth, SeqSLAM, ICRA 2012).
 
     Args:
         size: (height, width) in pixels; smaller frames keep theirs, cut to whole patches.
         patch: side in pixels of the square patches, which lie side by side.
 
     Shape: (B,C,H,W) -> (B, C x height x width).
-
-    Source: Milford and Wyeth, SeqSLAM, ICRA 2012.
 
     Raises:
         InputError: a size smaller than a patch; forward: frames that are not (B,C,H,W) float, or as small.

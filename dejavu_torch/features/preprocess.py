@@ -58,10 +58,7 @@ def channel_name(channel: str) -> str:
 
 
 def select_channel(frames: Tensor, channel: str) -> Tensor:
-    """One channel of colour frames, see `Preprocess`; grey frames pass unchanged as "grey".
-
-    Shape: (B,C,H,W) -> (B,1,H,W); a difference lies in [-1, 1].
-    """
+    """One channel of frames (B,C,H,W) -> (B,1,H,W), see `Preprocess`; a difference lies in [-1, 1]."""
     name, count = channel_name(channel), frames.shape[1]
     if name == "grey" and count == 1:
         return frames
@@ -89,21 +86,12 @@ def box_mean(frames: Tensor, side: int) -> Tensor:
 
 
 def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
-    """Each pixel minus the mean, divided by the standard deviation, of the patch around it, for each channel.
-
-    Shape: (B,C,H,W) -> (B,C,H,W), mean about 0, unbounded.
+    """Each pixel minus the mean, divided by the standard deviation, of the patch around it, for each channel
+    (Milford and Wyeth, SeqSLAM, ICRA 2012; there in patches side by side).
 
     Convention: at the border only pixels inside the frame count. The standard deviation divides by their
         number, and is at least 1/255, so that noise in a flat sky is not amplified; above that a gain and an
         offset of brightness change nothing. Gradients are finite everywhere.
-
-    Source: Milford and Wyeth, SeqSLAM, ICRA 2012; there in patches side by side.
-
-    Example:
-        >>> checks = (torch.arange(8)[:, None] + torch.arange(8)).remainder(2)[None, None]
-        >>> dark, bright = normalise_patches(0.5 + 0.1 * checks, patch=3)[0, 0, 0, :2]
-        >>> round(dark.item(), 3), round(bright.item(), 3)  # half of four pixels, half of six
-        (-1.0, 1.0)
     """
     height, width = frames.shape[-2:]
     if min(height, width) < patch:
@@ -122,12 +110,10 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
 
 
 def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8, 8)) -> Tensor:
-    """Contrast-limited adaptive histogram equalisation (CLAHE) by kornia, for each channel.
+    """Contrast-limited adaptive histogram equalisation (CLAHE) by kornia, for each channel, in [0, 1].
 
-    Shape: (B,C,H,W) in [0, 1] -> the same.
-
-    Convention: a table of 256 grey levels has no gradient: it passes as if the output followed the input one
-        to one. Kornia's differentiable form gives other values (up to 0.3 away).
+    A table of 256 grey levels has no gradient: it passes as if the output followed the input one to one.
+    Kornia's differentiable form gives other values (up to 0.3 away).
     """
     if torch.compiler.is_exporting():
         raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")

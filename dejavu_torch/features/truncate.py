@@ -46,11 +46,8 @@ def _traced_calls() -> OrderedDict[str, Any]:
 def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     """A copy of a network that `run` ends at a layer, the name of a submodule; the first of its runs counts.
 
-    Convention: modules that have not run when the layer is done are left out of the copy, unless it gives
-        something else without them on `frames`. The names of the others stay.
-
-    Raises:
-        InputError: no such layer, or one that the network does not run.
+    Modules that have not run when the layer is done are left out of the copy, unless it gives something else
+    without them on `frames`. The names of the others stay.
     """
     name, names = type(network).__name__, [one for one, _ in network.named_modules() if one]
     if layer not in names:

@@ -40,9 +40,6 @@ def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tens
 
     Limits: |shift| up to about 0.4 h ("dis" 0.25 h, and only to 0.1 pixels). Lines along the way seem to
         stand still: on a motorway both are worse than `phase_shifts`.
-
-    Raises:
-        InputError: an unknown method, or OpenCV cannot be imported.
     """
     track = tracker(method)
     found = [_shift(track, *pair) for pair in zip(_pictures(first), _pictures(second), strict=True)]

@@ -27,30 +27,22 @@ def check_corners(corners: Corners) -> None:
     points = torch.tensor(corners, dtype=torch.float64)
     if not ((points >= 0) & (points <= 1)).all():
         raise InputError(f"{text} lie outside the frame; expected fractions of it, 0 to 1")
-    (ax, ay), (bx, by) = (points.roll(-1, 0) - points).T, (points.roll(-2, 0) - points.roll(-1, 0)).T
-    if not (ax * by - ay * bx > 1e-6).all():
+    edges = points.roll(-1, 0) - points
+    if not (torch.stack([edges, edges.roll(-1, 0)], 1).det() > 1e-6).all():
         raise InputError(f"{text} are not convex; expected far left, far right, near right, near left")
 
 
 def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, int] = (96, 96)) -> Tensor:
-    """The ground in front of the camera as seen from above, grey.
+    """The ground in front of the camera as seen from above, in grey: frames (B,C,H,W), grey or RGB ->
+    (B,1,rows,columns), row 0 at the far end.
 
     Args:
-        frames: RGB or grey.
         corners: (x, y) of a region of ground, see `GroundOdometry`; (0, 0) is the top left pixel of the
             frame, (1, 1) the bottom right one.
         size: (rows, columns) of the patch in pixels.
 
-    Shape: (B,C,H,W) -> (B,1,rows,columns); row 0 is the far end.
-
-    Convention: rows of the frame are smoothed by (1, 2, 1) / 4, since the far rows are sampled coarsely.
-
     Raises:
         InputError: not (B,C,H,W) float with 1 or 3 channels, or frames below 2 x 2.
-
-    Example:
-        >>> ground_patch(torch.rand(2, 3, 120, 160), size=(96, 64)).shape
-        torch.Size([2, 1, 96, 64])
     """
     if frames.ndim != 4 or frames.shape[1] not in (1, 3) or not frames.is_floating_point():
         raise InputError(
@@ -66,6 +58,7 @@ def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, 
     from kornia.geometry.transform import get_perspective_transform, warp_perspective
 
     grey = frames if frames.shape[1] == 1 else rgb_to_grayscale(frames)
+    # the far rows are sampled coarsely
     grey = conv2d(pad(grey, (0, 0, 1, 1), mode="replicate"), grey.new_tensor([1, 2, 1]).view(1, 1, 3, 1) / 4)
     unit = grey.new_tensor([[[0, 0], [1, 0], [1, 1], [0, 1]]])
     region = torch.tensor([corners]).to(grey) * grey.new_tensor([width - 1, height - 1])

@@ -118,8 +118,7 @@ class GroundOdometry(nn.Module):
             progress: show a progress bar on a terminal.
 
         Convention: a step of a confidence below `least` (a cut, a drop-out) is interpolated between its
-            neighbours, and a warning names the frames. A step shorter than `still` is 0. Frames too small
-            for the patch are a warning.
+            neighbours, and a warning names the frames. A step shorter than `still` is 0.
 
         Raises:
             InputError: ready features, fewer than two frames, or no step of enough confidence.
@@ -160,13 +159,8 @@ class GroundOdometry(nn.Module):
 
 
 def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
-    """Steps (n,), those that are not valid interpolated between the others, a warning naming their frames.
-
-    Convention: before the first valid step and after the last, that one.
-
-    Raises:
-        InputError: none is valid.
-    """
+    """Steps (n,), those that are not valid interpolated between the others, a warning naming their frames;
+    before the first valid step and after the last, that one."""
     bad, good = (~valid).nonzero()[:, 0], valid.nonzero()[:, 0]
     if not len(bad):
         return shift

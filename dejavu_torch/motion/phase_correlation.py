@@ -32,13 +32,6 @@ def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         about 0.42 h, sway at most 3 columns. The confidence is the mean coherence: 1 for the same picture,
         mostly 0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of 96 x 96), 0 for
         patches that are flat or not finite.
-
-    Example:
-        >>> ground = torch.rand(1, 1, 80, 64)
-        >>> shift, confidence = phase_shifts(ground[..., 10:74, :], ground[..., 3:67, :])
-        >>> best = confidence[0].argmax()
-        >>> round(shift[0, best].item(), 1), confidence[0, best].item() > 0.9
-        (7.0, True)
     """
     count, _, height, _ = first.shape
     # coarse: every whole lag at half the resolution
@@ -60,13 +53,8 @@ def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _coherence(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway: int, band: float) -> Tensor:
-    """Mean coherence at the shifts guess + lag, the best over sways of up to `sway` columns.
-
-    Args:
-        band: standard deviation of a Gaussian over the frequencies, cycles/pixel.
-
-    Shape: (B,h,w), (B,h,w), (B,), (T,) -> (B,T).
-    """
+    """Mean coherence (B,T) at the shifts guess (B,) + lag (T,), the best over sways of up to `sway` columns;
+    band: standard deviation of a Gaussian over the frequencies, cycles/pixel."""
     height, width = first.shape[1:]
     row = torch.arange(height).to(first)
     common = (height - guess.abs())[:, None]  # rows of ground in both
@@ -105,12 +93,10 @@ def _vertex(score: Tensor, at: Tensor) -> Tensor:
 
 
 def viterbi_path(shifts: Tensor, confidences: Tensor, height: int) -> Tensor:
-    """Which shift of each pair, if the pairs follow one another in time.
+    """Which of the shifts (n,K) of each pair, if the pairs follow one another: (n,) int64, on the CPU.
 
     Sleepers look the same one period further on. The path with the highest sum of confidences less changes of
     the shift, in patch heights (`height`, pixels), resolves that.
-
-    Shape: (n,K), (n,K) -> (n,) int64, on the CPU.
     """
     shifts, confidences = shifts.double().cpu(), confidences.double().cpu()
     change = (shifts[1:, :, None] - shifts[:-1, None]).abs() / height

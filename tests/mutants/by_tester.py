@@ -235,8 +235,8 @@ MUTANTS = [
     Mutant(
         "Numbers of 4 bits come back from half a byte each.",
         "dejavu_torch/features/whitening.py",
-        "return low | high << 4",
-        "return high | low << 4",
+        "self.projection = low | high << 4",
+        "self.projection = high | low << 4",
         ("tests/features/test_whitening.py::test_numbers_of_four_bits_come_back_from_their_bytes",),
     ),
     Mutant(
