@@ -21,8 +21,6 @@ def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
     centres, which is faster than a window at every pixel (`normalise_patches`). All channels share the
     contrast. A gain or an offset of brightness changes almost nothing; contrast below 2/255 is not amplified.
     """
-    if cell < 1:
-        raise InputError(f"local_contrast got a cell of {cell} pixels; expected at least 1")
     height, width = frames.shape[-2:]
     grid = (-(-height // cell), -(-width // cell))
 
@@ -68,20 +66,14 @@ class SmallCNN(nn.Module):
     ) -> None:
         super().__init__()
         self.resize = check_size(resize, 1, "SmallCNN got resize")
-        self.follows = channels is None
-        channels = 3 if channels is None else channels
-        sizes = [dimension, channels, squeeze, *widths]
-        if not widths or min(sizes) < 1 or cell < 0:
-            raise InputError(
-                f"SmallCNN got dimension={dimension}, channels={channels}, "
-                f"widths={tuple(widths)}, squeeze={squeeze}, cell={cell}; expected at least 1 each, "
-                "cell 0 or more"
-            )
-        self.dimension, self.channels, self.squeeze, self.cell = dimension, channels, squeeze, cell
+        self.follows, self.channels = channels is None, 3 if channels is None else channels
+        self.dimension, self.squeeze, self.cell = dimension, squeeze, cell
         self.widths = tuple(int(width) for width in widths)  # a map gives a list
+        if not widths or min(dimension, self.channels, squeeze, *widths) < 1 or cell < 0:
+            raise InputError(f"SmallCNN got {settings_of(self)}; expected at least 1 each, cell 0 or more")
         layers: list[nn.Module] = []
         height, width = self.resize
-        for before, after in zip((channels, *self.widths), self.widths, strict=False):
+        for before, after in zip((self.channels, *self.widths), self.widths, strict=False):
             side = 3 if layers else 5
             layers += [
                 nn.Conv2d(before, after, side, stride=2, padding=side // 2, bias=False),

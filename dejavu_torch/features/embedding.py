@@ -109,7 +109,7 @@ class Embedding(nn.Module):
 
     Raises:
         InputError: settings out of range, a network that cannot take such frames, or has no such layer or
-            output; forward: frames that are neither grey nor colour, an output of another size than before.
+            output; forward: frames that are neither grey nor colour.
 
     Example:
         >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
@@ -139,12 +139,12 @@ class Embedding(nn.Module):
         super().__init__()
         if not isinstance(network, nn.Module):
             raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
-        coded = hidden == 0 if dimension is None else dimension >= 1
+        fits = hidden == 0 if dimension is None else dimension >= 1
         self.resize = check_size(resize, 1, "Embedding got resize")
         self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell
         self.hidden, self.noise, self.kept = hidden, noise, kept
         self.layer, self.mean, self.std, self.output = layer, mean, std, output
-        if not coded or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
+        if not fits or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
             raise InputError(
                 f"Embedding got {self.extra_repr()}; expected 1 or 3 channels, cell and hidden of 0 or more "
                 f"(with no dimension hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
@@ -157,7 +157,7 @@ class Embedding(nn.Module):
         try:
             self.network = network if layer is None else up_to(network, layer, frame)
             with torch.no_grad(), in_mode(self.network, False):
-                self.inputs = self._pooled(run(self.network, frame)).shape[1]
+                inputs = self._pooled(run(self.network, frame)).shape[1]
         except InputError:
             raise
         except Exception as error:  # a network may raise anything
@@ -167,8 +167,8 @@ class Embedding(nn.Module):
         self.linear: nn.Module = nn.Identity()
         self.standardise: nn.Module = nn.Identity()
         if dimension is not None:
-            sizes = (self.inputs, dimension)
-            self.linear = Coder(*sizes, hidden, noise, kept) if hidden else nn.Linear(*sizes)
+            coded = (inputs, dimension, hidden, noise, kept)
+            self.linear = Coder(*coded) if hidden else nn.Linear(inputs, dimension)
             self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
     def _pooled(self, made: object) -> Tensor:
@@ -220,13 +220,7 @@ class Embedding(nn.Module):
             frames = local_contrast(frames, self.cell)
         if self.mean is not None or self.std is not None:
             frames = (frames - self.offset.to(frames)) * self.factor.to(frames)
-        descriptors = self._pooled(run(self.network, frames))
-        if descriptors.shape[1] != self.inputs:
-            raise InputError(
-                f"{type(self.network).__name__} made {descriptors.shape[1]} numbers for each of "
-                f"{len(frames)} frames; expected {self.inputs}, as for the frame that it was tried with"
-            )
-        return descriptors
+        return self._pooled(run(self.network, frames))
 
     def code(self, descriptors: Tensor) -> Tensor:
         """Features of descriptors: (B,K) -> (B,D)."""

@@ -105,9 +105,10 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
         return batch
     features = describe(batch)
     if features.ndim != 2 or features.shape[0] != batch.shape[0]:
-        maker = describe[-1] if isinstance(describe, nn.Sequential) else describe
-        owner = maker if isinstance(maker, nn.Module) else getattr(maker, "__self__", None)
-        owner = getattr(owner, "features", owner)
+        owner = (
+            describe[-1] if isinstance(describe, nn.Sequential) else getattr(describe, "__self__", describe)
+        )
+        owner = getattr(owner, "features", owner)  # of a DejaVu
         raise InputError(
             f"{type(owner).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
             f"expected features ({len(batch)}, D)"

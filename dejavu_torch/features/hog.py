@@ -46,15 +46,15 @@ class HOG(nn.Module):
         bins: Bins = "hard",
     ) -> None:
         super().__init__()
-        known = bins in get_args(Bins)
-        if not known or min(orientations, cell, block) < 1 or orientations > MOST_ORIENTATIONS:
-            raise InputError(
-                f"HOG got orientations={orientations}, cell={cell}, block={block}, bins={bins!r}; expected "
-                f"at least 1 each, at most {MOST_ORIENTATIONS} orientations, and bins 'hard' or 'linear'"
-            )
         self.orientations, self.cell, self.block = orientations, cell, block
         self.resize = None if resize is None else check_size(resize, cell * block, "HOG got resize")
         self.bins: Bins = bins
+        least, most = min(orientations, cell, block), MOST_ORIENTATIONS
+        if least < 1 or orientations > most or bins not in get_args(Bins):
+            raise InputError(
+                f"HOG got {settings_of(self)}; expected at least 1 each, at most {most} orientations, bins "
+                "'hard' or 'linear'"
+            )
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "HOG")

@@ -18,9 +18,9 @@ log = logging.getLogger("dejavu_torch")
 
 ROWS = 1024  # in double precision at a time
 SAMPLED = 4096  # rows that principal components are found in
-NUMBERS = 128  # dimensions, unless said otherwise
+DIMENSIONS = 128  # unless said otherwise
 WIDEST = 256  # dimensions without whitening
-PLACES_PER_NUMBER = 4  # a short route does not fill as many dimensions
+PLACES_PER_DIMENSION = 4  # a short route does not fill as many dimensions
 COMPONENTS = 400  # that whitening works on
 VIEWS = 4  # of a frame, on a long route
 VIEWS_PER_COMPONENT = 30  # on any: as 4 views of each of 3000 frames
@@ -206,7 +206,7 @@ class Whitening(nn.Module):
         """Dimensions that are kept, unless the rank of the route is lower."""
         if self.numbers is not None:
             return self.numbers
-        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else WIDEST
+        return min(DIMENSIONS, features, max(1, places // PLACES_PER_DIMENSION)) if views else WIDEST
 
     @torch.no_grad()
     def learn(self, places: Tensor, views: Iterable[tuple[Tensor, Tensor]] | None = None) -> None:

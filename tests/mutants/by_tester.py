@@ -226,10 +226,10 @@ MUTANTS = [
         ("tests/features/test_preprocess.py::test_the_floor_keeps_noise_small",),
     ),
     Mutant(
-        "A whitening keeps fewer numbers of a short route.",
+        "A whitening keeps fewer dimensions of a short route.",
         "dejavu_torch/features/whitening.py",
-        "return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else WIDEST",
-        "return min(NUMBERS, features) if views else WIDEST",
+        "return min(DIMENSIONS, features, max(1, places // PLACES_PER_DIMENSION)) if views else WIDEST",
+        "return min(DIMENSIONS, features) if views else WIDEST",
         ("tests/features/test_whitening.py::test_numbers_follow_the_rank_and_the_length_of_the_route",),
     ),
     Mutant(
