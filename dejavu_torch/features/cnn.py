@@ -48,11 +48,6 @@ class SmallCNN(nn.Module):
 
     Raises:
         InputError: settings below 1; forward: frames of another number of channels.
-
-    Example:
-        >>> import torch
-        >>> SmallCNN(dimension=96)(torch.rand(2, 3, 96, 96)).shape
-        torch.Size([2, 96])
     """
 
     def __init__(

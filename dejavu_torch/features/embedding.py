@@ -20,7 +20,7 @@ SHOWN = 4  # shapes in a message
 
 
 class Coder(nn.Module):
-    """Whitens a descriptor and maps it, by one hidden layer, to the code of its place.
+    """Whitens a descriptor (B,K) and maps it, by one hidden layer, to the code (B,D) of its place.
 
     That code is arbitrary: training adds noise to the whitened descriptor, for the days that it does not see.
 
@@ -30,13 +30,8 @@ class Coder(nn.Module):
         noise: its standard deviation beside components of about 1, in training mode.
         kept: number of components that whitening keeps; fewer if K is smaller.
 
-    Shape: (B,K) -> (B,D).
-
-    Convention: components are the first numbers of the descriptor until `whiten`. They are scaled to length
-        sqrt(components) before the noise, and after it.
-
-    Raises:
-        InputError: settings out of range.
+    Convention: components are the first dimensions of the descriptor until `whiten`. They are scaled to
+        length sqrt(components) before the noise, and after it.
     """
 
     mean: Tensor
@@ -101,15 +96,14 @@ class Embedding(nn.Module):
         noise, kept: of the `Coder`.
         layer: name of the submodule, as in `named_modules`, that the network ends at, see `up_to`.
         mean, std: of each channel, or one number for all, subtracted from the frames in [0, 1] and divided
-            out last; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet trained. None is 0, and
-            1.
+            out last; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet trained.
         output: index of the member of a tuple, list or dict that counts instead.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
     Raises:
         InputError: settings out of range, a network that cannot take such frames, or has no such layer or
-            output; forward: frames that are neither grey nor colour.
+            output; forward: frames neither grey nor RGB.
 
     Example:
         >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
@@ -177,16 +171,13 @@ class Embedding(nn.Module):
         if self.output is not None:
             members = members_of(made)
             if not -len(members) <= self.output < len(members):
-                raise InputError(
-                    f"output is {self.output}, but {name} made {len(members)}; expected one of them"
-                )
+                seen = f"output is {self.output}, but {name} made {len(members)}"
+                raise InputError(f"{seen}; expected one of them")
             made = members[self.output]
         tensors = tensors_in(made)
         chosen = tensors if len(tensors) == 1 else [tensor for tensor in tensors if tensor.ndim == 2]
-        if chosen and chosen[0].ndim == 2:
-            return chosen[0]
-        if chosen and chosen[0].ndim == 3:
-            return chosen[0].mean(1)
+        if chosen and chosen[0].ndim in (2, 3):
+            return chosen[0].mean(1) if chosen[0].ndim == 3 else chosen[0]
         if chosen and chosen[0].ndim == 4:
             return nn.functional.adaptive_avg_pool2d(chosen[0], self.grid).flatten(1)
         seen = ", ".join(str(tuple(tensor.shape)) for tensor in tensors[:SHOWN]) or type(made).__name__

@@ -21,23 +21,19 @@ LEAST, SCORES = 240, 2**27  # frames of a long route at least, and scores of the
 
 
 class Views(NamedTuple):
-    """Frames of places of the reference.
-
-    places: (n,) int64, which place each frame shows; -1 for none, and the frame is left out.
-    """
+    """Frames of places of the reference: (n,) int64, the place that each shows; -1 for none, to skip it."""
 
     traverse: Traverse
     places: Tensor
 
 
 class AugmentedTraverse(Traverse):
-    """Augmented copies of frames of a traverse: one of each frame of a block, another of each, and so on.
+    """Augmented copies of frames of a traverse: one of each frame of a block, another of each, and so on; the
+    same whatever the batch size.
 
     Args:
         traverse: frames (B,C,H,W). runs: the frames, increasing. block: frames augmented at once, at most.
         copies: of each frame. strengths: arguments of `Augmentation`. factor: to multiply them by.
-
-    Convention: the copies are the same whatever the batch size.
 
     Raises:
         InputError: ready features, or strengths that `Augmentation` refuses.

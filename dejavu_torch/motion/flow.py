@@ -24,19 +24,12 @@ CONTRAST = 40.0  # grey levels per standard deviation of the patch
 
 
 def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tensor]:
-    """How far the ground moved along the rows from one patch to the next, for each pair.
+    """How far the ground moved from one patch to the next, as in `phase_shifts`: shift (B,), confidence (B,).
 
-    The median displacement of the points that, tracked forward and back, end where they started.
-
-    Args:
-        first, second: as in `phase_shifts`.
-        method: "lk" tracks up to 200 corners (pyramidal Lucas-Kanade), "dis" every pixel around which the
-            brightness changes along the rows (dense inverse search).
-
-    Shape: (B,1,h,w), (B,1,h,w) -> shift (B,) in pixels, rows of the patch; confidence (B,) in [0, 1].
-
-    Convention: shift > 0 is forward. The confidence is the share of points that agree with the median, 0 for
-        a patch that is flat or not finite. On the CPU, without gradients.
+    The median displacement of the points that, tracked forward and back, end where they started. "lk" tracks
+    up to 200 corners (pyramidal Lucas-Kanade), "dis" every pixel around which the brightness changes along
+    the rows (dense inverse search). The confidence is the share of points that agree with the median, 0 for a
+    patch that is flat or not finite.
 
     Limits: |shift| up to about 0.4 h ("dis" 0.25 h, and only to 0.1 pixels). Lines along the way seem to
         stand still: on a motorway both are worse than `phase_shifts`.

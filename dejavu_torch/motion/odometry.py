@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from dejavu_torch.data.selection import runs
 from dejavu_torch.motion.flow import flow_shift, tracker
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
@@ -35,12 +36,10 @@ class GroundOdometry(nn.Module):
 
     Args:
         corners: (x, y) of a region of ground in fractions of the frame: far left, far right, near right,
-            near left. Its sides should be parallel on the ground, as two rails are, so that every row of the
-            patch is the same length of ground.
+            near left. Its sides should be parallel on the ground, as two rails are.
         size: (rows, columns) of the patch it becomes, pixels, at least 32 x 32. The longest step that can be
             measured is about 0.42 of its rows.
-        step: pixels of ground from one resampled frame to the next; None is the median step of the
-            frames that move.
+        step: pixels of ground from one resampled frame to the next; None is the median of the steps not 0.
         least: confidence below which a step is interpolated, in [0, 1]. The default finds a cut in patches of
             96 x 96; in those of 32 x 32 unrelated ground can agree by 0.8.
         still: pixels of ground; a shorter step of either sign counts as 0, as of a standing camera. Ground of
@@ -48,14 +47,12 @@ class GroundOdometry(nn.Module):
         flow: how patches are compared: "phase" (`phase_shifts`), or optical flow of OpenCV, "lk" on corners
             or "dis" on all pixels (`flow_shift`, with its limits; `pip install 'dejavu_torch[flow]'`).
 
-    Shape: (N,C,H,W) -> shift (N-1,) in pixels of ground, forward > 0; confidence (N-1,) in [0, 1]: both
-        as measured, of consecutive frames.
+    Shape: (N,C,H,W) -> shift (N-1,) in pixels of ground, forward > 0; confidence (N-1,) in [0, 1].
 
     Convention: if periodic ground leaves several shifts, those that change least (`viterbi_path`).
 
     Raises:
-        InputError: an argument out of range; OpenCV is missing; forward: fewer than two frames, or not
-            (N,C,H,W) float.
+        InputError: an argument out of range, OpenCV missing; forward: not (N,C,H,W) float, or N of 1.
 
     Example:
         >>> shift, confidence = GroundOdometry()(torch.rand(1, 3, 120, 160).expand(5, 3, 120, 160))
@@ -123,16 +120,16 @@ class GroundOdometry(nn.Module):
         Raises:
             InputError: ready features, fewer than two frames, or no step of enough confidence.
         """
-        patches: Tensor | None = None
+        last: list[Tensor] = []  # patch of the batch before
         parts: list[tuple[Tensor, Tensor]] = []
         text, hidden = "measuring the ground", None if progress else True
         with tqdm(total=traverse.length, desc=text, unit="frame", disable=hidden, leave=False) as bar:
             for batch in traverse.batches(traverse.batch_size(batch_size)):
-                new = ground_patch(batch, self.corners, self.size)
-                if patches is None:
+                patches = torch.cat([*last, ground_patch(batch, self.corners, self.size)])
+                if not last:
                     self._warn_coarse(batch, traverse.name)
-                patches = new if patches is None else torch.cat([patches[-1:], new])
                 parts += self._shifts(patches)
+                last = [patches[-1:]]
                 bar.update(len(batch))
         shift, confidence = (part.cpu() for part in self._path(parts, traverse.name))
         shift = interpolated(shift.double(), confidence >= self.least, traverse.name)
@@ -169,8 +166,7 @@ def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
             f"{name}: none of {len(shift)} steps shows the same ground twice; "
             "expected corners on the ground in front of the camera"
         )
-    starts, stops = bad[bad.diff(prepend=bad[:1] - 2) > 1], bad[bad.diff(append=bad[-1:] + 2) > 1] + 1
-    segments = [f"{start} to {stop}" for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
+    segments = [f"{run.start} to {run.stop}" for run in runs(bad)]
     more = f" and {len(segments) - NAMED} more" if len(segments) > NAMED else ""
     log.warning(
         "%s: no common ground in frames %s%s (%d of %d steps): the velocity there is interpolated",

@@ -23,10 +23,8 @@ def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     Correlation of phases, each frequency weighted by its coherence over the columns, so that noise and motion
     blur weigh little. Each peak at half the resolution is refined by windows that move with the ground.
 
-    Args:
-        first, second: patches of ground, of any gain and offset of brightness, at least 32 x 32.
-
-    Shape: (B,1,h,w), (B,1,h,w) -> shift (B,K) in pixels, rows of the patch; confidence (B,K) in [0, 1].
+    Shape: patches of any gain and offset of brightness, at least 32 x 32, (B,1,h,w), (B,1,h,w) ->
+        shift (B,K) in pixels, rows of the patch; confidence (B,K) in [0, 1].
 
     Convention: shift > 0 is forward: row r of the first is row r + shift of the second. |shift| is at most
         about 0.42 h, sway at most 3 columns. The confidence is the mean coherence: 1 for the same picture,

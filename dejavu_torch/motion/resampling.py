@@ -21,9 +21,8 @@ DOUBTFUL = 0.2  # steps backwards for each one forward
 
 
 class ResampledTraverse(Selection):
-    """The frames of another traverse, resampled by distance: at even steps along the ground.
-
-    The other traverse is read once to measure the distances, and again each time the frames are asked for.
+    """The frames of another traverse, resampled by distance: at even steps along the ground. It is read once
+    to measure the distances, and again each time the frames are asked for.
 
     Args:
         odometry: measures the ground, and has the default of the step.
@@ -31,16 +30,14 @@ class ResampledTraverse(Selection):
         step: pixels of ground, in place of the odometry's; as for the queries of a map.
         progress: show a progress bar on a terminal.
 
-    Shape: frames (M,C,H,W). positions: (F,) float32, how many steps each frame of the other traverse lies
-        from the first. frame: (M,) int64, the frame of the other traverse nearest to each step, which is
-        shown. place: (M,) float64, its place, None if unknown. step: pixels of ground.
+    Shape: positions: (F,) float32, how many steps each frame of the other traverse lies from the first.
+        frame: (M,) int64, the one nearest to each step, which is shown. place: (M,) float64, or None.
 
     Convention: distances count from frame 0, in the direction in which the camera gets further from it. Each
         step is taken where it is first reached: standing, and going back and forth, add no frames.
 
     Raises:
-        InputError: as `GroundOdometry.distances`, and footage that does not move, or less than a step, or
-            over 20 steps a frame.
+        InputError: footage that does not move, or less than a step, or over 20 steps a frame.
     """
 
     length: int
@@ -95,12 +92,8 @@ def resampled(
     step: float | None = None,
     progress: bool = False,
 ) -> Traverse:
-    """A `ResampledTraverse`; the traverse itself without odometry, or if it is resampled already.
-
-    Args:
-        step: pixels of ground; None is the odometry's own. Queries need the map's: of them a single frame,
-            and ready features, stay as they are.
-    """
+    """A `ResampledTraverse`; the traverse itself without odometry, or if it is resampled already. Queries
+    have the `step` of the map: a single frame, and ready features, then stay as they are."""
     if odometry is None or isinstance(traverse, ResampledTraverse):
         return traverse
     if step is not None and (traverse.length == 1 or len(traverse.frame_shape) == 1):
@@ -122,11 +115,8 @@ def ground_truth_of(
     interpolate: bool = False,
     aligned: bool = False,
 ) -> GroundTruth | None:
-    """`find_ground_truth` of traverses that may be resampled, in frames of the reference's source.
-
-    Args:
-        places, queries: how many frames the traverses gave, needed where they do not know their lengths.
-    """
+    """`find_ground_truth` of traverses that may be resampled, in frames of the reference's source; places,
+    queries: how many frames the traverses gave, needed if they do not know their lengths."""
     frames, moved = reference.length if places is None else places, isinstance(reference, ResampledTraverse)
     if isinstance(reference, ResampledTraverse):
         frames = len(reference.positions)
