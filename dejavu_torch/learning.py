@@ -17,13 +17,20 @@ from torch import Tensor, nn
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.selection import Selection
 from dejavu_torch.features.extract import check_alone, feature_batches, warn_of_bright
-from dejavu_torch.features.memory import IN_MEMORY, concatenate
-from dejavu_torch.features.views import LEAST, STRETCH, AugmentedTraverse, Stretches, Views
+from dejavu_torch.features.views import (
+    LEAST,
+    STRETCH,
+    AugmentedTraverse,
+    Views,
+    augmented_route,
+    augmented_segments,
+)
 from dejavu_torch.features.whitening import STRENGTHS, Whitening
 from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
+from dejavu_torch.memory import IN_MEMORY, concatenate
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
 from dejavu_torch.types import InputError, Traverse
@@ -131,8 +138,7 @@ class Describer(NamedTuple):
         if second is None and not is_ready(traverse) and whitening.views != 0:
             copies = whitening.copies(*features.shape)
             settings = copies, whitening.most_views, whitening.strengths, whitening.seed
-            augmented = AugmentedTraverse(traverse, len(features), *settings)
-            second, looks = augmented.views, augmented.looks
+            second, looks = augmented_route(traverse, len(features), *settings)
         if second is None:
             whitening.learn(features)
         else:
@@ -639,12 +645,12 @@ def calibration_of(
             raise InputError("neither a reference nor views to calibrate by; expected one of them")
         strengths = STRENGTHS if describer.whitening is None else describer.whitening.strengths
         places = torch.arange(route.places) if places is None else places
-        stretches = Stretches(reference, len(places), strengths, places=route.places)
-        views = Views(stretches, places[stretches.places])
+        segments = augmented_segments(reference, len(places), strengths, route.places)
+        views = Views(segments, places[segments.places])
     observation_counts(views, route.places)  # refuses places beyond the map's
-    another = not isinstance(views.traverse, Stretches)
-    if isinstance(views.traverse, Stretches):
-        length = views.traverse.stretch
+    another = not isinstance(views.traverse, AugmentedTraverse)
+    if isinstance(views.traverse, AugmentedTraverse):
+        length = views.traverse.block
     else:
         length = max(STRETCH, min(LONGEST_SEGMENT, SEGMENT_SCORES // route.places))
         views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // route.places))

@@ -1,11 +1,14 @@
-"""How much memory there is, so that what cannot fit is refused before it is made."""
+"""How much memory there is, and what lies in temporary files instead."""
 
 from __future__ import annotations
 
 import math
 import os
 import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
@@ -16,6 +19,8 @@ from dejavu_torch.types import InputError
 GROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
 OWN = Path("/proc/self/cgroup")  # which of them the process is in
 CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back if memory is short
+IN_MEMORY = 2**29  # bytes of features, before they spill
+BLOCK = 2**26  # bytes: so large a tensor goes back to the system once it is freed, a batch may not
 
 
 def free_memory() -> float:
@@ -24,13 +29,7 @@ def free_memory() -> float:
 
 
 def check_room(needed: float, what: str) -> None:
-    """Refuse what does not fit into memory.
-
-    Args:
-        needed: bytes. what: it is, as the message begins.
-
-    Raises:
-        InputError: with both numbers.
+    """Refuse what takes more bytes than are free; the message begins with `what` it is.
 
     Example:
         >>> check_room(10**6, "a strip of 1000 x 1000 pixels")
@@ -38,36 +37,6 @@ def check_room(needed: float, what: str) -> None:
     free = free_memory()
     if needed > free:
         raise InputError(f"{what} takes {_size(needed)}; expected at most the {_size(free)} free")
-
-
-def empty(rows: int, columns: int, device: torch.device, in_memory: int = 2**29) -> Tensor:
-    """Room for a tensor that may be larger than the memory: on the CPU it then lies in a temporary file.
-
-    Args:
-        in_memory: bytes, at most. The file has no name and goes with the tensor or the process.
-
-    Shape: (rows,columns) float32.
-
-    Raises:
-        InputError: no room for the file.
-
-    Example:
-        >>> empty(3, 2, torch.device("cpu")).shape
-        torch.Size([3, 2])
-    """
-    size = 4 * rows * columns
-    if device.type != "cpu" or size <= in_memory:
-        return torch.empty(rows, columns, device=device)
-    try:
-        with tempfile.TemporaryFile() as file:
-            if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
-                os.posix_fallocate(file.fileno(), 0, size)
-            return torch.from_numpy(np.memmap(file, np.float32, "w+", shape=(rows, columns)))
-    except OSError as error:
-        raise InputError(
-            f"{rows} x {columns} numbers do not fit into a temporary file: {error.strerror}; "
-            "expected room there, or TMPDIR set to a folder with room"
-        ) from error
 
 
 def _size(number: float) -> str:
@@ -79,11 +48,8 @@ def _of_system() -> float:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
     except (OSError, ValueError, StopIteration):  # another system
-        pass
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, ValueError, OSError):
-        return math.inf
+        known = hasattr(os, "sysconf")
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if known else math.inf
 
 
 def _of_container() -> float:
@@ -114,3 +80,91 @@ def _of_process() -> float:
     except (ImportError, OSError, ValueError):  # another system
         return math.inf
     return math.inf if limit == resource.RLIM_INFINITY else float(limit - used)
+
+
+@contextmanager
+def _spilling(what: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{what} do not fit into a temporary file: {error.strerror}; "
+            "expected room there, or TMPDIR set to a folder with room"
+        ) from error
+
+
+def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEMORY) -> Tensor:
+    """(rows,columns) float32, not set; on the CPU, one of over `in_memory` bytes lies in a temporary file
+    without a name. InputError if there is no room for it."""
+    size = 4 * rows * columns
+    if device.type != "cpu" or size <= in_memory:
+        return torch.empty(rows, columns, device=device)
+    with _spilling(f"{rows} x {columns} numbers"), tempfile.TemporaryFile() as file:
+        if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
+            os.posix_fallocate(file.fileno(), 0, size)
+        return torch.from_numpy(np.memmap(file, np.float32, "w+", shape=(rows, columns)))
+
+
+def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: bool = False) -> Tensor:
+    """Batches (B,D) of one number type as one tensor (N,D), which may be larger than the memory.
+
+    Args:
+        in_memory: about how many bytes to keep in memory. More spill to a temporary file without a name,
+            which the tensor then maps, on the CPU: rows are read when they are used.
+        half: whether the file holds float16.
+
+    Raises:
+        InputError: batches of different D or number type, none at all, or no room for the file.
+    """
+    parts: list[Tensor] = []
+    file: IO[bytes] | None = None
+    rows, held = 0, 0
+    for block in _blocks(batches, min(BLOCK, in_memory)):
+        parts.append(block)
+        rows, held = rows + len(block), held + block.nbytes
+        if held > in_memory:
+            file = _spilled(parts, file, half)
+            parts, held = [], 0
+    if not parts and file is None:
+        raise InputError("there are no features; expected at least one batch")
+    if file is None:
+        if len(parts) == 1:
+            return parts[0]
+        whole = block.new_empty(rows, block.shape[1])  # torch.cat would hold all of them twice
+        for room in whole.split([len(part) for part in parts]):
+            room.copy_(parts.pop(0))
+        return whole
+    _spilled(parts, file, half)
+    kind = np.float16 if half else block.cpu().numpy().dtype
+    # copy on write: the tensor may be written to, the file never is
+    return torch.from_numpy(np.memmap(file, kind, "c", shape=(rows, block.shape[1])))
+
+
+def _blocks(batches: Iterable[Tensor], most: int) -> Iterator[Tensor]:
+    """Batches joined to blocks of just over `most` bytes."""
+    loose: list[Tensor] = []
+    kind, rows, held = None, 0, 0
+    for batch in batches:
+        seen = batch.shape[1], batch.dtype
+        kind = kind or seen
+        if seen != kind:
+            raise InputError(
+                f"features {rows}.. are {seen[0]} of {seen[1]}; expected {kind[0]} of {kind[1]} as before"
+            )
+        rows, held = rows + len(batch), held + batch.nbytes
+        loose.append(batch)
+        if held > most:
+            block, loose, held = torch.cat(loose), [], 0
+            yield block
+    if loose:
+        yield torch.cat(loose)
+
+
+def _spilled(parts: list[Tensor], file: IO[bytes] | None, half: bool) -> IO[bytes]:
+    """The file, a new one if there is none, with the parts at its end."""
+    with _spilling("the features"):
+        file = tempfile.TemporaryFile() if file is None else file  # noqa: SIM115, it goes with the tensor
+        for part in parts:
+            file.write((part.half() if half else part).cpu().contiguous().numpy().data)
+        file.flush()
+    return file

@@ -20,7 +20,6 @@ from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.memory import concatenate
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
@@ -39,6 +38,7 @@ from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
+from dejavu_torch.memory import concatenate
 from dejavu_torch.model_file import (
     CLASSES,
     model_state,

@@ -13,27 +13,20 @@ MOST_PIXELS = 2**26  # of a frame: files and options can name any number
 STRETCHED = 1.05  # change of the aspect ratio that counts
 
 
-def check_size(size: tuple[int, int], least: int, what: str) -> None:
-    """Refuse what is not (height, width) of at least `least` pixels each; the message begins with `what`."""
+def check_size(size: tuple[int, int], least: int, what: str) -> tuple[int, int]:
+    """(height, width) as a tuple, refused below `least` pixels each; the message begins with `what`."""
     if len(size) != 2 or min(size) < least or math.prod(size) > MOST_PIXELS:
         raise InputError(
             f"{what}={tuple(size)}; expected (height, width) in pixels, at least {least} each "
             f"and {MOST_PIXELS} in all"
         )
+    return int(size[0]), int(size[1])  # a map gives a list
 
 
 def resize_frames(frames: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """Frames of another size, antialiased: bilinear, over areas if they shrink.
+    """Frames (B,C,H,W) of another size (height, width), antialiased: bilinear, over areas if they shrink.
 
-    Args:
-        size: (height, width) in pixels; None, and the size that the frames have, change nothing.
-
-    Shape: (B,C,H,W) -> (B,C,height,width).
-
-    Example:
-        >>> import torch
-        >>> resize_frames(torch.rand(2, 3, 48, 64), (24, 32)).shape
-        torch.Size([2, 3, 24, 32])
+    None, and the size that the frames have, change nothing.
     """
     if size is None or tuple(frames.shape[-2:]) == tuple(size):
         return frames

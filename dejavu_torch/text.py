@@ -6,12 +6,7 @@ from unicodedata import category
 
 
 def printable(text: object) -> str:
-    """A text of one line: what is neither printable nor a space, as a line break, is escaped.
-
-    Example:
-        >>> printable("two\\nlines")
-        'two\\\\nlines'
-    """
+    """A text of one line: what is neither printable nor a space, as a line break, is escaped."""
     return "".join(
         c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode()
         for c in str(text)
@@ -19,10 +14,5 @@ def printable(text: object) -> str:
 
 
 def one_line(text: object) -> str:
-    """A text without line breaks, each run of blanks one space.
-
-    Example:
-        >>> one_line(ValueError("two\\n  lines"))
-        'two lines'
-    """
+    """A text without line breaks, each run of blanks one space."""
     return " ".join(str(text).split())

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dejavu_torch import FrequencyLayer, GroundOdometry
+from dejavu_torch.motion.phase_correlation import phase_shifts
 
 SIDE, STEP, CYCLE = 48, 6, 60  # pixels
 WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))  # the camera looks straight down
@@ -42,3 +43,10 @@ def camera(**settings: object) -> GroundOdometry:
 def everything(places: int) -> Fixed:
     """A layer that stores every place."""
     return Fixed(FrequencyLayer(places, places, 0, places, tuple(range(900))))
+
+
+def shift_between(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """The likeliest shift of each pair of patches, (B,1,h,w) twice -> shift (B,), confidence (B,)."""
+    shifts, confidences = phase_shifts(first, second)
+    best = confidences.argmax(1, keepdim=True)
+    return shifts.gather(1, best)[:, 0], confidences.gather(1, best)[:, 0]

@@ -45,13 +45,13 @@ ARROWS = {
     "maps": "types memory data periods",
     "recognition": "types maps",
     "motion": "types memory data",
-    "learning": "types data features maps recognition motion",
+    "learning": "types memory data features maps recognition motion",
     "model_file": "text version types data features periods maps recognition motion learning",
-    "model": "types resize data features maps recognition motion learning model_file",
+    "model": "types memory resize data features maps recognition motion learning model_file",
     "growth": "types data features maps motion learning model_file model",
     "cluster": "text types data maps recognition learning",
     "live": "types data features recognition model",
-    "evaluation": "text types resize data features periods maps recognition motion model",
+    "evaluation": "text types memory resize data features periods maps recognition motion model",
     "training": "text types memory resize data features periods maps recognition "
     "motion model_file model growth evaluation",
     "experiments": "text types data features periods maps recognition motion learning model_file "

@@ -23,8 +23,8 @@ from dejavu_torch import (
     Whitening,
 )
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.features.frames import VALUES_AT_ONCE
 from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.features.preprocess import VALUES_AT_ONCE
 from dejavu_torch.types import FrequencyLayer, Plan
 
 BATCHES = (1, 8, 100)

@@ -13,7 +13,7 @@ from dejavu_torch import DejaVu, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.features.views import AugmentedTraverse, Views
+from dejavu_torch.features.views import Views, augmented_route
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import second_traverse
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -183,29 +183,29 @@ def test_a_whitening_goes_with_templates_as_well(reference: Traverse, second: Tr
 
 
 def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
-    copies = AugmentedTraverse(reference, FRAMES, copies=3, most=90, strengths={}, seed=4)
+    (copies, places), _ = augmented_route(reference, FRAMES, copies=3, most=90, strengths={}, seed=4)
     assert copies.length == 90
-    assert copies.views.places.tolist() == 3 * list(range(0, FRAMES, 10))  # one block
+    assert places.tolist() == 3 * list(range(0, FRAMES, 10))  # one block
     frames = all_of(copies, 12)
     torch.manual_seed(1)
     assert frames.shape == (90, *reference.frame_shape)
     assert torch.equal(all_of(copies, 50), frames)
-    own = all_of(reference)[copies.views.places]
+    own = all_of(reference)[places]
     strangers = own.roll(7, 0)
     assert (
         (frames - own).abs().mean((1, 2, 3)) < (frames - strangers).abs().mean((1, 2, 3))
     ).float().mean() > 0.7
     with refused("ready features", "frames to augment"):
-        AugmentedTraverse(ArrayTraverse(torch.rand(9, 2), "nine"), 9, 1, 9, {})
+        augmented_route(ArrayTraverse(torch.rand(9, 2), "nine"), 9, 1, 9, {})
     with refused("colour2", "occlusion"):
-        AugmentedTraverse(reference, FRAMES, 1, 9, {"colour2": 1})
+        augmented_route(reference, FRAMES, 1, 9, {"colour2": 1})
 
 
 def test_copies_are_the_same_however_frames_are_read() -> None:
     frames = torch.rand(400, 1, 8, 8)
     whole, part = ArrayTraverse(frames[10:310]), FrameRange(ArrayTraverse(frames), 10, 310)
-    own, other = (AugmentedTraverse(one, 300, copies=2, most=200, strengths={}) for one in (whole, part))
-    assert torch.equal(all_of(own), all_of(other))
+    own, other = (augmented_route(one, 300, copies=2, most=200, strengths={})[0] for one in (whole, part))
+    assert torch.equal(all_of(own.traverse), all_of(other.traverse))
 
 
 def test_networks_are_described_in_eval_mode() -> None:

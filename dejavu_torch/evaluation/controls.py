@@ -10,13 +10,13 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from dejavu_torch.features.memory import concatenate
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap, log_posterior
 from dejavu_torch.maps.templates import PhaseTemplates
+from dejavu_torch.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match, SequenceModel

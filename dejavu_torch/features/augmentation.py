@@ -29,8 +29,7 @@ NO_BLUR = 1e-3  # sigma of a kernel that changes nothing
 
 
 class Augmentation(nn.Module):
-    """Light, lens and view of another day, drawn anew for every clip, up to the strength of each kind of
-    change.
+    """Light, lens and view of another day, drawn anew for every clip, up to the strength of each change.
 
     Args:
         colour: per channel, (gain, offset), at most 1: x * (1 +- gain) +- offset.
@@ -51,9 +50,8 @@ class Augmentation(nn.Module):
 
     Convention: they act in this order; rotation, shift, scale and perspective together on 9 clips of 10, and
         repeat the border; gamma, occlusion and noise on 7, illumination and blur on 5 of 10. All frames of a
-            clip
-        change alike, but for the noise; a clip alone is covered with black. Random numbers come from torch's
-        generators. No gradient passes. In eval mode the input itself comes back.
+        clip change alike, but for the noise; a clip alone is covered with black. Random numbers come from
+        torch's generators. No gradient passes. In eval mode the input itself comes back.
 
     Raises:
         InputError: a strength out of range; forward: frames of another shape or dtype, or too small to blur.
@@ -98,7 +96,7 @@ class Augmentation(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         if not self.training:
             return frames
-        (blur,) = self.strengths["blur"]
+        (blur,), (noise,) = self.strengths["blur"], self.strengths["noise"]
         radius = max(1, round(blur)) if blur else 0
         shape, kind = tuple(frames.shape), frames.dtype
         if len(shape) not in (4, 5) or kind != torch.float32 or min(shape) < 1 or min(shape[-2:]) <= radius:
@@ -107,17 +105,14 @@ class Augmentation(nn.Module):
                 f"more than {radius} pixels a side to blur"
             )
         clips = frames if frames.ndim == 5 else frames[:, None]
-        clips = self._lit(self._warped(self._coloured(clips)))
-        clips = self._occluded(_blurred(clips, blur, radius) if blur else clips)
-        (noise,) = self.strengths["noise"]
-        if noise:
-            clips = torch.randn_like(clips).mul_(noise * _happens(clips, NOISY)).add_(clips)
-        return clips.clamp_(0, 1).reshape(shape)  # in place: the input was copied for its colour
-
-    def _coloured(self, clips: Tensor) -> Tensor:
         gain, offset = self.strengths["colour"]
         draw = torch.rand(2, len(clips), 1, clips.shape[2], 1, 1, device=clips.device) * 2 - 1
-        return (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)
+        clips = (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)  # a copy: all else is in place
+        clips = self._lit(self._warped(clips))
+        clips = self._occluded(_blurred(clips, blur, radius) if blur else clips)
+        if noise:
+            clips = torch.randn_like(clips).mul_(noise * _happens(clips, NOISY)).add_(clips)
+        return clips.clamp_(0, 1).reshape(shape)
 
     def _warped(self, clips: Tensor) -> Tensor:
         """Rotation, shift, scale and perspective by one homography."""
@@ -131,11 +126,10 @@ class Augmentation(nn.Module):
         draw = (2 * torch.rand(6, len(clips), device=clips.device) - 1) * _happens(clips, WARPED).flatten()
         angle, tilts = (turn * draw[0]).deg2rad(), (slant * draw[1:3]).deg2rad()
         zooms, moves = 1 + zoom * draw[3], draw[4:] * sides[:, None] * clips.new_tensor(shift)[:, None]
-        matrix = _homography(angle, zooms, moves, tilts)
         u = torch.arange(1 - width, width, 2, device=clips.device) / (2 * longest)
         v = torch.arange(1 - height, height, 2, device=clips.device)[:, None] / (2 * longest)
         points = torch.stack(torch.broadcast_tensors(u, v, u.new_ones(()))).flatten(1)
-        source = matrix @ points
+        source = _homography(angle, zooms, moves, tilts) @ points
         grid = (source[:, :2] / source[:, 2:]).mT * (2 / sides)
         images, grid = clips.flatten(1, 2), grid.view(-1, height, width, 2)
         return F.grid_sample(images, grid, padding_mode="border", align_corners=False).view(clips.shape)

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from dejavu_torch.features.frames import settings_of
+from dejavu_torch.features.preprocess import settings_of
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
@@ -15,21 +15,12 @@ FLAT = 2 / 255  # contrast below which nothing is blown up
 
 
 def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
-    """Each pixel minus the mean around it, divided by the contrast around it.
+    """Each pixel (B,C,H,W) minus the mean around it, divided by the contrast around it, mean about 0.
 
-    Mean and contrast are those of square cells, interpolated between the cells' centres, which is faster than
-    a window at every pixel (`normalise_patches`). All channels share the contrast.
-
-    Args:
-        cell: side of a cell, pixels.
-
-    Shape: (B,C,H,W) in [0, 1] -> (B,C,H,W), mean about 0.
-
-    Convention: a gain or an offset of brightness changes almost nothing; contrast below 2/255 is not
-    amplified.
+    Mean and contrast are those of square cells, of `cell` pixels a side, interpolated between the cells'
+    centres, which is faster than a window at every pixel (`normalise_patches`). All channels share the
+    contrast. A gain or an offset of brightness changes almost nothing; contrast below 2/255 is not amplified.
     """
-    if cell < 1:
-        raise InputError(f"local_contrast got a cell of {cell} pixels; expected at least 1")
     height, width = frames.shape[-2:]
     grid = (-(-height // cell), -(-width // cell))
 
@@ -42,10 +33,8 @@ def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
 
 
 class SmallCNN(nn.Module):
-    """Local contrast, strided convolutions, and one linear layer, which keeps where things are.
-
-    The features are standardised by their running mean and deviation over the training frames, so that they
-    share one scale in L1 distances.
+    """Local contrast, strided convolutions, and one linear layer, which keeps where things are. Features are
+    standardised by their running mean and deviation over the training frames, to share one scale.
 
     Args:
         dimension: D, number of features.
@@ -59,11 +48,6 @@ class SmallCNN(nn.Module):
 
     Raises:
         InputError: settings below 1; forward: frames of another number of channels.
-
-    Example:
-        >>> import torch
-        >>> SmallCNN(dimension=96)(torch.rand(2, 3, 96, 96)).shape
-        torch.Size([2, 96])
     """
 
     def __init__(
@@ -76,22 +60,15 @@ class SmallCNN(nn.Module):
         cell: int = 8,
     ) -> None:
         super().__init__()
-        check_size(resize, 1, "SmallCNN got resize")
-        self.follows = channels is None
-        channels = 3 if channels is None else channels
-        sizes = [dimension, channels, squeeze, *widths]
-        if not widths or min(sizes) < 1 or cell < 0:
-            raise InputError(
-                f"SmallCNN got dimension={dimension}, channels={channels}, "
-                f"widths={tuple(widths)}, squeeze={squeeze}, cell={cell}; expected at least 1 each, "
-                "cell 0 or more"
-            )
-        self.dimension, self.channels, self.squeeze, self.cell = dimension, channels, squeeze, cell
-        self.resize = (int(resize[0]), int(resize[1]))  # a map gives lists
-        self.widths = tuple(int(width) for width in widths)
+        self.resize = check_size(resize, 1, "SmallCNN got resize")
+        self.follows, self.channels = channels is None, 3 if channels is None else channels
+        self.dimension, self.squeeze, self.cell = dimension, squeeze, cell
+        self.widths = tuple(int(width) for width in widths)  # a map gives a list
+        if not widths or min(dimension, self.channels, squeeze, *widths) < 1 or cell < 0:
+            raise InputError(f"SmallCNN got {settings_of(self)}; expected at least 1 each, cell 0 or more")
         layers: list[nn.Module] = []
         height, width = self.resize
-        for before, after in zip((channels, *self.widths), self.widths, strict=False):
+        for before, after in zip((self.channels, *self.widths), self.widths, strict=False):
             side = 3 if layers else 5
             layers += [
                 nn.Conv2d(before, after, side, stride=2, padding=side // 2, bias=False),
@@ -133,5 +110,4 @@ class SmallCNN(nn.Module):
         standardised: Tensor = self.standardise(features.float())
         return standardised
 
-    def extra_repr(self) -> str:
-        return settings_of(self)
+    extra_repr = settings_of

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.features.frames import settings_of
-from dejavu_torch.features.preprocess import select_channel
+from dejavu_torch.features.preprocess import select_channel, settings_of
 from dejavu_torch.features.truncate import members_of, run, tensors_in, up_to
 from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.resize import check_size, resize_frames
@@ -21,10 +20,9 @@ SHOWN = 4  # shapes in a message
 
 
 class Coder(nn.Module):
-    """Whitens a descriptor and maps it, by one hidden layer, to the code of its place.
+    """Whitens a descriptor (B,K) and maps it, by one hidden layer, to the code (B,D) of its place.
 
-    The code of a place is arbitrary, so a descriptor that another day moved a little must still get the same
-    one. Training therefore adds noise to the whitened descriptor, in place of the days that it does not see.
+    That code is arbitrary: training adds noise to the whitened descriptor, for the days that it does not see.
 
     Args:
         inputs: K, of a descriptor. dimension: D, of the code, not standardised yet.
@@ -32,13 +30,8 @@ class Coder(nn.Module):
         noise: its standard deviation beside components of about 1, in training mode.
         kept: number of components that whitening keeps; fewer if K is smaller.
 
-    Shape: (B,K) -> (B,D).
-
-    Convention: components are the first numbers of the descriptor until `whiten`. They are scaled to length
-        sqrt(components) before the noise, and after it.
-
-    Raises:
-        InputError: settings out of range.
+    Convention: components are the first dimensions of the descriptor until `whiten`. They are scaled to
+        length sqrt(components) before the noise, and after it.
     """
 
     mean: Tensor
@@ -103,15 +96,14 @@ class Embedding(nn.Module):
         noise, kept: of the `Coder`.
         layer: name of the submodule, as in `named_modules`, that the network ends at, see `up_to`.
         mean, std: of each channel, or one number for all, subtracted from the frames in [0, 1] and divided
-            out last; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet trained. None is 0, and
-            1.
+            out last; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet trained.
         output: index of the member of a tuple, list or dict that counts instead.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
     Raises:
         InputError: settings out of range, a network that cannot take such frames, or has no such layer or
-            output; forward: frames that are neither grey nor colour, an output of another size than before.
+            output; forward: frames neither grey nor RGB.
 
     Example:
         >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
@@ -141,18 +133,16 @@ class Embedding(nn.Module):
         super().__init__()
         if not isinstance(network, nn.Module):
             raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
-        check_size(resize, 1, "Embedding got resize")
-        coded = hidden == 0 if dimension is None else dimension >= 1
-        if not coded or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
-            raise InputError(
-                f"Embedding got dimension={dimension}, channels={channels}, grid={grid}, cell={cell}, "
-                f"hidden={hidden}; expected 1 or 3 channels, cell and hidden of 0 or more (with no dimension "
-                f"hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
-            )
+        fits = hidden == 0 if dimension is None else dimension >= 1
+        self.resize = check_size(resize, 1, "Embedding got resize")
         self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell
-        self.resize = (int(resize[0]), int(resize[1]))  # a map gives a list
         self.hidden, self.noise, self.kept = hidden, noise, kept
         self.layer, self.mean, self.std, self.output = layer, mean, std, output
+        if not fits or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
+            raise InputError(
+                f"Embedding got {self.extra_repr()}; expected 1 or 3 channels, cell and hidden of 0 or more "
+                f"(with no dimension hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
+            )
         # the settings say the same
         self.register_buffer("offset", _of_channels("mean", mean, channels, 0.0), persistent=False)
         self.register_buffer("factor", 1 / _of_channels("std", std, channels, 1.0), persistent=False)
@@ -161,7 +151,7 @@ class Embedding(nn.Module):
         try:
             self.network = network if layer is None else up_to(network, layer, frame)
             with torch.no_grad(), in_mode(self.network, False):
-                self.inputs = self._pooled(run(self.network, frame)).shape[1]
+                inputs = self._pooled(run(self.network, frame)).shape[1]
         except InputError:
             raise
         except Exception as error:  # a network may raise anything
@@ -171,8 +161,8 @@ class Embedding(nn.Module):
         self.linear: nn.Module = nn.Identity()
         self.standardise: nn.Module = nn.Identity()
         if dimension is not None:
-            sizes = (self.inputs, dimension)
-            self.linear = Coder(*sizes, hidden, noise, kept) if hidden else nn.Linear(*sizes)
+            coded = (inputs, dimension, hidden, noise, kept)
+            self.linear = Coder(*coded) if hidden else nn.Linear(inputs, dimension)
             self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
     def _pooled(self, made: object) -> Tensor:
@@ -181,16 +171,13 @@ class Embedding(nn.Module):
         if self.output is not None:
             members = members_of(made)
             if not -len(members) <= self.output < len(members):
-                raise InputError(
-                    f"output is {self.output}, but {name} made {len(members)}; expected one of them"
-                )
+                seen = f"output is {self.output}, but {name} made {len(members)}"
+                raise InputError(f"{seen}; expected one of them")
             made = members[self.output]
         tensors = tensors_in(made)
         chosen = tensors if len(tensors) == 1 else [tensor for tensor in tensors if tensor.ndim == 2]
-        if chosen and chosen[0].ndim == 2:
-            return chosen[0]
-        if chosen and chosen[0].ndim == 3:
-            return chosen[0].mean(1)
+        if chosen and chosen[0].ndim in (2, 3):
+            return chosen[0].mean(1) if chosen[0].ndim == 3 else chosen[0]
         if chosen and chosen[0].ndim == 4:
             return nn.functional.adaptive_avg_pool2d(chosen[0], self.grid).flatten(1)
         seen = ", ".join(str(tuple(tensor.shape)) for tensor in tensors[:SHOWN]) or type(made).__name__
@@ -224,13 +211,7 @@ class Embedding(nn.Module):
             frames = local_contrast(frames, self.cell)
         if self.mean is not None or self.std is not None:
             frames = (frames - self.offset.to(frames)) * self.factor.to(frames)
-        descriptors = self._pooled(run(self.network, frames))
-        if descriptors.shape[1] != self.inputs:
-            raise InputError(
-                f"{type(self.network).__name__} made {descriptors.shape[1]} numbers for each of "
-                f"{len(frames)} frames; expected {self.inputs}, as for the frame that it was tried with"
-            )
-        return descriptors
+        return self._pooled(run(self.network, frames))
 
     def code(self, descriptors: Tensor) -> Tensor:
         """Features of descriptors: (B,K) -> (B,D)."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
+from tqdm import tqdm
 
-from dejavu_torch.features.progress import shown
 from dejavu_torch.features.views import AugmentedTraverse
 from dejavu_torch.types import InputError, Traverse
 
@@ -19,6 +21,7 @@ BRIGHTEST = 1.5  # of a frame in [0, 1], whatever was done to it
 APART = 1e-3  # of its length: by how much the features of a frame may differ alone and among others
 ULPS = 4  # and of the coarsest numbers
 TF32 = 2**-10  # what it rounds by
+FIRST, EVERY = 30.0, 60.0  # seconds before the first line of progress, and from one to the next
 
 
 def feature_batches(
@@ -27,25 +30,24 @@ def feature_batches(
     batch_size: int = 64,
     device: torch.device | str = "cpu",
     progress: str | None = None,
-    look: Callable[[Tensor, Tensor], None] | None = None,
+    on_first: Callable[[Tensor, Tensor], None] | None = None,
 ) -> Iterator[Tensor]:
-    """Features of the frames of a traverse, in order, without gradients.
+    """Features (B,D) of the frames of a traverse, in order, without gradients.
 
     Args:
         traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time; fewer if they are large.
-        progress: what to call this work on stderr, see `shown`. Copies of an AugmentedTraverse count once.
-        look: called with the first batch and its features.
-
-    Shape: yields (B,D) float.
+        progress: what to call this work on stderr: a bar on a terminal, else a line now and then. Copies of
+            one frame count once.
+        on_first: called with the first batch and its features.
 
     Raises:
         InputError: features that are not (B,D) or not finite, or no frames at all.
     """
-    done, looks = 0, traverse.copies if isinstance(traverse, AugmentedTraverse) else 1
-    total = traverse.length and traverse.length // looks
-    with shown(progress, total) as update, in_mode(module, False):
+    done, copies = 0, traverse.copies if isinstance(traverse, AugmentedTraverse) else 1
+    total = traverse.length and traverse.length // copies
+    with _progress(progress, total) as update, in_mode(module, False):
         for batch in traverse.batches(traverse.batch_size(batch_size)):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
@@ -58,13 +60,36 @@ def feature_batches(
                 raise InputError(
                     f"{traverse.name}: frame {first} gives NaN or infinite features; expected finite numbers"
                 )
-            if look is not None and done == 0:
-                look(batch, features)
-            update((done + len(features)) // looks - done // looks)
+            if on_first is not None and done == 0:
+                on_first(batch, features)
+            update((done + len(features)) // copies - done // copies)
             done += len(features)
             yield features
     if done == 0:
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
+
+
+@contextmanager
+def _progress(text: str | None, total: int | None) -> Iterator[Callable[[int], object]]:
+    """A function to call with how many more frames are done, which shows it on stderr; None shows nothing."""
+    if text is not None and sys.stderr.isatty():
+        with tqdm(total=total, desc=text, unit="frame", leave=False) as bar:
+            yield bar.update
+        return
+    began, done = time.monotonic(), 0
+    due = began + FIRST
+
+    def update(more: int) -> None:
+        nonlocal done, due
+        done, now = done + more, time.monotonic()
+        if text is None or now < due or not done:
+            return
+        due = now + EVERY
+        of = f" of {total}" if total else ""
+        left = f", {max(0, total - done) * (now - began) / done:.0f} s left" if total else ""
+        tqdm.write(f"dejavu: {text}: {done}{of} frames{left}", file=sys.stderr)
+
+    yield update
 
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
@@ -80,9 +105,10 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
         return batch
     features = describe(batch)
     if features.ndim != 2 or features.shape[0] != batch.shape[0]:
-        maker = describe[-1] if isinstance(describe, nn.Sequential) else describe
-        owner = maker if isinstance(maker, nn.Module) else getattr(maker, "__self__", None)
-        owner = getattr(owner, "features", owner)
+        owner = (
+            describe[-1] if isinstance(describe, nn.Sequential) else getattr(describe, "__self__", describe)
+        )
+        owner = getattr(owner, "features", owner)  # of a DejaVu
         raise InputError(
             f"{type(owner).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
             f"expected features ({len(batch)}, D)"
@@ -100,23 +126,19 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
 
 
 def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
-    """Refuse a network, in eval mode, whose features of a frame depend on the other frames of the batch.
-
-    Raises:
-        InputError: those of the first frame differ by over 1e-3 of their length, or what its numbers round
-            by.
-    """
+    """Refuse a network, in eval mode, whose features of a frame depend on the other frames of the batch: by
+    over 1e-3 of their length, or what its numbers round by."""
     if frames.ndim != 4 or len(frames) < 2:
         return
+    device = features.device.type
     with torch.no_grad():
         alone = features_of(frames[:1].to(features.device), module, name).to(features)
     apart = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
-    device = features.device.type
     kinds = {one.dtype for one in module.parameters() if one.is_floating_point()}
     if torch.is_autocast_enabled(device):
         kinds.add(torch.get_autocast_dtype(device))
-    coarsest = 0.0 if device == "cpu" else TF32  # which a GPU may use in one batch and not in another
-    coarsest = max([coarsest, *(torch.finfo(kind).eps for kind in kinds)])
+    # a GPU may use TF32 in one batch and not in another
+    coarsest = max([0.0 if device == "cpu" else TF32, *(torch.finfo(kind).eps for kind in kinds)])
     if apart > max(APART, ULPS * coarsest):
         raise InputError(
             f"frame 0 of {name} has other features alone than in a batch with {len(frames) - 1} others, by "

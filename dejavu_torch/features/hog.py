@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.frames import check_frames, in_parts, settings_of
+from dejavu_torch.features.preprocess import check_frames, in_parts, settings_of
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
@@ -46,18 +46,15 @@ class HOG(nn.Module):
         bins: Bins = "hard",
     ) -> None:
         super().__init__()
-        if bins not in get_args(Bins):
-            raise InputError(f"HOG got bins={bins!r}; expected 'hard' or 'linear'")
-        if min(orientations, cell, block) < 1 or orientations > MOST_ORIENTATIONS:
-            raise InputError(
-                f"HOG got orientations={orientations}, cell={cell}, block={block}; expected at least 1 each, "
-                f"and at most {MOST_ORIENTATIONS} orientations"
-            )
-        if resize is not None:
-            check_size(resize, cell * block, "HOG got resize")
         self.orientations, self.cell, self.block = orientations, cell, block
-        self.resize = None if resize is None else (int(resize[0]), int(resize[1]))  # a map gives a list
+        self.resize = None if resize is None else check_size(resize, cell * block, "HOG got resize")
         self.bins: Bins = bins
+        least, most = min(orientations, cell, block), MOST_ORIENTATIONS
+        if least < 1 or orientations > most or bins not in get_args(Bins):
+            raise InputError(
+                f"HOG got {settings_of(self)}; expected at least 1 each, at most {most} orientations, bins "
+                "'hard' or 'linear'"
+            )
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "HOG")
@@ -76,8 +73,7 @@ class HOG(nn.Module):
         blocks = _unit(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).clamp(max=0.2)
         return _unit(blocks).flatten(1)
 
-    def extra_repr(self) -> str:
-        return settings_of(self)
+    extra_repr = settings_of
 
 
 def hog(
@@ -99,9 +95,8 @@ def hog(
 
 
 def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Differences f(x + 1) - f(x - 1) along rows and columns, 0 at the border, of the strongest channel:
-    (B,C,H,W) -> two of (B,H,W).
-    """
+    """Differences f(x + 1) - f(x - 1) down the rows and along the columns, 0 at the border, of the strongest
+    channel: (B,C,H,W) -> two of (B,H,W)."""
     rows, columns = torch.zeros_like(frames), torch.zeros_like(frames)
     rows[:, :, 1:-1] = frames[:, :, 2:] - frames[:, :, :-2]
     columns[..., 1:-1] = frames[..., 2:] - frames[..., :-2]
@@ -126,35 +121,29 @@ def cell_histograms(
     # sqrt has no gradient at 0: a flat pixel is masked on both sides of it, and its gradient is 0
     flat = energy == 0
     magnitude = energy.masked_fill(flat, 1).sqrt().masked_fill(flat, 0)
-    y, x = (torch.arange(n * cell, device=rows.device).div(cell, rounding_mode="floor") for n in (ny, nx))
-    first = (y[:, None] * nx + x) * orientations
-    votes = magnitude.new_zeros(batch, ny * nx * orientations)
     if bins == "linear":
         # atan2 has no gradient at 0, or where the square underflows: such a pixel has no vote to share
         columns = columns.masked_fill(energy < torch.finfo(energy.dtype).tiny, 1)
     else:  # detached, not under no_grad, which torch.export cannot save
         rows, columns = rows.detach(), columns.detach()
-    for slot, share in _shares(rows, columns, magnitude, orientations, bins):
+    # in degrees 45, 90 and 135 are exact, also in float32: they lie on bin edges
+    position = torch.rad2deg(torch.atan2(rows, columns)).remainder(180) / (180 / orientations)
+    if bins == "hard":  # rounding may reach the end of the circle; NaN stays NaN in the magnitude
+        shares = [(position.long().masked_fill_(~(position < orientations), 0), magnitude)]
+    else:
+        position = position - 0.5
+        floor = position.detach().floor()
+        lower, upper_share = floor.long(), position - floor
+        shares = [
+            (lower.remainder(orientations), magnitude * (1 - upper_share)),
+            ((lower + 1).remainder_(orientations), magnitude * upper_share),
+        ]
+    y, x = (torch.arange(n * cell, device=rows.device).div(cell, rounding_mode="floor") for n in (ny, nx))
+    first = (y[:, None] * nx + x) * orientations
+    votes = magnitude.new_zeros(batch, ny * nx * orientations)
+    for slot, share in shares:
         votes = votes.scatter_add(1, slot.add_(first).flatten(1), share.flatten(1))
     return votes.view(batch, ny, nx, orientations) / cell**2
-
-
-def _shares(
-    rows: Tensor, columns: Tensor, magnitude: Tensor, orientations: int, bins: Bins
-) -> list[tuple[Tensor, Tensor]]:
-    """The one or two bins that each pixel votes for, each with its share of the magnitude, (B,H,W)."""
-    # in degrees 45, 90 and 135 are exact, also in float32: they lie on bin edges
-    degrees = torch.rad2deg(torch.atan2(rows, columns)).remainder(180)
-    position = degrees / (180 / orientations)
-    if bins == "hard":  # rounding may reach the end of the circle; NaN stays NaN in the magnitude
-        return [(position.long().masked_fill_(~(position < orientations), 0), magnitude)]
-    position = position - 0.5
-    floor = position.detach().floor()
-    lower, upper_share = floor.long(), position - floor
-    return [
-        (lower.remainder(orientations), magnitude * (1 - upper_share)),
-        ((lower + 1).remainder_(orientations), magnitude * upper_share),
-    ]
 
 
 def _unit(blocks: Tensor) -> Tensor:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from dejavu_torch.features.frames import check_frames, settings_of
-from dejavu_torch.features.preprocess import FLAT
+from dejavu_torch.features.preprocess import FLAT, check_frames, settings_of
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.types import InputError
 
 
 class PatchPixels(nn.Module):
-    """Pixels of frames made small, each patch with mean 0 and standard deviation 1, which is at least 1/255.
+    """Pixels of frames made small, each patch with mean 0 and standard deviation 1, which is at least 1/255
+    (Milford and Wyeth, SeqSLAM, ICRA 2012).
 
     Args:
         size: (height, width) in pixels; smaller frames keep theirs, cut to whole patches.
@@ -19,23 +19,15 @@ class PatchPixels(nn.Module):
 
     Shape: (B,C,H,W) -> (B, C x height x width).
 
-    Source: Milford and Wyeth, SeqSLAM, ICRA 2012.
-
     Raises:
         InputError: a size smaller than a patch; forward: frames that are not (B,C,H,W) float, or as small.
-
-    Example:
-        >>> import torch
-        >>> PatchPixels()(torch.rand(2, 1, 100, 60)).shape  # 32 x 56
-        torch.Size([2, 1792])
     """
 
     def __init__(self, size: tuple[int, int] = (32, 64), patch: int = 8) -> None:
         super().__init__()
         if patch < 2:
             raise InputError(f"patches of {patch} pixels; expected at least 2")
-        check_size(size, patch, "PatchPixels got size")
-        self.size, self.patch = size, patch
+        self.size, self.patch = check_size(size, patch, "PatchPixels got size"), patch
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "PatchPixels")
@@ -51,5 +43,4 @@ class PatchPixels(nn.Module):
         pixels: Tensor = (centred / deviation).flatten(1)
         return pixels
 
-    def extra_repr(self) -> str:
-        return settings_of(self)
+    extra_repr = settings_of

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
+import math
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.frames import check_frames, in_parts, settings_of
 from dejavu_torch.types import InputError
 
 MOST_CLIP = 1e6
@@ -15,6 +17,31 @@ Contrast = Literal["patch", "clahe"]
 COLOURS = "RGB"
 SIZE = 160  # pixels of the longer side of a frame, unless said otherwise
 FLAT = 1 / 255  # one step of an 8-bit image: a smaller standard deviation says nothing
+VALUES_AT_ONCE = 2**19  # of frames, so that intermediate results stay in the cache
+
+
+def check_frames(frames: Tensor, name: str) -> None:
+    """Refuse all but a batch of float frames."""
+    if not isinstance(frames, Tensor):
+        raise InputError(f"{name} got a {type(frames).__name__}; expected a tensor of frames (B,C,H,W)")
+    if frames.ndim != 4 or not frames.is_floating_point():
+        raise InputError(
+            f"{name} got {tuple(frames.shape)} {frames.dtype}; expected float frames (B,C,H,W) in [0, 1]"
+        )
+
+
+def in_parts(work: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
+    """`work` on at most VALUES_AT_ONCE values at a time, at least one frame."""
+    if torch.compiler.is_compiling():  # the number of parts would fix the batch
+        return work(frames)
+    size = max(1, VALUES_AT_ONCE // max(1, math.prod(frames.shape[1:])))
+    return torch.cat([work(part) for part in frames.split(size)])
+
+
+def settings_of(module: nn.Module, *hidden: str) -> str:
+    """The constructor's arguments, as `extra_repr` shows them."""
+    names = [name for name in inspect.signature(type(module)).parameters if name not in hidden]
+    return ", ".join(f"{name}={getattr(module, name)!r}" for name in names)
 
 
 def channel_name(channel: str) -> str:
@@ -31,11 +58,7 @@ def channel_name(channel: str) -> str:
 
 
 def select_channel(frames: Tensor, channel: str) -> Tensor:
-    """One channel of colour frames, see `Preprocess`; grey frames pass unchanged as "grey".
-
-    Shape: (B,C,H,W) -> (B,1,H,W); a difference lies in [-1, 1].
-    """
-    check_frames(frames, "preprocess")
+    """One channel of frames (B,C,H,W) -> (B,1,H,W), see `Preprocess`; a difference lies in [-1, 1]."""
     name, count = channel_name(channel), frames.shape[1]
     if name == "grey" and count == 1:
         return frames
@@ -51,10 +74,9 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
 
 
 def box_mean(frames: Tensor, side: int) -> Tensor:
-    """Mean of the side x side pixels around each pixel; at the border only those inside count."""
+    """Mean of the pixels inside the frame of the side x side around each; faster than pooling."""
 
     def sums(values: Tensor) -> Tensor:
-        """Of `side` values along the last axis."""
         running = nn.functional.pad(values, (side // 2 + 1, side // 2)).cumsum(-1)
         return running[..., side:] - running[..., :-side]
 
@@ -64,24 +86,13 @@ def box_mean(frames: Tensor, side: int) -> Tensor:
 
 
 def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
-    """Each pixel minus the mean, divided by the standard deviation, of the patch around it, for each channel.
+    """Each pixel minus the mean, divided by the standard deviation, of the patch around it, for each channel
+    (Milford and Wyeth, SeqSLAM, ICRA 2012; there in patches side by side).
 
-    Shape: (B,C,H,W) -> (B,C,H,W), mean about 0, unbounded.
-
-    Convention: the patch slides with the pixel; at the border only pixels inside the frame count. The
-        standard deviation divides by their number, and is at least 1/255, so that noise in a flat sky is not
-        amplified; above that a gain and an offset of brightness change nothing. Gradients are finite
-        everywhere.
-
-    Source: Milford and Wyeth, SeqSLAM, ICRA 2012; there in patches side by side.
-
-    Example:
-        >>> checks = (torch.arange(8)[:, None] + torch.arange(8)).remainder(2)[None, None]
-        >>> dark, bright = normalise_patches(0.5 + 0.1 * checks, patch=3)[0, 0, 0, :2]
-        >>> round(dark.item(), 3), round(bright.item(), 3)  # half of four pixels, half of six
-        (-1.0, 1.0)
+    Convention: at the border only pixels inside the frame count. The standard deviation divides by their
+        number, and is at least 1/255, so that noise in a flat sky is not amplified; above that a gain and an
+        offset of brightness change nothing. Gradients are finite everywhere.
     """
-    check_frames(frames, "preprocess")
     height, width = frames.shape[-2:]
     if min(height, width) < patch:
         raise InputError(
@@ -99,14 +110,11 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
 
 
 def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8, 8)) -> Tensor:
-    """Contrast-limited adaptive histogram equalisation (CLAHE) by kornia, for each channel.
+    """Contrast-limited adaptive histogram equalisation (CLAHE) by kornia, for each channel, in [0, 1].
 
-    Shape: (B,C,H,W) in [0, 1] -> the same.
-
-    Convention: a table of 256 grey levels has no gradient: it passes as if the output followed the input one
-        to one. Kornia's differentiable form gives other values (up to 0.3 away).
+    A table of 256 grey levels has no gradient: it passes as if the output followed the input one to one.
+    Kornia's differentiable form gives other values (up to 0.3 away).
     """
-    check_frames(frames, "preprocess")
     if torch.compiler.is_exporting():
         raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")
     from kornia.enhance import equalize_clahe
@@ -118,8 +126,8 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
             f"expected at least {rows + 1} x {columns + 1} pixels"
         )
     fixed = frames.detach()
-    if not ((fixed >= 0) & (fixed <= 1)).all():
-        low, high = fixed.min().item(), fixed.max().item()
+    low, high = (one.item() for one in fixed.aminmax())
+    if not (low >= 0 and high <= 1):
         raise InputError(f"clahe got values from {low:g} to {high:g}; expected values in [0, 1]")
     even = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), fixed)
     return frames + (even - fixed) if frames.requires_grad else even
@@ -136,9 +144,8 @@ class Preprocess(nn.Module):
         clip_limit: for "clahe": a grey level counts at most this many times as often as in a flat histogram,
             and at least once, as all do in tiles under 256 / clip_limit pixels; 0 is no limit.
         grid: (rows, columns) of tiles for "clahe"; they need not divide the frame.
-        size: pixels that the longer side of a traverse's frames is reduced to if it has more, but no further
-            than the features' own `resize`; None keeps the frames' size. `DejaVu.fit` does so, forward does
-            not.
+        size: pixels that `DejaVu.fit` reduces the longer side of a traverse's frames to, but no further than
+            the features' own `resize`; None keeps the frames' size. `forward` does not.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
@@ -181,6 +188,9 @@ class Preprocess(nn.Module):
         self.grid = (int(grid[0]), int(grid[1]))  # a map gives a list
 
     def forward(self, frames: Tensor) -> Tensor:
+        if self.channel is None and self.contrast is None:
+            return frames
+        check_frames(frames, "preprocess")
         if self.channel is not None:
             frames = select_channel(frames, self.channel)
         if self.contrast == "patch":
@@ -190,5 +200,4 @@ class Preprocess(nn.Module):
             return equalise((frames + 1) / 2 if difference else frames, self.clip_limit, self.grid)
         return frames
 
-    def extra_repr(self) -> str:
-        return settings_of(self)
+    extra_repr = settings_of

@@ -46,18 +46,14 @@ def _traced_calls() -> OrderedDict[str, Any]:
 def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     """A copy of a network that `run` ends at a layer, the name of a submodule; the first of its runs counts.
 
-    Convention: modules that have not run when the layer is done are left out of the copy, unless it gives
-        something else without them on `frames`. The names of the others stay.
-
-    Raises:
-        InputError: no such layer, or one that the network does not run.
+    Modules that have not run when the layer is done are left out of the copy, unless it gives something else
+    without them on `frames`. The names of the others stay.
     """
     name, names = type(network).__name__, [one for one, _ in network.named_modules() if one]
     if layer not in names:
         some = [one for one in names if one.count(".") < 2]
-        more = ", .." if len(some) > SHOWN else ""
-        known = ", ".join(some[:: -(-len(some) // SHOWN) or 1]) or "none, it has none"
-        raise InputError(f"{name} has no layer {layer!r:.80}; expected one such as {known}{more}")
+        known = ", ".join([*some[:SHOWN], ".."][: len(some)]) or "none, it has none"
+        raise InputError(f"{name} has no layer {layer!r:.80}; expected one such as {known}")
     try:
         ended = copy.deepcopy(network)
     except RuntimeError as error:
@@ -79,9 +75,13 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     smaller = copy.deepcopy(ended)
     _leave_out(ended, smaller, begun, done)
     try:
-        return smaller if _same(_tried(smaller, frames), expected) else ended
+        found = _tried(smaller, frames)
+        pairs = zip(found, expected, strict=True)
+        # a map's network is first made without numbers
+        same = all(a.shape == b.shape and (a.is_meta or torch.allclose(a, b, 1e-4, 1e-5)) for a, b in pairs)
     except Exception:  # a network may look at any of its parts
-        return ended
+        same = False
+    return smaller if same else ended
 
 
 def _end(layer: nn.Module, given: Any, output: object) -> None:
@@ -104,14 +104,6 @@ def _leave_out(whole: nn.Module, smaller: nn.Module, begun: set[nn.Module], done
             setattr(smaller, name, nn.Identity())
 
 
-def _same(found: list[Tensor], expected: list[Tensor]) -> bool:
-    # a map's network is first made without numbers
-    return [one.shape for one in found] == [one.shape for one in expected] and all(
-        one.is_meta or torch.allclose(one, other, rtol=1e-4, atol=1e-5)
-        for one, other in zip(found, expected, strict=True)
-    )
-
-
 def members_of(made: object) -> list[object]:
     """The members of a tuple, list or dict; anything else is the only one."""
     if isinstance(made, dict):
@@ -121,8 +113,6 @@ def members_of(made: object) -> list[object]:
 
 def tensors_in(made: object) -> list[Tensor]:
     """The tensors in what a network made, in order."""
-    if isinstance(made, Tensor):
-        return [made]
     if not isinstance(made, (tuple, list, dict)):
-        return []
+        return [made] if isinstance(made, Tensor) else []
     return [tensor for member in members_of(made) for tensor in tensors_in(member)]

@@ -11,16 +11,16 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.features.frames import settings_of
+from dejavu_torch.features.preprocess import settings_of
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
 
 ROWS = 1024  # in double precision at a time
 SAMPLED = 4096  # rows that principal components are found in
-NUMBERS = 128  # dimensions, unless said otherwise
+DIMENSIONS = 128  # unless said otherwise
 WIDEST = 256  # dimensions without whitening
-PLACES_PER_NUMBER = 4  # a short route does not fill as many dimensions
+PLACES_PER_DIMENSION = 4  # a short route does not fill as many dimensions
 COMPONENTS = 400  # that whitening works on
 VIEWS = 4  # of a frame, on a long route
 VIEWS_PER_COMPONENT = 30  # on any: as 4 views of each of 3000 frames
@@ -44,15 +44,10 @@ def learned_whitening(
 
     With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m] and
     W = (1 - a) C + a tr(C) / K I, the columns of P are the `kept` directions with the largest
-    p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
-
-    Args:
-        shrinkage: a, above 0 and at most 1; None is `oracle_shrinkage`, and at least 0.03.
+    p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007). The shrinkage a is above 0
+    and at most 1; None is `oracle_shrinkage`, and at least 0.03.
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
-
-    Raises:
-        InputError: views that equal their places but for rounding, or not finite.
     """
     n, k = views.shape
     within, second = views.new_zeros(2, k, k, dtype=torch.float64)
@@ -80,10 +75,8 @@ def learned_whitening(
 
 
 def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
-    """How much of a covariance (K,K) of Gaussian samples to replace by a multiple of the identity, 0 to 1.
-
-    Source: Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal Processing 58 (2010), eq. 23.
-    """
+    """How much of a covariance (K,K) of Gaussian samples to replace by a multiple of the identity, 0 to 1
+    (Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal Processing 58, 2010, eq. 23)."""
     size, trace = len(covariance), float(covariance.trace())
     square = float(covariance.square().sum())
     spread = (samples + 1 - 2 / size) * (square - trace**2 / size)
@@ -92,14 +85,13 @@ def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
 
 
 class Whitening(nn.Module):
-    """A descriptor of few dimensions, which tells places apart and changes little with light and view.
-
-    For one route: principal components, then `learned_whitening` by views of its places, which are augmented
+    """A descriptor of few dimensions, which tells places apart and changes little with light and view: for
+    one route, principal components, then `learned_whitening` by views of its places, which are augmented
     copies of its frames, or frames of a second traverse.
 
     Args:
-        numbers: K. None is 128, on a short route a quarter of its places, without views 256; at most the
-            rank.
+        numbers: K, at most the rank. None is 128, on a short route a quarter of its places; without views
+            256.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, and more if there are few views.
         views: augmented copies of each frame. None is 4, up to 12 on a short route: 30 for each component.
@@ -113,8 +105,7 @@ class Whitening(nn.Module):
     Shape: (B,D) -> (B,K).
 
     Convention: descriptors have length 1. Without views they are the principal components, with their
-        variances, and a constant number, the root mean square of these. Before `learn` descriptors pass
-        unchanged.
+        variances, and a constant number, the root mean square of these. Before `learn` descriptors pass.
 
     Raises:
         InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
@@ -159,7 +150,7 @@ class Whitening(nn.Module):
             )
         self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # learned elsewhere: it serves this route unchanged
-        self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), see `_packed`
+        self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), see `take`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
         self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
         self.register_buffer("length", torch.zeros(0))  # (1,), the constant number, or (0,)
@@ -215,7 +206,7 @@ class Whitening(nn.Module):
         """Dimensions that are kept, unless the rank of the route is lower."""
         if self.numbers is not None:
             return self.numbers
-        return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else WIDEST
+        return min(DIMENSIONS, features, max(1, places // PLACES_PER_DIMENSION)) if views else WIDEST
 
     @torch.no_grad()
     def learn(self, places: Tensor, views: Iterable[tuple[Tensor, Tensor]] | None = None) -> None:
@@ -254,54 +245,43 @@ class Whitening(nn.Module):
         self.take(mean + basis @ centre, basis @ projection, None)
 
     def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
-        """Set mean (D,), projection (D,K), rounded to `bits`, and the constant number, if any."""
-        largest = 2 ** (self.bits - 1) - 1
-        self.scale = projection.abs().amax(0) / largest
+        """Set mean (D,), projection (D,K), rounded to `bits`, and the constant number, if any.
+
+        Of 4 bits two numbers are a byte, the first half of the columns the lower ones.
+        """
+        self.scale = projection.abs().amax(0) / (2 ** (self.bits - 1) - 1)
         whole = (projection / self.scale).round()
-        self.projection = _packed(whole, self.bits)
+        self.projection = whole.to(torch.int8 if self.bits <= 8 else torch.int16)
+        if self.bits == 4:
+            low, high = nn.functional.pad(whole + 8, (0, whole.shape[1] % 2)).to(torch.uint8).chunk(2, 1)
+            self.projection = low | high << 4
         self.offset = (mean @ whole) * self.scale
         self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
-        buffers = dict(self.named_buffers(recurse=False))
-        _check_buffers(**{name: state.get(prefix + name, own) for name, own in buffers.items()})
-        for name, own in buffers.items():
-            if prefix + name in state:
-                setattr(self, name, torch.empty_like(state[prefix + name], device=own.device))
+        buffers = {name: state.get(prefix + name, own) for name, own in self.named_buffers(recurse=False)}
+        kind, seen = buffers["projection"].dtype, [tuple(one.shape) for one in buffers.values()]
+        width = tuple((count + 1) // 2 if kind == torch.uint8 else count for count in seen[1])
+        fits = len(seen[0]) == 2 and seen[0][1:] == width and seen[2] == seen[1] and seen[3] in ((0,), (1,))
+        finite = all(bool(stored.isfinite().all()) for stored in buffers.values())
+        if not fits or not finite or kind not in (torch.uint8, torch.int8, torch.int16):
+            raise InputError(
+                f"the whitening has a projection, scale, offset and length of {seen}; expected finite (D,K), "
+                "two numbers to a byte in uint8, (K,), (K,), and one number or none"
+            )
+        for name, stored in buffers.items():
+            setattr(self, name, torch.empty_like(stored, device=self.scale.device))
         super()._load_from_state_dict(state, prefix, *args)
 
     def extra_repr(self) -> str:
         return settings_of(self, *(["strengths"] if self.strengths == STRENGTHS else []))
 
 
-def _packed(whole: Tensor, bits: int) -> Tensor:
-    """Whole numbers (D,K) as int8 or int16; of 4 bits two to a byte, the first half of the columns lower."""
-    if bits > 4:
-        return whole.to(torch.int8 if bits == 8 else torch.int16)
-    low, high = nn.functional.pad(whole + 8, (0, whole.shape[1] % 2)).to(torch.uint8).chunk(2, 1)
-    return low | high << 4
-
-
-def _check_buffers(projection: Tensor, scale: Tensor, offset: Tensor, length: Tensor) -> None:
-    """Refuse shapes, types and values that `take` does not make."""
-    seen = [tuple(tensor.shape) for tensor in (projection, scale, offset, length)]
-    width = tuple((count + 1) // 2 if projection.dtype == torch.uint8 else count for count in seen[1])
-    fits = projection.ndim == 2 and seen[0][1:] == width and seen[2] == seen[1] and seen[3] in ((0,), (1,))
-    finite = all(bool(tensor.isfinite().all()) for tensor in (scale, offset, length))
-    if not fits or not finite or projection.dtype not in (torch.uint8, torch.int8, torch.int16):
-        raise InputError(
-            f"the whitening has a projection, scale, offset and length of {seen}; expected finite (D,K), "
-            "two numbers to a byte in uint8, (K,), (K,), and one number or none"
-        )
-
-
 def principal_components(rows: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """The directions in which SAMPLED of the descriptors, drawn evenly, vary most, by subspace iteration.
+    """The directions in which SAMPLED of the descriptors, drawn evenly, vary most, by subspace iteration
+    (Halko, Martinsson and Tropp, SIAM Review 53, 2011, algorithm 4.4), faster than `torch.svd_lowrank`.
 
     Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first; C is `count` at most.
-
-    Source: Halko, Martinsson and Tropp, SIAM Review 53 (2011), algorithm 4.4; with one QR a round it is
-        faster than `torch.svd_lowrank`.
     """
     if rows.ndim != 2 or len(rows) < 2:
         raise InputError(f"the descriptors are {tuple(rows.shape)}; expected (N,D), N at least 2")

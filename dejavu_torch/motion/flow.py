@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.motion.ground_plane import FLAT, check_pairs
+from dejavu_torch.motion.ground_plane import FLAT
 from dejavu_torch.types import InputError
 
 Array = np.ndarray[Any, Any]
@@ -24,33 +24,16 @@ CONTRAST = 40.0  # grey levels per standard deviation of the patch
 
 
 def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tensor]:
-    """How far the ground moved along the rows from one patch to the next, each pair by itself.
+    """How far the ground moved from one patch to the next, as in `phase_shifts`: shift (B,), confidence (B,).
 
-    The median displacement of the points that, tracked forward and back, end where they started.
-
-    Args:
-        first, second: patches of ground, of any gain and offset of brightness.
-        method: "lk" tracks up to 200 corners (pyramidal Lucas-Kanade), "dis" every pixel around which the
-            brightness changes along the rows (dense inverse search).
-
-    Shape: (B,1,h,w), (B,1,h,w) -> shift (B,) in pixels, rows of the patch; confidence (B,) in [0, 1].
-
-    Convention: shift > 0 is forward, as `shift_between`. The confidence is the share of points that agree
-        with the median, 0 for a patch that is flat or not finite. On the CPU, without gradients.
+    The median displacement of the points that, tracked forward and back, end where they started. "lk" tracks
+    up to 200 corners (pyramidal Lucas-Kanade), "dis" every pixel around which the brightness changes along
+    the rows (dense inverse search). The confidence is the share of points that agree with the median, 0 for a
+    patch that is flat or not finite.
 
     Limits: |shift| up to about 0.4 h ("dis" 0.25 h, and only to 0.1 pixels). Lines along the way seem to
-        stand still: on a motorway both are worse than `shift_between`.
-
-    Raises:
-        InputError: patches that are not two equal (B,1,h,w) of at least 32 x 32; see `tracker`.
-
-    Example:
-        >>> ground = torch.rand(1, 1, 80, 64)
-        >>> shift, confidence = flow_shift(ground[..., 10:74, :], ground[..., 3:67, :], "lk")
-        >>> round(shift.item(), 1), confidence.item() > 0.9
-        (7.0, True)
+        stand still: on a motorway both are worse than `phase_shifts`.
     """
-    check_pairs(first, second)
     track = tracker(method)
     found = [_shift(track, *pair) for pair in zip(_pictures(first), _pictures(second), strict=True)]
     shift, confidence = first.new_tensor(found).view(-1, 2).T
@@ -58,11 +41,7 @@ def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tens
 
 
 def tracker(method: str) -> Tracker:
-    """Points of a picture and where they are in another: `track(first, second, start)`.
-
-    Raises:
-        InputError: an unknown method, or OpenCV cannot be imported.
-    """
+    """`track(first, second, start)` of a method: where points of one picture are in another."""
     if method not in TRACKERS:
         raise InputError(f"flow is {method!r}; expected phase, {', '.join(TRACKERS)}")
     try:
@@ -75,7 +54,7 @@ def tracker(method: str) -> Tracker:
 
 
 def _pictures(patches: Tensor) -> Array:
-    """(B,1,h,w) -> (B,h,w) uint8 of equal contrast; 0 where a patch shows nothing."""
+    """(B,1,h,w) -> (B,h,w) uint8 of equal contrast; 0 if a patch shows nothing."""
     grey = patches[:, 0].detach().double().cpu()
     centred = grey - grey.mean((1, 2), keepdim=True)
     variance = centred.square().mean((1, 2), keepdim=True)
@@ -108,10 +87,8 @@ def _track_corners(cv2: Any, first: Array, second: Array, start: float) -> tuple
     points = cv2.goodFeaturesToTrack(first, 200, 0.01, 3)
     if points is None:
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)
-    track = partial(
-        cv2.calcOpticalFlowPyrLK, winSize=(15, 15), maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
-    )
-    guess = np.array([0, start], np.float32)
+    flags, guess = cv2.OPTFLOW_USE_INITIAL_FLOW, np.array([0, start], np.float32)
+    track = partial(cv2.calcOpticalFlowPyrLK, winSize=(15, 15), maxLevel=3, flags=flags)
     there, found, _ = track(first, second, points, points + guess)
     again, kept, _ = track(second, first, there, there - guess)
     returned = (found & kept)[:, 0].astype(bool) & (np.abs(again - points) < TOLERANCE).all((1, 2))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -28,71 +27,42 @@ def check_corners(corners: Corners) -> None:
     points = torch.tensor(corners, dtype=torch.float64)
     if not ((points >= 0) & (points <= 1)).all():
         raise InputError(f"{text} lie outside the frame; expected fractions of it, 0 to 1")
-    (ax, ay), (bx, by) = (points.roll(-1, 0) - points).T, (points.roll(-2, 0) - points.roll(-1, 0)).T
-    if not (ax * by - ay * bx > 1e-6).all():
+    edges = points.roll(-1, 0) - points
+    if not (torch.stack([edges, edges.roll(-1, 0)], 1).det() > 1e-6).all():
         raise InputError(f"{text} are not convex; expected far left, far right, near right, near left")
 
 
-def check_pairs(first: Tensor, second: Tensor) -> None:
-    """Refuse what is not two equal batches of patches, (B,1,h,w), of at least 32 x 32 pixels."""
-    if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 1 or min(first.shape[2:]) < 32:
-        raise InputError(
-            f"patches {tuple(first.shape)} and {tuple(second.shape)}; "
-            "expected two of the same (B,1,h,w), h and w at least 32"
-        )
-
-
-def region_length(corners: Corners, height: int, width: int) -> float:
-    """Pixels of a frame between the middles of the region's far and near edge."""
-    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
-    return math.hypot((cx + dx - ax - bx) / 2 * (width - 1), (cy + dy - ay - by) / 2 * (height - 1))
-
-
 def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, int] = (96, 96)) -> Tensor:
-    """The ground in front of the camera as seen from above, grey.
+    """The ground in front of the camera as seen from above, in grey: frames (B,C,H,W), grey or RGB ->
+    (B,1,rows,columns), row 0 at the far end.
 
     Args:
-        frames: RGB or grey.
-        corners: (x, y) of a region of ground in fractions of the frame's width and height, (0, 0) its top
-            left pixel and (1, 1) its bottom right one: far left, far right, near right, near left. Its
-            sides should be parallel on the ground, as two rails are, so that every row of the patch is the
-            same length of ground.
+        corners: (x, y) of a region of ground, see `GroundOdometry`; (0, 0) is the top left pixel of the
+            frame, (1, 1) the bottom right one.
         size: (rows, columns) of the patch in pixels.
 
-    Shape: (B,C,H,W) -> (B,1,rows,columns); row 0 is the far end.
-
-    Convention: rows of the frame are smoothed by (1, 2, 1) / 4, since the far rows are sampled coarsely.
-
     Raises:
-        InputError: not (B,C,H,W) float with 1 or 3 channels, frames or a patch below 2 x 2, or corners
-            that are not four, not inside the frame, not convex or in another order.
-
-    Example:
-        >>> ground_patch(torch.rand(2, 3, 120, 160), size=(96, 64)).shape
-        torch.Size([2, 1, 96, 64])
+        InputError: not (B,C,H,W) float with 1 or 3 channels, or frames below 2 x 2.
     """
-    check_corners(corners)
     if frames.ndim != 4 or frames.shape[1] not in (1, 3) or not frames.is_floating_point():
         raise InputError(
-            f"frames {tuple(frames.shape)} {frames.dtype}; expected float frames (B,C,H,W), grey or RGB"
+            f"frames {tuple(frames.shape)} {frames.dtype}; "
+            "expected frames (B,C,H,W), float, grey or RGB: ready features show no ground"
         )
-    rows, columns = size
-    if min(*size, *frames.shape[2:]) < 2:
-        seen = f"a patch {tuple(size)} of frames of {frames.shape[2]} x {frames.shape[3]} pixels"
-        raise InputError(f"{seen}; expected at least 2 x 2 each")
+    (count, _, height, width), (rows, columns) = frames.shape, size
+    if min(height, width) < 2:
+        raise InputError(f"frames of {height} x {width} pixels; expected at least 2 x 2")
     # the grid in two forms and the patches
-    check_room(
-        32.0 * len(frames) * rows * columns, f"the ground in {len(frames)} x {rows} x {columns} pixels"
-    )
+    check_room(32.0 * count * rows * columns, f"the ground in {count} x {rows} x {columns} pixels")
     from kornia.color import rgb_to_grayscale  # loading kornia takes a third of a second
     from kornia.geometry.transform import get_perspective_transform, warp_perspective
 
     grey = frames if frames.shape[1] == 1 else rgb_to_grayscale(frames)
+    # the far rows are sampled coarsely
     grey = conv2d(pad(grey, (0, 0, 1, 1), mode="replicate"), grey.new_tensor([1, 2, 1]).view(1, 1, 3, 1) / 4)
-    unit = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]]).to(grey)
-    region = torch.tensor([corners]).to(grey) * grey.new_tensor([grey.shape[3] - 1, grey.shape[2] - 1])
+    unit = grey.new_tensor([[[0, 0], [1, 0], [1, 1], [0, 1]]])
+    region = torch.tensor([corners]).to(grey) * grey.new_tensor([width - 1, height - 1])
     # the other direction fails if the frame's first pixel lies on the patch's horizon
     from_patch = get_perspective_transform(unit * grey.new_tensor([columns - 1, rows - 1]), region)
-    matrix = torch.linalg.inv(from_patch).expand(len(grey), 3, 3)
-    patch: Tensor = warp_perspective(grey, matrix, (rows, columns))
+    patch: Tensor = warp_perspective(grey, torch.linalg.inv(from_patch).expand(count, 3, 3), (rows, columns))
     return patch

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from dejavu_torch.data.selection import runs
 from dejavu_torch.motion.flow import flow_shift, tracker
-from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch, region_length
-from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, shift_peaks, viterbi_path
+from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
+from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -23,11 +24,8 @@ NAMED = 6  # segments without common ground that a warning lists
 
 
 class Odometry(NamedTuple):
-    """Where a camera is at each frame of a traverse.
-
-    distance: (N,) float64, pixels of ground (rows of the patch) from frame 0, negative behind it.
-    confidence: (N-1,) of each step in [0, 1], as measured.
-    """
+    """distance: (N,) float64, pixels of ground (rows of the patch) from frame 0, negative if backwards.
+    confidence: (N-1,) of each step in [0, 1], as measured."""
 
     distance: Tensor
     confidence: Tensor
@@ -38,26 +36,23 @@ class GroundOdometry(nn.Module):
 
     Args:
         corners: (x, y) of a region of ground in fractions of the frame: far left, far right, near right,
-            near left; its sides parallel on the ground, such as the rails. See `ground_patch`.
+            near left. Its sides should be parallel on the ground, as two rails are.
         size: (rows, columns) of the patch it becomes, pixels, at least 32 x 32. The longest step that can be
             measured is about 0.42 of its rows.
-        step: pixels of ground from one resampled frame to the next; None is the median step of the
-            frames that move.
+        step: pixels of ground from one resampled frame to the next; None is the median of the steps not 0.
         least: confidence below which a step is interpolated, in [0, 1]. The default finds a cut in patches of
             96 x 96; in those of 32 x 32 unrelated ground can agree by 0.8.
         still: pixels of ground; a shorter step of either sign counts as 0, as of a standing camera. Ground of
             little contrast needs more, slow footage at many frames a second less.
-        flow: how patches are compared: "phase" (`shift_between`), or optical flow of OpenCV, "lk" on corners
+        flow: how patches are compared: "phase" (`phase_shifts`), or optical flow of OpenCV, "lk" on corners
             or "dis" on all pixels (`flow_shift`, with its limits; `pip install 'dejavu_torch[flow]'`).
 
-    Shape: (N,C,H,W) -> shift (N-1,) in pixels of ground, forward > 0; confidence (N-1,) in [0, 1]: both
-        as measured, of consecutive frames.
+    Shape: (N,C,H,W) -> shift (N-1,) in pixels of ground, forward > 0; confidence (N-1,) in [0, 1].
 
     Convention: if periodic ground leaves several shifts, those that change least (`viterbi_path`).
 
     Raises:
-        InputError: an argument out of range; OpenCV is missing; forward: fewer than two frames, or not
-            (N,C,H,W) float.
+        InputError: an argument out of range, OpenCV missing; forward: not (N,C,H,W) float, or N of 1.
 
     Example:
         >>> shift, confidence = GroundOdometry()(torch.rand(1, 3, 120, 160).expand(5, 3, 120, 160))
@@ -92,88 +87,77 @@ class GroundOdometry(nn.Module):
         self.least, self.still, self.flow = least, still, flow
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        patches = ground_patch(frames, self.corners, self.size)
+        return self._path(self._shifts(ground_patch(frames, self.corners, self.size)), "the input")
+
+    def _shifts(self, patches: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Possible shifts (n-1,K) between consecutive patches (n,1,h,w), and their confidence; [] of one."""
         if len(patches) < 2:
-            raise InputError(f"there are {len(patches)} frames; expected at least 2 to see motion")
-        return self._path(*self._shifts(patches))
-
-    def _shifts(self, patches: Tensor) -> tuple[Tensor, Tensor]:
-        """Possible shifts between consecutive patches. (n,1,h,w) -> (n-1,K), confidence (n-1,K)"""
+            return []
         if self.flow == "phase":
-            return shift_peaks(patches[:-1], patches[1:])
+            return [phase_shifts(patches[:-1], patches[1:])]
         shift, confidence = flow_shift(patches[:-1], patches[1:], self.flow)
-        return shift[:, None], confidence[:, None]
+        return [(shift[:, None], confidence[:, None])]
 
-    def _path(self, shifts: Tensor, confidences: Tensor) -> tuple[Tensor, Tensor]:
+    def _path(self, parts: list[tuple[Tensor, Tensor]], name: str) -> tuple[Tensor, Tensor]:
+        """The likeliest shifts of all parts, (n,), and their confidence (n,)."""
+        if not parts:
+            raise InputError(f"{name} has 1 frame; expected at least 2 to see motion")
+        shifts, confidences = (torch.cat(part) for part in zip(*parts, strict=True))
         path = viterbi_path(shifts, confidences, self.size[0]).to(shifts.device)[:, None]
         return shifts.gather(1, path)[:, 0], confidences.gather(1, path)[:, 0]
 
+    @torch.no_grad()
     def distances(self, traverse: Traverse, batch_size: int = 64, progress: bool = False) -> Odometry:
         """Where the camera is at each frame of a traverse, which is read once, batch by batch.
 
         Args:
-            traverse: frames, in order.
             batch_size: frames in memory at a time; fewer if they are large.
             progress: show a progress bar on a terminal.
 
         Convention: a step of a confidence below `least` (a cut, a drop-out) is interpolated between its
-            neighbours, and a warning names the frames. A step shorter than `still` is 0. Frames too small
-            for the patch are a warning.
+            neighbours, and a warning names the frames. A step shorter than `still` is 0.
 
         Raises:
             InputError: ready features, fewer than two frames, or no step of enough confidence.
         """
-        patches: Tensor | None = None
+        last: list[Tensor] = []  # patch of the batch before
         parts: list[tuple[Tensor, Tensor]] = []
         text, hidden = "measuring the ground", None if progress else True
         with tqdm(total=traverse.length, desc=text, unit="frame", disable=hidden, leave=False) as bar:
             for batch in traverse.batches(traverse.batch_size(batch_size)):
-                if batch.ndim != 4:
-                    raise InputError(
-                        f"{traverse.name} gives batches {tuple(batch.shape)}; expected frames (B,C,H,W): "
-                        "ready features show no ground"
-                    )
-                with torch.no_grad():
-                    new = ground_patch(batch, self.corners, self.size)
-                    if patches is None:
-                        self._warn_coarse(batch, traverse.name)
-                    patches = new if patches is None else torch.cat([patches[-1:], new])
-                    parts.append(self._shifts(patches))
+                patches = torch.cat([*last, ground_patch(batch, self.corners, self.size)])
+                if not last:
+                    self._warn_coarse(batch, traverse.name)
+                parts += self._shifts(patches)
+                last = [patches[-1:]]
                 bar.update(len(batch))
-        shifts, confidences = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
-        if not len(shifts):
-            raise InputError(f"{traverse.name} has 1 frame; expected at least 2 to see motion")
-        shift, confidence = self._path(shifts, confidences)
+        shift, confidence = (part.cpu() for part in self._path(parts, traverse.name))
         shift = interpolated(shift.double(), confidence >= self.least, traverse.name)
         shift = torch.where(shift.abs() < self.still, 0.0, shift)
         return Odometry(torch.cat([shift.new_zeros(1), shift.cumsum(0)]), confidence)
 
     def _warn_coarse(self, batch: Tensor, name: str) -> None:
         """Warn of a patch finer than the frames: interpolated rows hardly move."""
-        shown, (rows, columns) = region_length(self.corners, *batch.shape[2:]), self.size
-        if rows <= 2 * shown:
-            return
-        fits = f"size ({int(2 * shown)}, {columns})" if shown >= 16 else "larger frames, or a larger region,"
-        log.warning(
-            "%s: the patch has %d rows, its region only %.0f in frames of %d x %d pixels: slow motion is "
-            "underestimated, %s would do",
-            *(name, rows, shown, *batch.shape[2:], fits),
-        )
+        (height, width), (rows, columns) = batch.shape[2:], self.size
+        (ax, ay), (bx, by), (cx, cy), (dx, dy) = self.corners
+        # pixels between the middles of the region's far and near edge
+        shown = math.hypot((cx + dx - ax - bx) / 2 * (width - 1), (cy + dy - ay - by) / 2 * (height - 1))
+        if rows > 2 * shown:
+            fits = f"size ({int(2 * shown)}, {columns})"
+            fits = fits if shown >= 16 else "larger frames, or a larger region,"
+            log.warning(
+                "%s: the patch has %d rows, its region only %.0f in frames of %d x %d pixels: slow motion is "
+                "underestimated, %s would do",
+                *(name, rows, shown, height, width, fits),
+            )
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={getattr(self, name)}" for name in signature(type(self)).parameters)
 
 
 def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
-    """Steps with the others interpolated between those that are valid; a warning names their frames.
-
-    Convention: before the first valid step and after the last, that one.
-
-    Shape: (n,), (n,) bool -> (n,).
-
-    Raises:
-        InputError: none is valid.
-    """
+    """Steps (n,), those that are not valid interpolated between the others, a warning naming their frames;
+    before the first valid step and after the last, that one."""
     bad, good = (~valid).nonzero()[:, 0], valid.nonzero()[:, 0]
     if not len(bad):
         return shift
@@ -182,8 +166,7 @@ def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
             f"{name}: none of {len(shift)} steps shows the same ground twice; "
             "expected corners on the ground in front of the camera"
         )
-    starts, stops = bad[bad.diff(prepend=bad[:1] - 2) > 1], bad[bad.diff(append=bad[-1:] + 2) > 1] + 1
-    segments = [f"{start} to {stop}" for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
+    segments = [f"{run.start} to {run.stop}" for run in runs(bad)]
     more = f" and {len(segments) - NAMED} more" if len(segments) > NAMED else ""
     log.warning(
         "%s: no common ground in frames %s%s (%d of %d steps): the velocity there is interpolated",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from dejavu_torch.motion.ground_plane import FLAT, check_pairs
+from dejavu_torch.motion.ground_plane import FLAT
 
 REACH = 0.42  # largest shift, as a share of the patch
 SWAY = 3  # pixels to either side
@@ -17,72 +17,21 @@ MIN_CONFIDENCE = 0.4  # unrelated patches reach 0.15 to 0.25, the same ground 0.
 BAND = 0.1  # cycles/pixel: the far rows are interpolated, and their finest detail does not move
 
 
-def shift_between(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """How far the ground moved along the rows from one patch to the next, each pair by itself.
+def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """How far the ground may have moved along the rows from one patch to the next, for each pair.
 
-    Correlation of phases, each frequency weighted by its coherence over the columns, so that noise and what
-    motion blurs away weigh little. Every peak at half the resolution is refined by windows that move with
-    the ground, and the best one wins.
+    Correlation of phases, each frequency weighted by its coherence over the columns, so that noise and motion
+    blur weigh little. Each peak at half the resolution is refined by windows that move with the ground.
 
-    Args:
-        first, second: patches of ground, of any gain and offset of brightness.
+    Shape: patches of any gain and offset of brightness, at least 32 x 32, (B,1,h,w), (B,1,h,w) ->
+        shift (B,K) in pixels, rows of the patch; confidence (B,K) in [0, 1].
 
-    Shape: (B,1,h,w), (B,1,h,w) -> shift (B,) in pixels, rows of the patch; confidence (B,) in [0, 1].
-
-    Convention: shift > 0 is forward: what is in row r of the first is in row r + shift of the second.
-        |shift| is at most about 0.42 h, sway at most 3 columns. The confidence is the mean coherence: 1 for
-        the same picture, mostly 0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of
-        96 x 96), 0 for patches that are flat or not finite.
-
-    Raises:
-        InputError: patches that are not two equal (B,1,h,w) of at least 32 x 32.
-
-    Example:
-        >>> ground = torch.rand(1, 1, 80, 64)
-        >>> shift, confidence = shift_between(ground[..., 10:74, :], ground[..., 3:67, :])
-        >>> round(shift.item(), 1), confidence.item() > 0.9
-        (7.0, True)
+    Convention: shift > 0 is forward: row r of the first is row r + shift of the second. |shift| is at most
+        about 0.42 h, sway at most 3 columns. The confidence is the mean coherence: 1 for the same picture,
+        mostly 0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of 96 x 96), 0 for
+        patches that are flat or not finite.
     """
-    shifts, confidences = shift_peaks(first, second)
-    best = confidences.argmax(1, keepdim=True)
-    return shifts.gather(1, best)[:, 0], confidences.gather(1, best)[:, 0]
-
-
-def viterbi_path(shifts: Tensor, confidences: Tensor, height: int) -> Tensor:
-    """Which peak of each pair, if the pairs follow one another in time.
-
-    Sleepers look the same one period further on. The path through the peaks with the highest sum of
-    confidences less changes of the shift, in patch heights (`height`, pixels), resolves that.
-
-    Shape: (n,K), (n,K) -> (n,) int64, on the CPU.
-
-    Example:
-        >>> shifts = torch.tensor([[9.0, 33.0]] * 3)
-        >>> viterbi_path(shifts, torch.tensor([[0.9, 0.8], [0.8, 0.85], [0.9, 0.8]]), 96)
-        tensor([0, 0, 0])
-    """
-    shifts, confidences = shifts.double().cpu(), confidences.double().cpu()
-    change = (shifts[1:, :, None] - shifts[:-1, None]).abs() / height
-    best, origins = confidences[:1].sum(0), []
-    for cost, gain in zip(change, confidences[1:], strict=True):
-        total, origin = (best - cost).max(1)
-        best = total + gain
-        origins.append(origin)
-    path = [best.argmax()]
-    for origin in reversed(origins):
-        path.append(origin[path[-1]])
-    return torch.stack(path[::-1])
-
-
-def shift_peaks(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """The likeliest shifts, as `shift_between`.
-
-    Shape: (B,1,h,w), (B,1,h,w) -> shift (B,K) in pixels, confidence (B,K) in [0, 1].
-    """
-    check_pairs(first, second)
     count, _, height, _ = first.shape
-    if not count:
-        return first.new_zeros(0, PEAKS), first.new_zeros(0, PEAKS)
     # coarse: every whole lag at half the resolution
     reach = int(REACH * (height // 2))
     lags = torch.arange(-reach, reach + 1.0).to(first)
@@ -102,13 +51,8 @@ def shift_peaks(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _coherence(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway: int, band: float) -> Tensor:
-    """Mean coherence at the shifts guess + lag, the best over sways of up to `sway` columns.
-
-    Args:
-        band: standard deviation of a Gaussian over the frequencies, cycles/pixel.
-
-    Shape: (B,h,w), (B,h,w), (B,), (T,) -> (B,T).
-    """
+    """Mean coherence (B,T) at the shifts guess (B,) + lag (T,), the best over sways of up to `sway` columns;
+    band: standard deviation of a Gaussian over the frequencies, cycles/pixel."""
     height, width = first.shape[1:]
     row = torch.arange(height).to(first)
     common = (height - guess.abs())[:, None]  # rows of ground in both
@@ -144,3 +88,22 @@ def _vertex(score: Tensor, at: Tensor) -> Tensor:
     left, mid, right = (score.gather(1, (inside + k)[:, None])[:, 0] for k in (-1, 0, 1))
     curve = (2 * mid - left - right).clamp(min=1e-9)
     return torch.where(inside == at, (0.5 * (right - left) / curve).clamp(-1, 1), 0.0)
+
+
+def viterbi_path(shifts: Tensor, confidences: Tensor, height: int) -> Tensor:
+    """Which of the shifts (n,K) of each pair, if the pairs follow one another: (n,) int64, on the CPU.
+
+    Sleepers look the same one period further on. The path with the highest sum of confidences less changes of
+    the shift, in patch heights (`height`, pixels), resolves that.
+    """
+    shifts, confidences = shifts.double().cpu(), confidences.double().cpu()
+    change = (shifts[1:, :, None] - shifts[:-1, None]).abs() / height
+    best, origins = confidences[:1].sum(0), []
+    for cost, gain in zip(change, confidences[1:], strict=True):
+        total, origin = (best - cost).max(1)
+        best = total + gain
+        origins.append(origin)
+    path = [best.argmax()]
+    for origin in reversed(origins):
+        path.append(origin[path[-1]])
+    return torch.stack(path[::-1])

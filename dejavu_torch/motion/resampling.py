@@ -21,27 +21,23 @@ DOUBTFUL = 0.2  # steps backwards for each one forward
 
 
 class ResampledTraverse(Selection):
-    """The frames of another traverse, resampled by distance: at even steps along the ground.
-
-    The other traverse is read once to measure the distances, and again each time the frames are asked for.
+    """The frames of another traverse, resampled by distance: at even steps along the ground. It is read once
+    to measure the distances, and again each time the frames are asked for.
 
     Args:
-        traverse: frames, in order.
         odometry: measures the ground, and has the default of the step.
         batch_size: frames in memory at a time while measuring.
         step: pixels of ground, in place of the odometry's; as for the queries of a map.
         progress: show a progress bar on a terminal.
 
-    Shape: frames (M,C,H,W). positions: (F,) float32, how many steps each frame of the other traverse lies
-        from the first. frame: (M,) int64, the frame of the other traverse nearest to each step, which is
-        shown. place: (M,) float64, its place, None if unknown. step: pixels of ground.
+    Shape: positions: (F,) float32, how many steps each frame of the other traverse lies from the first.
+        frame: (M,) int64, the one nearest to each step, which is shown. place: (M,) float64, or None.
 
     Convention: distances count from frame 0, in the direction in which the camera gets further from it. Each
         step is taken where it is first reached: standing, and going back and forth, add no frames.
 
     Raises:
-        InputError: as `GroundOdometry.distances`, and footage that does not move, or less than a step, or
-            over 20 steps a frame.
+        InputError: footage that does not move, or less than a step, or over 20 steps a frame.
     """
 
     length: int
@@ -63,7 +59,13 @@ class ResampledTraverse(Selection):
         moved, frames = distance.diff(), len(distance)
         if not moved.any():
             raise InputError(f"{traverse.name} stands still in all of its {frames} frames; expected motion")
-        _warn_doubtful(moved, traverse.name)
+        forward, back = int((moved > 0).sum()), int((moved < 0).sum())
+        if back > DOUBTFUL * forward:
+            log.warning(
+                "%s: %d of %d steps go forward and %d backwards: do the corners show ground that comes "
+                "nearer?",
+                *(traverse.name, forward, len(moved), back),
+            )
         step = odometry.step if step is None else step
         self.step = float(moved.abs()[moved != 0].median()) if step is None else float(step)
         self.positions = (distance / self.step).float()
@@ -83,16 +85,6 @@ class ResampledTraverse(Selection):
         return picked(self.traverse.batches(size), range(len(self.positions)), self.frame, size)
 
 
-def _warn_doubtful(moved: Tensor, name: str) -> None:
-    """Warn of footage in which hardly any step goes forward, as where the corners show no ground."""
-    forward, back = int((moved > 0).sum()), int((moved < 0).sum())
-    if back > DOUBTFUL * forward:
-        log.warning(
-            "%s: %d of %d steps go forward and %d backwards: do the corners show ground that comes nearer?",
-            *(name, forward, len(moved), back),
-        )
-
-
 def resampled(
     traverse: Traverse,
     odometry: GroundOdometry | None,
@@ -100,15 +92,8 @@ def resampled(
     step: float | None = None,
     progress: bool = False,
 ) -> Traverse:
-    """A traverse at even steps along the ground; as it is without odometry, or where it is so already.
-
-    Args:
-        step: pixels of ground; None is the odometry's own. Queries need the map's: of them a single frame,
-            and ready features, stay as they are.
-
-    Raises:
-        InputError: as `ResampledTraverse`.
-    """
+    """A `ResampledTraverse`; the traverse itself without odometry, or if it is resampled already. Queries
+    have the `step` of the map: a single frame, and ready features, then stay as they are."""
     if odometry is None or isinstance(traverse, ResampledTraverse):
         return traverse
     if step is not None and (traverse.length == 1 or len(traverse.frame_shape) == 1):
@@ -130,17 +115,13 @@ def ground_truth_of(
     interpolate: bool = False,
     aligned: bool = False,
 ) -> GroundTruth | None:
-    """`find_ground_truth` of traverses that may be resampled, in frames of the reference's source.
-
-    Args:
-        places, queries: how many frames the traverses gave, needed where they do not know their lengths.
-    """
-    frames = source_of(reference).length if places is None else places
+    """`find_ground_truth` of traverses that may be resampled, in frames of the reference's source; places,
+    queries: how many frames the traverses gave, needed if they do not know their lengths."""
+    frames, moved = reference.length if places is None else places, isinstance(reference, ResampledTraverse)
     if isinstance(reference, ResampledTraverse):
         frames = len(reference.positions)
     numbers = query.frame if isinstance(query, ResampledTraverse) else queries or query.length
     if numbers is None:
         raise InputError(f"{query.name} does not know how many frames it has; expected their number")
     sources = source_of(reference), source_of(query)
-    moved = reference is not sources[0]
     return find_ground_truth(truth, *sources, frames, numbers, interpolate, moved, aligned)

@@ -21,9 +21,8 @@ from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.selection import runs as runs_of
 from dejavu_torch.data.source import open_source, routes_of
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.features.memory import concatenate
-from dejavu_torch.features.views import STRETCH, Stretches
-from dejavu_torch.memory import check_room
+from dejavu_torch.features.views import STRETCH, AugmentedTraverse, augmented_segments
+from dejavu_torch.memory import check_room, concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
@@ -305,17 +304,17 @@ class RouteData(LightningDataModule):
 
     def held_frames(
         self, starts: list[int], strengths: Mapping[str, Any], shape: tuple[int, ...] | None = None
-    ) -> Stretches | None:
+    ) -> AugmentedTraverse | None:
         """Those of these stretches that begin at `starts`, as they may look on another visit; None without
         any.
 
         Args:
-            strengths: see `Stretches`. shape: (C,H,W) of the frames; None is that of the reference.
+            strengths: see `augmented_segments`. shape: (C,H,W) of the frames; None is that of the reference.
         """
         if not starts:
             return None
         reference = self.reference if shape is None else fitted(self.reference, shape)
-        return Stretches(reference, len(self.sets["reference"].values), strengths, starts=starts)
+        return augmented_segments(reference, len(self.sets["reference"].values), strengths, starts=starts)
 
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""

@@ -77,12 +77,6 @@ def test_gradients_of_local_contrast_are_right_and_finite_on_a_flat_frame() -> N
     assert flat.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("cell", [0, -1])
-def test_a_cell_below_1_is_refused(cell: int) -> None:
-    with refused(f"cell of {cell}", "at least 1"):
-        local_contrast(torch.rand(1, 1, 8, 8), cell)
-
-
 # the network
 
 

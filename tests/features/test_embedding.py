@@ -248,14 +248,6 @@ def test_no_output_is_taken_silently(
         Embedding(Maker(make), output=output)
 
 
-def test_a_network_that_changes_its_output_size_is_refused() -> None:
-    network = Maker(lambda frames: frames[:, :2].mean((2, 3)))
-    net = Embedding(network, dimension=None)
-    network.make = lambda frames: frames.mean((2, 3))
-    with refused("Maker made 3 numbers", "expected 2"):
-        net(torch.rand(4, 3, 96, 96))
-
-
 def test_mean_and_deviation_are_taken_out_last() -> None:
     frames = torch.rand(2, 3, 12, 16)
     net = plain(mean=[0.1, 0.2, 0.3], std=0.5, cell=4).eval()

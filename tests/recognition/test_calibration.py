@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, open_source
 from dejavu_torch.data.arrays import as_traverse
-from dejavu_torch.features.views import Stretches, Views
+from dejavu_torch.features.views import Views, augmented_segments
 from dejavu_torch.model import HIGHEST
 from dejavu_torch.recognition.calibration import (
     NEVER,
@@ -175,7 +175,7 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
 )
 def test_every_tenth_stretch_is_taken(frames: int, stretch: int, starts: list[int]) -> None:
     route = open_source(f"sim:aerial?frames={frames}")
-    changed = Stretches(route, frames, {"noise": 0.01})
+    changed = augmented_segments(route, frames, {"noise": 0.01})
     shown = changed.places.view(len(starts), -1, stretch)
     assert shown[:, 0].flatten().tolist() == [start + i for start in starts for i in range(stretch)]
     assert changed.length is not None
@@ -188,7 +188,7 @@ def test_every_tenth_stretch_is_taken(frames: int, stretch: int, starts: list[in
 )
 def test_long_routes_are_looked_at_in_fewer_frames(frames: int, places: int | None, most: int) -> None:
     route = open_source("sim:aerial?frames=30")  # none of it is read
-    changed = Stretches(route, frames, {"noise": 0.01}, places=places)
+    changed = augmented_segments(route, frames, {"noise": 0.01}, places=places)
     assert changed.length is not None
     assert most * 0.7 < changed.length <= most
     assert int(changed.places.max()) > 0.8 * frames
@@ -222,21 +222,23 @@ def test_changed_frames_show_their_places_whatever_the_batch() -> None:
     frames = torch.cat(list(route.batches(64)))
     nothing = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion"), 0.0)
     plain = {**nothing, "colour": [0, 0], "shift": [0, 0], "exposure": [0, 0], "noise": 0.0}
-    same = Stretches(route, 300, plain)
+    same = augmented_segments(route, 300, plain)
     torch.testing.assert_close(torch.cat(list(same.batches(50))), frames[same.places])
-    changed = Stretches(route, 300, {**plain, "noise": 0.1})
+    changed = augmented_segments(route, 300, {**plain, "noise": 0.1})
     once = torch.cat(list(changed.batches(7)))
     assert torch.equal(once, torch.cat(list(changed.batches(64))))
     assert (once - frames[changed.places]).std() == pytest.approx(
         0.15 * 0.7**0.5, rel=0.3
     )  # 1.5 times as much
     unread = Stream(frames)  # which cannot begin anywhere
-    torch.testing.assert_close(torch.cat(list(Stretches(unread, 300, plain).batches(9))), frames[same.places])
+    torch.testing.assert_close(
+        torch.cat(list(augmented_segments(unread, 300, plain).batches(9))), frames[same.places]
+    )
     with refused("ready features"):
-        Stretches(open_source_of(torch.rand(30, 4)), 30, plain)
+        augmented_segments(open_source_of(torch.rand(30, 4)), 30, plain)
     for strengths in ({"noise": {}}, {"noise": float("nan")}, {"nose": 0.1}):  # of a file
         with refused("nois" if "noise" in strengths else "nose"):
-            Stretches(open_source("sim:aerial?frames=30"), 30, strengths)
+            augmented_segments(open_source("sim:aerial?frames=30"), 30, strengths)
 
 
 def open_source_of(features: Tensor):  # type: ignore[no-untyped-def]

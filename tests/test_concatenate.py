@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.features import memory
-from dejavu_torch.features.memory import concatenate
+from dejavu_torch import memory
+from dejavu_torch.memory import concatenate
 
 
 @given(
@@ -53,7 +53,7 @@ def test_what_fits_is_not_held_twice() -> None:
         pytest.skip("no /proc")
     code = (
         "import torch; from dejavu_torch.experiments.bench import peak_memory\n"
-        "from dejavu_torch.features.memory import concatenate\n"
+        "from dejavu_torch.memory import concatenate\n"
         "print(peak_memory(lambda: concatenate(torch.ones(64, 2048) for _ in range(700))))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
