@@ -6,6 +6,7 @@ import json
 import math
 import types
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from hashlib import blake2b
 from inspect import formatannotation
 from pathlib import Path
@@ -61,7 +62,10 @@ def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any])
     Raises:
         InputError: the file cannot be written.
     """
-    plain, metadata = _sealed(tensors, header)
+    try:
+        plain, metadata = _sealed(tensors, header)
+    except ValueError as error:
+        raise InputError(f"{path} was not written: {error}") from error
     with whole_file(path) as temporary:
         try:
             safetensors.torch.save_file(plain, temporary, metadata)
@@ -72,10 +76,8 @@ def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any])
 def _sealed(
     tensors: Mapping[str, Tensor], header: dict[str, Any]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors with memory of their own, as safetensors needs, and the metadata.
-
-    The metadata are one entry, since safetensors writes several in any order.
-    """
+    """Tensors with memory of their own, as safetensors needs, and metadata of one entry, as it writes several
+    in any order."""
     plain: dict[str, Tensor] = {}
     owners: set[int] = set()
     for name, tensor in tensors.items():
@@ -110,7 +112,7 @@ def read_map(path: Path) -> Contents:
                     f"{path} is no map of dejavu_torch, or an old one; expected {EXPECTED}; of an old one, "
                     "learn the route anew"
                 )
-            sealed = json_values(metadata[NAME])
+            sealed = json.loads(metadata[NAME])
             version = sealed["version"]
             if version != FORMAT:
                 newer = isinstance(version, int) and version > FORMAT
@@ -119,15 +121,14 @@ def read_map(path: Path) -> Contents:
                     f"{path} has map format {version!r:.40}; this version reads {FORMAT}: {cure}"
                 )
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
-        header, sums = sealed[HEADER], sealed["checksums"]
+        header, sums = sealed[HEADER], dict(sealed["checksums"] or {})
         seen = checksums(tensors, header)
     except InputError:
         raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
-    if seen != sums:
-        known = sums if isinstance(sums, dict) else {}
-        damaged = sorted(part for part in {*seen, *known} if seen.get(part) != known.get(part))
+    damaged = sorted(part for part in {*seen, *sums} if seen.get(part) != sums.get(part))
+    if damaged:
         raise InputError(
             f"{path} is damaged: its {' and '.join(damaged)}; expected the file as it was written"
         )
@@ -136,26 +137,8 @@ def read_map(path: Path) -> Contents:
 
 def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     """The tensors of one part of a file, by their own names."""
-    return {
-        name.removeprefix(f"{part}."): one for name, one in tensors.items() if name.startswith(f"{part}.")
-    }
-
-
-def json_values(text: str) -> Any:
-    """JSON values, of finite numbers, whole ones below 2^53; else ValueError."""
-    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
-
-
-def _finite(text: str) -> float:
-    if not math.isfinite(float(text)):
-        raise ValueError(f"{text} is no finite number")
-    return float(text)
-
-
-def _whole(text: str) -> int:
-    if abs(int(text)) >= LARGEST:
-        raise ValueError(f"{text:.40} is no whole number below 2^53")
-    return int(text)
+    prefix = f"{part}."
+    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
 def checked(value: Any, kind: Any, where: str) -> Any:
@@ -182,21 +165,20 @@ def checked(value: Any, kind: Any, where: str) -> Any:
     if hasattr(kind, "_fields"):
         return kind(**checked_fields(value, get_type_hints(kind), where))
     if origin in (Union, types.UnionType):
-        mappings = [one for one in inner if hasattr(one, "_fields") and isinstance(value, dict)]
-        for one in mappings or inner:
-            try:
+        named = [one for one in inner if hasattr(one, "_fields")]
+        if named and isinstance(value, dict):
+            return checked(value, named[0], where)
+        for one in inner:
+            with suppress(InputError):
                 return checked(value, one, where)
-            except InputError:
-                if mappings:
-                    raise
     elif origin in (tuple, list, Sequence) and isinstance(value, list | tuple):
         kinds = inner if origin is tuple and ... not in inner else inner[:1] * len(value)
         if len(kinds) == len(value):
-            items = [
-                checked(one, of, f"{where}[{i}]")
-                for i, (one, of) in enumerate(zip(value, kinds, strict=True))
-            ]
+            pairs = enumerate(zip(value, kinds, strict=True))
+            items = [checked(one, of, f"{where}[{i}]") for i, (one, of) in pairs]
             return items if origin is list else tuple(items)
+    elif origin in (dict, Mapping) and isinstance(value, dict):
+        return {name: checked(one, inner[1], f"{where}.{name}") for name, one in value.items()}
     elif _fits(value, origin, inner):
         return value
     limit = ", finite and below 2^53" if isinstance(value, int | float) else ""
@@ -205,13 +187,13 @@ def checked(value: Any, kind: Any, where: str) -> Any:
 
 def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
     """Whether a value is of a type other than a union, a sequence or a NamedTuple."""
+    if type(value) in (int, float) and not abs(value) < (LARGEST if type(value) is int else math.inf):
+        return False
     if origin is Literal:
         return any(type(value) is type(one) and value == one for one in inner)
-    if origin is int:
-        return type(value) is int and abs(value) < LARGEST
     if origin is float:
-        return type(value) in (int, float) and math.isfinite(value)
-    if origin in (str, bool, None, type(None)):
+        return type(value) in (int, float)
+    if origin in (int, str, bool, None, type(None)):
         return type(value) is (origin or type(None))
     return origin is Any or isinstance(value, dict)
 

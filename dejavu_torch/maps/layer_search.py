@@ -23,7 +23,7 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
     Args:
         one, other: distances of each layer at its first tau places. places: at least the longer tau.
 
-    Shape: (Q,tau1), (Q,tau2) -> (Q,), (Q,) int64; `places` where no score is finite.
+    Shape: (Q,tau1), (Q,tau2) -> (Q,), (Q,) int64; `places` if no score is finite.
 
     Example:
         >>> lowest(torch.tensor([[3.0, 0.0]]), torch.tensor([[1.0, 1.0, 0.0]]), places=6)
@@ -58,10 +58,7 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
 
 @lru_cache(maxsize=16)
 def _circles(outer: int, inner: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Residues modulo `inner` in the order in which steps of `outer` visit them, and where each r begins.
-
-    Shape: -> (inner,), (outer,) int64.
-    """
+    """Residues modulo `inner` in the order in which steps of `outer` visit them, and where each r begins."""
     circles = math.gcd(outer, inner)
     starts, steps = torch.arange(circles), torch.arange(inner // circles)
     order = ((starts[:, None] + steps * outer) % inner).flatten()
@@ -78,10 +75,9 @@ def sliding_minimum(values: Tensor, width: int) -> Tensor:
         kernels, Pattern Recognition Letters 13 (1992).
     """
     size = values.shape[-1]
-    padding = -(size + width - 1) % width  # of the last block
-    blocks = torch.cat([values, values[..., : width - 1], values[..., :padding]], -1).unflatten(
-        -1, (-1, width)
-    )
-    from_start = blocks.cummin(-1).values.flatten(-2)
-    to_end = blocks.flip(-1).cummin(-1).values.flip(-1).flatten(-2)
+    blocks = -(-(size + width - 1) // width)
+    around = torch.arange(blocks * width, device=values.device) % size
+    parts = values.index_select(-1, around).unflatten(-1, (-1, width))
+    from_start = parts.cummin(-1).values.flatten(-2)
+    to_end = parts.flip(-1).cummin(-1).values.flip(-1).flatten(-2)
     return torch.minimum(to_end[..., :size], from_start[..., width - 1 : width - 1 + size])

@@ -10,16 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dejavu_torch.types import InputError
+SMALLEST = 4  # period: a layer of 2 or 3 phases hardly tells places from noise
+CORRECTS = 1  # wrong layers that supportive periods survive
 
 
 def common_period(periods: Sequence[Fraction | int]) -> Fraction:
-    """Least common multiple of the periods, at least one: the number of places they can tell apart.
-
-    Not their product: the paper's 93 and 171 share a factor 3.
+    """Least common multiple of one or more periods: the number of places they can tell apart.
 
     Example:
-        >>> common_period([93, 171]), common_period([Fraction(195, 2), 171])
+        >>> common_period([93, 171]), common_period([Fraction(195, 2), 171])  # 93 and 171 share a factor 3
         (Fraction(5301, 1), Fraction(11115, 1))
     """
     numerators, denominators = zip(*(Fraction(period).as_integer_ratio() for period in periods), strict=True)
@@ -40,9 +39,9 @@ def shared_factor(a: Fraction | int, b: Fraction | int) -> Fraction:
 class Support(NamedTuple):
     """How whole periods support each other over a route.
 
-    code_distance: least number of layers in which two places differ, the Hamming distance of their residue
-    code; 0 if some look alike. torus_distance: least distance of two places D > 1 apart on the torus of
-    their phases, sum over layers of min(D mod tau, tau - D mod tau).
+    code_distance: in how many layers any two places differ at least, the Hamming distance of their residue
+        code, which survives (code_distance - 1) // 2 wrong layers.
+    torus_distance: least sum over layers of min(D mod tau, tau - D mod tau) for places D > 1 apart.
 
     Source: R. W. Watson and C. W. Hastings, Self-checked computation using residue arithmetic, Proc. IEEE
         54 (1966).
@@ -50,11 +49,6 @@ class Support(NamedTuple):
 
     code_distance: int
     torus_distance: int
-
-    @property
-    def corrects(self) -> int:
-        """How many wrong layers the nearest code word survives."""
-        return max(0, (self.code_distance - 1) // 2)
 
 
 def support_of(periods: Sequence[int], places: int) -> Support:
@@ -70,36 +64,23 @@ def support_of(periods: Sequence[int], places: int) -> Support:
     return Support(int((phase != 0).sum(0).min()), int(around[1:].min()))
 
 
-def supportive_periods(places: int, corrects: int = 1, smallest: int = 4) -> tuple[int, ...]:
-    """Distinct whole periods, increasing, that tell the places apart, also with some layers wrong.
-
-    Args:
-        places: N, places to tell apart, at least 2.
-        corrects: wrong layers to survive, >= 0.
-        smallest: shortest period allowed, >= 2; a layer of 2 or 3 phases hardly tells places from noise.
+def supportive_periods(places: int) -> tuple[int, ...]:
+    """Distinct whole periods >= 4, increasing, that tell the places apart, also with one layer wrong.
 
     Convention: the pairwise co-prime set of the fewest templates; of several the one of the largest code
         distance, then of the largest torus distance, then of the longest shortest period.
 
-    Raises:
-        InputError: an argument out of range.
-
     Example:
-        >>> supportive_periods(540), supportive_periods(540, corrects=0)
-        ((4, 5, 7, 9, 11, 13), (4, 5, 7, 9))
+        >>> supportive_periods(540)
+        (4, 5, 7, 9, 11, 13)
     """
-    if places < 2 or corrects < 0 or smallest < 2:
-        raise InputError(
-            f"supportive_periods got {places=}, {corrects=}, {smallest=}; expected places >= 2, "
-            "corrects >= 0, smallest >= 2"
-        )
 
     def suffices(chosen: tuple[int, ...]) -> bool:
-        """Whether any but 2 * corrects of them, at worst the smallest, tell the places apart."""
-        core = len(chosen) - 2 * corrects
+        """Whether any but 2 * CORRECTS of them, at worst the smallest, tell the places apart."""
+        core = len(chosen) - 2 * CORRECTS
         return core > 0 and math.prod(chosen[:core]) >= places
 
-    totals = ([*filter(suffices, _co_prime_sets(total, smallest))] for total in count(smallest))
+    totals = ([*filter(suffices, _co_prime_sets(total, SMALLEST))] for total in count(SMALLEST))
     return max(next(filter(None, totals)), key=lambda chosen: (support_of(chosen, max(places, 3)), chosen))
 
 

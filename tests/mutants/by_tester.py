@@ -36,8 +36,8 @@ MUTANTS = [
     Mutant(
         "The cosine distance of features of the same direction is 0.",
         "dejavu_torch/maps/distance.py",
-        "return 1 - unit(query, dim=-1)",
-        "return 2 - unit(query, dim=-1)",
+        "return 1 - normalize(query, dim=-1)",
+        "return 2 - normalize(query, dim=-1)",
         ("tests/maps/test_distance.py::-k definition or distance_0",),
     ),
     Mutant(
@@ -109,8 +109,8 @@ MUTANTS = [
     Mutant(
         "A map file that is damaged in any bit is refused.",
         "dejavu_torch/maps/file.py",
-        "if seen != sums:",
-        "if seen.keys() != sums.keys():",
+        "if seen.get(part) != sums.get(part)",
+        "if (part in seen) != (part in sums)",
         ("tests/maps/test_file.py::-k any_flipped",),
     ),
     Mutant(
