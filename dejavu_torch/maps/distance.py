@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -30,27 +30,10 @@ QUERIES_AT_ONCE = 64  # they stay in cache while the templates stream by
 TASK = 2**23  # |a - b| for one thread at a time, about half a millisecond
 
 
-def _l1(query: Tensor, templates: Tensor) -> Tensor:
-    distances = compiled_l1(query, templates)
-    return torch.cdist(query, templates, p=1.0) if distances is None else distances
-
-
-def _l2(query: Tensor, templates: Tensor) -> Tensor:
-    # the matrix-product form loses the small distances that decide a match
-    return torch.cdist(query, templates, p=2.0, compute_mode="donot_use_mm_for_euclid_dist")
-
-
-def _cosine(query: Tensor, templates: Tensor) -> Tensor:
-    return 1 - normalize(query, dim=-1) @ normalize(templates, dim=-1).T
-
-
-METRICS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"l1": _l1, "l2": _l2, "cosine": _cosine}
-
-
 def check_metric(metric: Metric) -> None:
     """Refuse an unknown metric by an InputError."""
-    if metric not in [*METRICS]:
-        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(METRICS)}")
+    if metric not in get_args(Metric):
+        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(get_args(Metric))}")
 
 
 def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> Tensor:
@@ -78,8 +61,15 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
             f"phase_distances got {tuple(query.shape)} and {tuple(templates.shape)}; expected (Q,F) and (P,F)"
         )
     dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
+    query, templates = query.to(dtype), templates.to(dtype)
     with torch.autocast(query.device.type, enabled=False):
-        return METRICS[metric](query.to(dtype), templates.to(dtype))
+        if metric == "cosine":
+            return 1 - normalize(query, dim=-1) @ normalize(templates, dim=-1).T
+        if metric == "l1" and (distances := compiled_l1(query, templates)) is not None:
+            return distances
+        # the matrix-product form of l2 loses the small distances that decide a match
+        p, mode = 1.0 if metric == "l1" else 2.0, "donot_use_mm_for_euclid_dist"
+        return torch.cdist(query, templates, p, compute_mode=mode)
 
 
 def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:

@@ -25,6 +25,7 @@ FORMAT = 10
 NAME = "dejavu_torch-map"
 ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
+EXPORT = "or `dejavu train export` of the checkpoint"
 HEADER = "header"  # the digest that is of no tensor
 SHOWN = 60  # characters of a value in a message
 
@@ -57,11 +58,7 @@ def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
 
 
 def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
-    """Write the file whole or not at all; the same tensors and header give the same bytes.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write the file whole or, with an InputError, not at all; the same contents give the same bytes."""
     try:
         plain, metadata = _sealed(tensors, header)
     except ValueError as error:
@@ -92,26 +89,18 @@ def _sealed(
 
 
 def read_map(path: Path) -> Contents:
-    """Tensors and header of a map file, as they were written.
-
-    Raises:
-        InputError: missing, truncated, foreign, damaged, or of another format.
-    """
+    """Tensors and header as written; an InputError if the file is missing, truncated, foreign, damaged, or of
+    another format."""
     check_regular(path, EXPECTED)
     try:
         with path.open("rb") as file:
             if file.read(len(ZIP)) == ZIP:
-                raise InputError(
-                    f"{path} is a checkpoint or another archive; expected a map, as `dejavu train export` "
-                    "makes of a checkpoint"
-                )
+                raise InputError(f"{path} is a checkpoint or another archive; expected {EXPECTED}, {EXPORT}")
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
             if NAME not in metadata:
-                raise InputError(
-                    f"{path} is no map of dejavu_torch, or an old one; expected {EXPECTED}; of an old one, "
-                    "learn the route anew"
-                )
+                problem = f"{path} is no map of dejavu_torch, or an old one"
+                raise InputError(f"{problem}; expected {EXPECTED}; of an old one, learn the route anew")
             sealed = json.loads(metadata[NAME])
             version = sealed["version"]
             if version != FORMAT:
@@ -129,9 +118,7 @@ def read_map(path: Path) -> Contents:
         raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
     damaged = sorted(part for part in {*seen, *sums} if seen.get(part) != sums.get(part))
     if damaged:
-        raise InputError(
-            f"{path} is damaged: its {' and '.join(damaged)}; expected the file as it was written"
-        )
+        raise InputError(f"{path} is damaged: its {' and '.join(damaged)}; expected it as it was written")
     return Contents(tensors, header)
 
 
@@ -142,17 +129,12 @@ def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
 
 
 def checked(value: Any, kind: Any, where: str) -> Any:
-    """A JSON value by a type annotation.
+    """A JSON value, if it is of a type; else an InputError. Numbers are finite, whole ones below 2^53.
 
     Args:
         kind: int, float, str, bool, None, Any, a Literal, a union, a sequence or mapping of these, or a
             NamedTuple, for a mapping with exactly its fields. A module is a mapping.
         where: names the value in messages.
-
-    Convention: numbers are finite, whole ones below 2^53.
-
-    Raises:
-        InputError: naming what is of another type.
 
     Example:
         >>> checked([4, 4], tuple[int, int], "block")

@@ -25,12 +25,11 @@ class PlaceMap(nn.Module, ABC):
     Attributes:
         kind: a name of the kind, stored with the map.
         state: type of what `get_extra_state` gives, by which a file is checked: a NamedTuple of its entries.
-        places: N, the number of places. dimension: D, features per frame.
-        positions: (F,) float32, how many even steps each reference frame lies from the first place of its
-            route, if frames were resampled (section IV-B); (0,) if place i is reference frame i.
-        visits: (V,2) int32, runs of places and how many visits each of these is the mean of; (0,2) if all are
-            of one.
-        routes: of a merged map, in order; () for one route. Places and frames then count through all of them.
+        places, dimension: N, and D features per frame.
+        positions: (F,) float32, even steps of each reference frame from the first place of its route, if
+            resampled (section IV-B); (0,) if place i is reference frame i.
+        visits: (V,2) int32, runs of places and how many visits they are the mean of; (0,2) if all are of one.
+        routes: of a merged map, in order, else (). Places and frames count through all of them.
 
     Shape: queries (Q,D) -> scores (Q,N), lower is better, +inf where nothing covers a place.
 
@@ -75,8 +74,7 @@ class PlaceMap(nn.Module, ABC):
     def score_blocks(
         self, queries: Tensor, start: int = 0, stop: int | None = None
     ) -> Iterator[tuple[int, Tensor]]:
-        """Scores of the places [start, stop) alone, as `scores` has them: the first place and (Q,n) scores of
-        one block after another, as many as the kind of map makes at a time."""
+        """The columns [start, stop) of `scores`, block by block: its first place, and (Q,n) scores."""
         yield start, self.scores(queries)[:, start:stop]
 
     @property
@@ -85,11 +83,8 @@ class PlaceMap(nn.Module, ABC):
         return self.places
 
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The lowest score of each query and the first place that has it, without gradient, if the map finds
-        them in less time than all scores.
-
-        Shape: (Q,D) -> (Q,) and (Q,) int64, -1 where no place has a finite score; else None.
-        """
+        """The lowest score of each query (Q,) and the first place that has it (Q,), -1 if none is finite;
+        without gradient. None if that takes as long as all scores."""
         return None
 
     @property
@@ -142,11 +137,7 @@ class PlaceMap(nn.Module, ABC):
         return {"kind": self.kind, "places": self.places, "dimension": self.dimension, **self.settings()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take over what `get_extra_state` gave.
-
-        Raises:
-            InputError: a state of another kind, or of other settings.
-        """
+        """Take over what `get_extra_state` gave; another kind or other settings are an InputError."""
         if not isinstance(state, dict):
             raise InputError(f"the map's state is a {type(state).__name__}; expected its kind and settings")
         for name, value in {"kind": self.kind, **self.settings()}.items():
@@ -167,17 +158,14 @@ class PlaceMap(nn.Module, ABC):
         try:
             if prefix + EXTRA in state_dict:  # before any tensor is touched
                 self.set_extra_state(state_dict[prefix + EXTRA])
-                for name in OPTIONAL:
-                    if name in self._buffers and name not in self._non_persistent_buffers_set:
-                        state_dict.setdefault(prefix + name, getattr(self, name)[:0])
             for name, own in [*self.named_buffers(recurse=False), *self.named_parameters(recurse=False)]:
                 trained = isinstance(own, nn.Parameter)  # one that holds something keeps its shape
                 if prefix + name in state_dict and not (trained and own.numel()):
                     new = torch.empty_like(state_dict[prefix + name], device=own.device)
                     setattr(self, name, nn.Parameter(new) if trained else new)
             super()._load_from_state_dict(state_dict, prefix, *args)
-            self.loaded()
             self.check()
+            self.loaded()
         except InputError:  # a state that is refused leaves the map as it was
             self.__dict__.clear()
             self.__dict__.update(before)
@@ -193,10 +181,12 @@ class PlaceMap(nn.Module, ABC):
 
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load what `packed` and `get_extra_state` gave; an InputError names tensors that are missing."""
-        missing = sorted(self.state_dict().keys() - tensors.keys() - {EXTRA, *OPTIONAL})
+        own = self.state_dict()
+        missing = sorted(own.keys() - tensors.keys() - {EXTRA, *OPTIONAL})
         if missing:
             raise InputError(f"it does not hold the map's {', '.join(missing)}")
-        self.load_state_dict({**tensors, EXTRA: extra})
+        optional = {name: own[name][:0] for name in OPTIONAL if name in own}
+        self.load_state_dict({**optional, **tensors, EXTRA: extra})
 
 
 class Mapper(nn.Module, ABC):
@@ -221,8 +211,7 @@ class Mapper(nn.Module, ABC):
         """A map without places, which can load any map of this mapper."""
 
     def with_overhead(self, overhead: int, ready: bool = False) -> Mapper:
-        """The mapper that leaves room in its budget, if any, for bytes that a file holds of the places beside
-        the map.
+        """The mapper that leaves room in its budget, if any, for bytes of a file that grow with the places.
 
         Args:
             ready: whether the descriptors are of ready features, not of frames.

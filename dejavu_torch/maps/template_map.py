@@ -17,14 +17,12 @@ from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.summary import MapSummary, summarise
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
-from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
-PLACE_BYTES = 16  # per place, while a query is scored
 PHASE_COST = 8  # of a phase of two layers that are searched, in places that are scored in the same time
 SEARCH_COST = 2**15  # of any search, in the same unit
 
@@ -155,14 +153,11 @@ class TemplateMap(PlaceMap):
         self.register_buffer("weights", torch.zeros(0) if weights is None else weights.float())
         self.register_buffer("lap_phases", torch.zeros(0, dtype=torch.int64), persistent=False)
         self.to(numbers.device)
-        self.loaded()
         self.check()
+        self.loaded()
 
     def loaded(self) -> None:
         """Derive the plan, its segments and the phases of each layer from the buffers."""
-        problem = self._plan_problem()
-        if problem:
-            raise InputError(f"the map does not fit together: {problem}")
         index = self.feature_index.split(self.feature_ptr.diff().tolist())
         self.plan: Plan = tuple(
             FrequencyLayer(Fraction(a, b), phases, start, stop, tuple(features.tolist()))
@@ -176,30 +171,28 @@ class TemplateMap(PlaceMap):
             )
         # phases repeat after as many places as the numerator of the period
         self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
-        check_room(PLACE_BYTES * (self.places + sum(self.laps)), f"a map of {self.places} places")
         pairs = zip(self.plan, self.laps, strict=True)
         phases = [layer.phase(torch.arange(layer.start, layer.start + lap)) for layer, lap in pairs]
         self.lap_phases = torch.cat([torch.zeros(0, dtype=torch.int64), *phases]).to(self.layers.device)
         self.segments = tuple(segments(self.plan, self.places))
 
-    def _plan_problem(self) -> str:
+    def disagreement(self) -> str:
         count, last = self.layers.numel() // 5, self.feature_index.numel()
         shapes = {"layers": (count, 5), "feature_ptr": (count + 1,), "feature_index": (last,)}
         for name, shape in shapes.items():
             buffer = getattr(self, name)
             if buffer.shape != shape or buffer.dtype not in (torch.int32, torch.int64):
                 return f"{name} {tuple(buffer.shape)} {buffer.dtype}; expected {shape} int32 or int64"
-        pointer = self.feature_ptr.tolist()
-        if pointer != sorted(pointer) or (pointer[0], pointer[-1]) != (0, last):
+        sizes = self.feature_ptr.diff()
+        if bool((sizes < 0).any()) or (int(self.feature_ptr[0]), int(self.feature_ptr[-1])) != (0, last):
             return f"feature_ptr does not rise from 0 to {last}"
-        return "a period with a denominator below 1" if bool((self.layers[:, 1] < 1).any()) else ""
-
-    def disagreement(self) -> str:
-        numbers = sum(layer.phases * len(layer.features) for layer in self.plan)
-        for name, sizes in (("templates", [numbers]), ("weights", [self.dimension, 0])):
+        if bool((self.layers[:, 1] < 1).any()):
+            return "a period with a denominator below 1"
+        numbers = int((self.layers[:, 2] * sizes).sum())
+        for name, lengths in (("templates", [numbers]), ("weights", [self.dimension, 0])):
             values = getattr(self, name)
-            if values.ndim != 1 or len(values) not in sizes:
-                return f"{name} {tuple(values.shape)}; expected {' or '.join(f'({n},)' for n in sizes)}"
+            if values.ndim != 1 or len(values) not in lengths:
+                return f"{name} {tuple(values.shape)}; expected {' or '.join(f'({n},)' for n in lengths)}"
             if not values.is_floating_point() or not values.isfinite().all():
                 return f"{name} that are not finite floats"
         T = self.temperature
@@ -357,7 +350,7 @@ class TemplateMap(PlaceMap):
 
     def extra_repr(self) -> str:
         sizes = f"places={self.places}, dimension={self.dimension}, layers={len(self.plan)}"
-        return f"{sizes}, template_numbers={self.templates.numel()}, {_settings(self)}"
+        return f"{sizes}, template_numbers={self.templates.numel()}, metric={self.metric!r}"
 
 
 def _along(distances: Tensor, lap: Tensor, first: int, count: int) -> Tensor:
@@ -370,10 +363,6 @@ def _along(distances: Tensor, lap: Tensor, first: int, count: int) -> Tensor:
         return distances.index_select(1, lap[first : first + count])
     lap = lap.roll(-first) if first else lap
     return distances.index_select(1, lap).repeat(1, -(-count // len(lap)))[:, :count]
-
-
-def _settings(one: TemplateMap | TemplateMapper) -> str:
-    return f"metric={one.metric!r}, reduction={one.reduction!r}, temperature={one.temperature}"
 
 
 class TemplateMapper(Mapper):
@@ -437,4 +426,4 @@ class TemplateMapper(Mapper):
         return route
 
     def extra_repr(self) -> str:
-        return _settings(self)
+        return f"metric={self.metric!r}, reduction={self.reduction!r}, temperature={self.temperature}"

@@ -100,11 +100,8 @@ def packed(module: nn.Module) -> dict[str, Tensor]:
 
 
 def unpacked(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors of a file; below a prefix, products in place of whole numbers and scales.
-
-    Raises:
-        InputError: numbers that `quantised` does not return.
-    """
+    """The tensors of a file; below a prefix, products in place of whole numbers and scales that `quantised`
+    returned; others are an InputError."""
     found = dict(tensors)
     for name in tensors:
         if name.startswith(prefix) and name + SCALE in tensors:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from itertools import count
-from typing import NamedTuple
 
 import numpy as np
 
@@ -36,32 +35,25 @@ def shared_factor(a: Fraction | int, b: Fraction | int) -> Fraction:
     return Fraction(math.gcd(a.numerator, b.numerator), math.lcm(a.denominator, b.denominator))
 
 
-class Support(NamedTuple):
-    """How whole periods support each other over a route.
+def support_of(periods: Sequence[int], places: int) -> tuple[int, int]:
+    """How whole periods >= 1 support each other over a route of at least 3 places.
 
-    code_distance: in how many layers any two places differ at least, the Hamming distance of their residue
-        code, which survives (code_distance - 1) // 2 wrong layers.
-    torus_distance: least sum over layers of min(D mod tau, tau - D mod tau) for places D > 1 apart.
+    Returns:
+        The code distance, in how many layers any two places differ at least: (code distance - 1) // 2 wrong
+        layers are survived. The torus distance, the least sum over layers of
+        min(D mod tau, tau - D mod tau) for places D > 1 apart.
 
     Source: R. W. Watson and C. W. Hastings, Self-checked computation using residue arithmetic, Proc. IEEE
         54 (1966).
-    """
-
-    code_distance: int
-    torus_distance: int
-
-
-def support_of(periods: Sequence[int], places: int) -> Support:
-    """The mutual support of whole periods, each at least 1, over a route of at least 3 places.
 
     Example:
         >>> support_of([4, 5, 7], 100)
-        Support(code_distance=1, torus_distance=1)
+        (1, 1)
     """
     tau = np.array(periods)[:, None]
     phase = np.arange(1, places) % tau  # of every difference D
     around = np.minimum(phase, tau - phase).sum(0)
-    return Support(int((phase != 0).sum(0).min()), int(around[1:].min()))
+    return int((phase != 0).sum(0).min()), int(around[1:].min())
 
 
 def supportive_periods(places: int) -> tuple[int, ...]:

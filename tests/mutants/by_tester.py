@@ -43,8 +43,8 @@ MUTANTS = [
     Mutant(
         "Small l2 distances between large features are kept.",
         "dejavu_torch/maps/distance.py",
-        'compute_mode="donot_use_mm_for_euclid_dist"',
-        'compute_mode="use_mm_for_euclid_dist"',
+        'else 2.0, "donot_use_mm_for_euclid_dist"',
+        'else 2.0, "use_mm_for_euclid_dist"',
         ("tests/maps/test_distance.py::test_small_distances_between_large_features_are_kept",),
     ),
     Mutant(
