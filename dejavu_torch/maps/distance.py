@@ -75,8 +75,8 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
 def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
     """L1 distances by the compiled loop: (Q,F), (P,F) -> (Q,P); None if torch has to compute them.
 
-    Torch does so for gradients and whatever else follows or traces operations (vmap, torch.compile, export),
-    on other devices and dtypes, for few templates, and without numba.
+    That is for gradients and whatever else follows or traces operations (vmap, torch.compile, export), on
+    other devices and dtypes, for few templates, and without numba.
 
     Convention: a pair is summed in one order wherever it stands: a query alone has the distances, to the bit,
         that it has in a batch, and equal templates have equal distances.
@@ -134,10 +134,8 @@ def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
 
 
 def _distances(query: Floats, templates: Floats, out: Floats) -> None:
-    """Four templates at a time, so that each number of a query is loaded once for all four; compiled only.
-
-    The last block repeats the last template, so that every pair is summed in the same order.
-    """
+    """Four templates at a time, so that each number of a query is loaded once for all four; the last block
+    repeats the last template, so that every pair is summed in the same order."""
     last = len(templates) - 1
     for a in range(0, len(templates), 4):
         b, c, d = min(a + 1, last), min(a + 2, last), min(a + 3, last)

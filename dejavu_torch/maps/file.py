@@ -31,7 +31,7 @@ SHOWN = 60  # characters of a value in a message
 
 
 class Contents(NamedTuple):
-    """tensors: by name, which begins with its part and a dot. header: JSON values."""
+    """Tensors by their names, which begin with a part of the model and a dot, and a header of JSON values."""
 
     tensors: dict[str, Tensor]
     header: dict[str, Any]
@@ -73,8 +73,7 @@ def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any])
 def _sealed(
     tensors: Mapping[str, Tensor], header: dict[str, Any]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors with memory of their own, as safetensors needs, and metadata of one entry, as it writes several
-    in any order."""
+    """Tensors with memory of their own, as safetensors needs, and one entry of metadata: it mixes several."""
     plain: dict[str, Tensor] = {}
     owners: set[int] = set()
     for name, tensor in tensors.items():

@@ -17,11 +17,9 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
 
     The score of place i is (one[i mod tau1] + other[i mod tau2]) / divisor. Among the places r, r + tau1,
     r + 2 tau1, ... the longer layer has one distance, and those of the shorter one are a window that slides
-    along a circle of its residues: O(tau1 + tau2) for any number of places. Rounded sums are equal more often
-    than their terms are, so the first of equal scores is sought among all r that reach the lowest.
-
-    Args:
-        one, other: distances of each layer at its first tau places. places: at least the longer tau.
+    along a circle of its residues: O(tau1 + tau2) for any number of places, which is at least the longer tau.
+    Rounded sums are equal more often than their terms are, so the first of equal scores is sought among all r
+    that reach the lowest.
 
     Shape: (Q,tau1), (Q,tau2) -> (Q,), (Q,) int64; `places` if no score is finite.
 
@@ -67,9 +65,8 @@ def _circles(outer: int, inner: int, device: torch.device) -> tuple[Tensor, Tens
 
 
 def sliding_minimum(values: Tensor, width: int) -> Tensor:
-    """The lowest of each value and the width - 1 after it, around the circle of the last dimension.
-
-    O(n) for any width: every window is the end of one block of `width` values and the beginning of the next.
+    """The lowest of each value and the width - 1 after it, around the circle of the last dimension, in O(n):
+    every window is the end of one block of `width` values and the beginning of the next.
 
     Source: M. van Herk, A fast algorithm for local minimum and maximum filters on rectangular and octagonal
         kernels, Pattern Recognition Letters 13 (1992).

@@ -38,20 +38,11 @@ class TemplateState(NamedTuple):
     temperature: float | None
 
 
-class Segment(NamedTuple):
-    """Places [start, stop) that the same layers cover, by their positions in the plan."""
-
-    start: int
-    stop: int
-    layers: tuple[int, ...]
-
-
-def segments(plan: Plan, places: int) -> Iterator[Segment]:
-    """Cut 0..places at every start and stop of a layer: within a segment L of eq. 4 is constant."""
+def segments(plan: Plan, places: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
+    """Places [start, stop) that the same layers cover, and these, L of eq. 4, as positions in the plan."""
     cuts = sorted({0, places, *(layer.start for layer in plan), *(layer.stop for layer in plan)})
     for start, stop in pairwise(cuts):
-        members = (j for j, layer in enumerate(plan) if layer.start <= start and stop <= layer.stop)
-        yield Segment(start, stop, tuple(members))
+        yield start, stop, tuple(j for j, layer in enumerate(plan) if layer.start <= start < layer.stop)
 
 
 def weight_per_feature(metric: Metric, features: int) -> float:
@@ -62,8 +53,8 @@ def weight_per_feature(metric: Metric, features: int) -> float:
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
     """How unlikely each place is, in nats: -log softmax(-S / T) over places; (Q,N) -> (Q,N), lower is better.
 
-    It keeps the order of places and makes the scores of different queries comparable: what no template
-    explains raises S at all places, and this not at all. A place that scores +inf stays +inf.
+    It makes the scores of different queries comparable: what no template explains raises S at all places, and
+    this not at all. A place that scores +inf stays +inf.
 
     Example:
         >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()
@@ -79,16 +70,15 @@ def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
 class TemplateMap(PlaceMap):
     """A route in sum(P x F) template numbers instead of N x D, and the L1 matcher of section III-B.
 
-    Buffers (compressed sparse rows; their size is the storage claim):
+    Buffers, the tensors of a file:
         layers: (L,5) int64, period numerator, period denominator, phases, start, stop.
         feature_ptr, feature_index: (L+1,) int64, where each layer's features begin in (sum F,) int32.
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
         weights: (D,) float, the factor of each feature's difference in eq. 3; (0,) for 1.
 
     Args:
-        plan: the layers.
-        templates: one (P,F) tensor per layer, as `PhaseTemplates` gives them; they may carry gradients.
-        places: N, frames of the reference traverse. dimension: D, features per frame.
+        plan, templates: the layers, and a tensor (P,F) for each, as `PhaseTemplates` gives them.
+        places, dimension: N, and D features per frame.
         metric: distance of eq. 3, see `phase_distances`.
         reduction: "sum" is eq. 4 as printed. "mean" divides it by the number of features summed over (l2:
             their roots, cosine: the layers), so that places are comparable whatever covers them.
@@ -101,8 +91,7 @@ class TemplateMap(PlaceMap):
         features: |w H - w mu| = w |H - mu|. Gradients reach the queries and the templates.
 
     Raises:
-        InputError: templates that do not fit the plan, an unknown metric or reduction, a temperature of 0 or
-            less; scores: features of another dimension.
+        InputError: arguments that do not fit together or are unknown; scores: features of another dimension.
 
     Example:
         >>> plan = (FrequencyLayer(2, 2, 0, 3, (0,)),)
@@ -166,9 +155,8 @@ class TemplateMap(PlaceMap):
         check_plan(self.plan, self.places, self.dimension)
         covered = sum(layer.stop - layer.start for layer in self.plan)
         if max(self.places, covered) > MAX_PLACES:
-            raise InputError(
-                f"a map of {self.places} places, {covered} in all layers; expected at most {MAX_PLACES}"
-            )
+            seen = f"a map of {self.places} places, {covered} in all layers"
+            raise InputError(f"{seen}; expected at most {MAX_PLACES}")
         # phases repeat after as many places as the numerator of the period
         self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
         pairs = zip(self.plan, self.laps, strict=True)
@@ -229,9 +217,8 @@ class TemplateMap(PlaceMap):
     def distances(self, queries: Tensor, layers: Sequence[int] | None = None) -> list[Tensor]:
         """Eq. 3 for every layer, or for some by their positions in the plan: (Q,D) -> L tensors (Q,P)."""
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
-            raise InputError(
-                f"the query features are {tuple(queries.shape)}; the map expects (Q, {self.dimension})"
-            )
+            seen = f"the query features are {tuple(queries.shape)}"
+            raise InputError(f"{seen}; the map expects (Q, {self.dimension})")
         queries, features, blocks = self.weighted(queries), self.layer_features(), self.blocks()
         return [
             phase_distances(queries.index_select(1, features[j]), blocks[j], self.metric)
@@ -273,8 +260,7 @@ class TemplateMap(PlaceMap):
             yield start, self.scores(queries)[:, start:stop]
 
     def _scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
-        inside = (one.layers for one in self.segments if one.start < stop and one.stop > start)
-        members = sorted({j for layers in inside for j in layers})
+        members = [j for j, layer in enumerate(self.plan) if layer.start < stop and layer.stop > start]
         found = dict(zip(members, self.distances(queries, members), strict=True))
         if not found:
             dtype = torch.promote_types(queries.dtype, torch.float32)
@@ -286,7 +272,7 @@ class TemplateMap(PlaceMap):
     @property
     def block_places(self) -> int:
         """See `PlaceMap`: a number for each place in each layer of a segment."""
-        return self.places * max([1, *(len(segment.layers) for segment in self.segments)])
+        return self.places * max([1, *(len(layers) for _, _, layers in self.segments)])
 
     @torch.no_grad()
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -307,9 +293,6 @@ class TemplateMap(PlaceMap):
 
         Args:
             start: (D,) the weights to begin with if the map has none; None or (0,) is 1 for every feature.
-
-        Raises:
-            InputError: a start of another shape.
         """
         self.freeze()
         if weights and not len(self.weights):
@@ -324,10 +307,7 @@ class TemplateMap(PlaceMap):
                 setattr(self, name, nn.Parameter(getattr(self, name).detach().clone()))
 
     def freeze(self) -> None:
-        """Make buffers of what was trained.
-
-        Convention: |w H - mu| is the same with both signs turned, so no weight is left below 0.
-        """
+        """Make buffers of what was trained; no weight is left below 0, since |w H - mu| = |-w H + mu|."""
         for name, parameter in list(self.named_parameters()):
             delattr(self, name)
             self.register_buffer(name, parameter.detach().clone())
@@ -354,10 +334,7 @@ class TemplateMap(PlaceMap):
 
 
 def _along(distances: Tensor, lap: Tensor, first: int, count: int) -> Tensor:
-    """Distances of a layer at `count` of its places, from `first` on: (Q,P) -> (Q,count).
-
-    lap: phases of its first places, until they repeat.
-    """
+    """Distances of a layer at `count` of its places, whose phases repeat after a lap: (Q,P) -> (Q,count)."""
     first %= len(lap)
     if first + count <= len(lap):
         return distances.index_select(1, lap[first : first + count])
@@ -369,13 +346,11 @@ class TemplateMapper(Mapper):
     """The paper's mapper (section III-A): layers of what repeats, and a template for each of their phases.
 
     Args:
-        periods: finds the layers; None is `SpectrogramAnalysis` with its defaults.
+        periods: finds the layers, without gradient; None is `SpectrogramAnalysis` with its defaults.
         metric, reduction, temperature: of the maps, see `TemplateMap`.
         trainable: make the templates nn.Parameters, to be fine-tuned, instead of buffers.
 
-    Shape: features (N,D) -> TemplateMap of N places; without layers, all places +inf, if nothing repeats.
-
-    Convention: periods get no gradient; the templates do, if gradients are enabled.
+    Shape: features (N,D) -> TemplateMap of N places; if nothing repeats, all places score +inf.
 
     Raises:
         InputError: see `TemplateMap`, and what `periods` refuses.
@@ -398,9 +373,8 @@ class TemplateMapper(Mapper):
     ) -> None:
         super().__init__()
         if periods is not None and not isinstance(periods, PeriodFinder):
-            raise InputError(
-                f"periods is a {type(periods).__name__}; expected a PeriodFinder such as SpectrogramAnalysis"
-            )
+            seen = f"periods is a {type(periods).__name__}"
+            raise InputError(f"{seen}; expected a PeriodFinder such as SpectrogramAnalysis")
         self.trainable = trainable
         self.periods: PeriodFinder | None = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature

@@ -30,10 +30,7 @@ Bin = TypeVar("Bin", int, Tensor)
 
 
 class Spectrum(NamedTuple):
-    """Power of every feature at every frequency of one chunk [start, stop), n = stop - start places.
-
-    power: (n // 2 + 1, D); bin k is the frequency k / n per place, the period n / k places.
-    """
+    """Power (n // 2 + 1, D) of each feature in a chunk [start, stop) of n places; bin k is period n / k."""
 
     start: int
     stop: int
@@ -58,15 +55,13 @@ def chunk_power(chunk: Tensor) -> Tensor:
 
 
 def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", "local"]) -> Tensor:
-    """The `count` strongest bins of each feature among bins 2..last, strongest first (section III-A).
+    """The `count` strongest bins of each feature among bins 2..last with power, strongest first.
 
     Args:
         peaks: "bins" ranks all bins; "local" only local maxima, so that the leakage of a peak into the next
             bin is no second period.
 
-    Shape: (K,D) -> (count,D) int64, -1 if a feature has no more such bins.
-
-    Convention: a bin without power is no candidate; of equal bins the lower one wins.
+    Shape: (K,D) -> (count,D) int64, -1 if a feature has no more such bins; of equal bins the lower one wins.
     """
     candidates = torch.zeros_like(power, dtype=torch.bool)
     candidates[2 : last + 1] = power[2 : last + 1] > 0
@@ -80,7 +75,7 @@ def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", 
 
 
 def bin_period(length: int, k: Bin) -> Bin:
-    """Period, in whole places, of bin k of a spectrum over `length` places: round(length / k), halves up.
+    """Period of bin k of a spectrum over `length` places, in whole places: round(length / k), halves up.
 
     Example:
         >>> bin_period(1024, 11), bin_period(1024, 6)  # the paper's two periods
@@ -90,10 +85,8 @@ def bin_period(length: int, k: Bin) -> Bin:
 
 
 def layers_of(bins: Tensor, start: int, stop: int) -> list[FrequencyLayer]:
-    """Layers of the chunk [start, stop) by increasing period: features of equal `bin_period` share one.
-
-    Shape: bins (count,D), the strongest of each feature, -1 for none -> layers, phases = period.
-    """
+    """Layers of the chunk [start, stop) by the strongest bins (count,D) of each feature, -1 for none: by
+    increasing period, features of equal `bin_period` share one."""
     rank, feature = (bins > 0).nonzero(as_tuple=True)
     period = bin_period(stop - start, bins[rank, feature])
     return [
@@ -120,8 +113,8 @@ class SpectrogramAnalysis(PeriodFinder):
     """Which features repeat, where and how often, by the spectrogram of each (section III-A).
 
     Args:
-        window: places per spectrum, the length of a chunk.
-        hop: places from one chunk to the next; None is `window`.
+        window: places per spectrum, the length of a chunk. hop: places from one chunk to the next; None is
+            `window`.
         min_period: shortest period, in places. The longest is half the window, bin 2: bins 0 and 1 hold mean
             and slow drift.
         strongest: how many frequencies a feature keeps.
@@ -130,15 +123,15 @@ class SpectrogramAnalysis(PeriodFinder):
             passes, whether it repeats or not. None: every chunk gets layers (the paper).
         short: for a route shorter than the window: "shrink" the window and log that, or "refuse".
 
-    Shape: features (N,D) -> tuple of G spectra, one for each chunk, each (n // 2 + 1, D).
+    Shape: features (N,D) -> tuple of G spectra, one for each chunk.
 
     Convention: Hann window, not centred. The places after the last whole window are a shorter chunk, left out
         if they are fewer than two of the shortest periods. A feature that is constant in a chunk has no power
         there. A chunk too short to pass `false_alarm` is logged.
 
     Raises:
-        InputError: an argument out of range; features that are not float (N,D) or not finite; a route shorter
-            than two of the shortest periods, or than the window if `short` is "refuse".
+        InputError: an argument out of range; features that are not finite floats (N,D); a route that is too
+            short.
 
     Example:
         >>> wave = torch.sin(torch.arange(256) * 2 * torch.pi / 32)[:, None]
@@ -177,10 +170,8 @@ class SpectrogramAnalysis(PeriodFinder):
         """The chunks [start, stop) of a route of so many places."""
         shortest = 2 * self.min_period
         if places < shortest:
-            raise InputError(
-                f"the route has {places} place{'s' * (places != 1)}; expected at least {shortest}, "
-                f"two periods of {self.min_period}"
-            )
+            seen = f"the route has {places} place{'s' * (places != 1)}"
+            raise InputError(f"{seen}; expected at least {shortest}, two periods of {self.min_period}")
         if places < self.window and self.short == "refuse":
             raise InputError(
                 f"the route has {places} places; expected at least {self.window}, the window, "
@@ -199,7 +190,7 @@ class SpectrogramAnalysis(PeriodFinder):
 
     @torch.no_grad()
     def plan(self, features: Tensor) -> Plan:
-        """The layers of a route, by chunk and then by period, without gradient: features (N,D) -> plan."""
+        """See `PeriodFinder`; by chunk and then by period."""
         layers: list[FrequencyLayer] = []
         chunks = self._chunks_of(features)
         if len(features) < self.window:
@@ -211,11 +202,10 @@ class SpectrogramAnalysis(PeriodFinder):
         return tuple(layers)
 
     def _chunks_of(self, features: Tensor) -> list[tuple[int, int]]:
-        seen = f"a {type(features).__name__}"
-        if isinstance(features, Tensor):
-            seen = f"{tuple(features.shape)} {features.dtype}"
-            if features.ndim == 2 and features.is_floating_point():
-                return self.chunks(len(features))
+        known = isinstance(features, Tensor)
+        if known and features.ndim == 2 and features.is_floating_point():
+            return self.chunks(len(features))
+        seen = f"{tuple(features.shape)} {features.dtype}" if known else f"a {type(features).__name__}"
         raise InputError(f"spectrogram got {seen}; expected a float tensor (N,D)")
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:

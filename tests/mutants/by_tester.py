@@ -8,7 +8,7 @@ MUTANTS = [
     Mutant(
         "A layer covers the last place of its chunk.",
         "dejavu_torch/maps/template_map.py",
-        "if layer.start <= start and stop <= layer.stop",
+        "if layer.start <= start < layer.stop",
         "if layer.start <= start and stop < layer.stop",
         ("tests/maps/test_scores.py::-k segments or convention_1 or uncovered",),
     ),
