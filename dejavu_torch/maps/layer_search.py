@@ -72,9 +72,9 @@ def sliding_minimum(values: Tensor, width: int) -> Tensor:
         kernels, Pattern Recognition Letters 13 (1992).
     """
     size = values.shape[-1]
-    blocks = -(-(size + width - 1) // width)
-    around = torch.arange(blocks * width, device=values.device) % size
-    parts = values.index_select(-1, around).unflatten(-1, (-1, width))
+    length = -(-(size + width - 1) // width) * width
+    turns = torch.cat([values] * -(-length // size), -1)
+    parts = turns[..., :length].unflatten(-1, (-1, width))
     from_start = parts.cummin(-1).values.flatten(-2)
     to_end = parts.flip(-1).cummin(-1).values.flip(-1).flatten(-2)
     return torch.minimum(to_end[..., :size], from_start[..., width - 1 : width - 1 + size])
