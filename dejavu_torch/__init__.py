@@ -5,7 +5,7 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
 
     III    the whole method                      DejaVu              model
     III-A  spectrogram, two strongest periods    SpectrogramAnalysis periods.spectrogram
-    III-A  layers of features of like period     FrequencyLayer      types, periods.layers
+    III-A  layers of features of like period     FrequencyLayer      types, periods.spectrogram
     eq. 2  phase masks M(i, tau, k)              phase_mask          maps.templates
     eq. 1  templates mu(H, tau, k)               PhaseTemplates      maps.templates
            the map they make                     TemplateMapper      maps.template_map

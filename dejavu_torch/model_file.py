@@ -32,7 +32,6 @@ from dejavu_torch.maps.file import (
     checked_fields,
     checksums,
     digests,
-    json_values,
     map_size,
     part_of,
     read_map,
@@ -247,10 +246,6 @@ def write_model(path: Path, model: Any) -> None:
     tensors, header = contents(model)
     checked_fields(header, HEADER, "the model")  # what is written can be read
     checked(header["map"], model.map.state, "the map")
-    try:
-        json_values(json.dumps(header))
-    except ValueError as error:
-        raise InputError(f"the model cannot be written: {error}") from error
     write_map(path, tensors, header)
 
 

@@ -186,7 +186,7 @@ def test_imports_point_one_way(file: Path) -> None:
     ("file", "source"),
     [
         ("types.py", "import dejavu_torch.data.files"),
-        ("features/hog.py", "from dejavu_torch.periods.layers import cluster_layers"),
+        ("features/hog.py", "from dejavu_torch.periods.spectrogram import layers_of"),
         ("features/hog.py", "from dejavu_torch import periods"),
         ("features/hog.py", "from dejavu_torch import HOG"),
         ("features/hog.py", "import dejavu_torch"),

@@ -137,11 +137,6 @@ def test_an_l1_mean_state_goes_into_no_other(settings: tuple[Any, Any]) -> None:
     assert (other.places, other.plan) == (0, ())
 
 
-def test_a_template_map_is_not_extended() -> None:
-    with refused("'templates'", "cannot be extended"):
-        TemplateMap((), (), 5, 2).extend(torch.rand(3, 2))
-
-
 def test_frames_and_places_are_one_another_where_nothing_is_resampled() -> None:
     route = TemplateMap((), (), 5, 2)
     some = torch.tensor([[0, 4], [-1, 2]])

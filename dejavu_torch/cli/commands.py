@@ -752,9 +752,9 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         map: map file
         features: class of the map's features, if not ours
     """
+    from dejavu_torch.maps.distance import l1_backend
     from dejavu_torch.maps.file import FORMAT
-    from dejavu_torch.maps.l1 import l1_backend
-    from dejavu_torch.periods.stft import BACKEND
+    from dejavu_torch.periods.spectrogram import BACKEND
 
     model = DejaVu.load(map, features)
     print_map(model)

@@ -27,8 +27,7 @@ from dejavu_torch.evaluation.plots import Plot
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.hog import HOG, hog
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.maps.distance import phase_distances
-from dejavu_torch.maps.l1 import l1_backend
+from dejavu_torch.maps.distance import l1_backend, phase_distances
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu

@@ -36,7 +36,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import calibrate_if_possible
-from dejavu_torch.maps.l1 import l1_backend
+from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
@@ -44,7 +44,7 @@ from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
-from dejavu_torch.periods.stft import BACKEND
+from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Matching, lengths_beside
 from dejavu_torch.recognition.select import check_candidates

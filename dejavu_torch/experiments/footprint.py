@@ -31,7 +31,7 @@ from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.experiments.bench import MEMORY, Row, bars, peak_memory, resident, write_bench
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.maps.l1 import l1_backend
+from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu

@@ -48,7 +48,7 @@ from dejavu_torch.experiments.scale_contenders import (
 from dejavu_torch.experiments.scale_report import RECALL, ScaleRow, exponents, pictured, with_ratios
 from dejavu_torch.experiments.template_search import PLACES as TEMPLATES
 from dejavu_torch.experiments.template_search import bench_templates
-from dejavu_torch.maps import codec, l1
+from dejavu_torch.maps import codec, distance
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match
 
@@ -444,7 +444,7 @@ if __name__ == "__main__":
     what, given, place = json.loads(sys.argv[1])
     with suppress(ImportError):  # loaded ahead of what is measured, as are loops that numba compiles
         import faiss  # noqa: F401
-    for module in (codec, l1):
+    for module in (codec, distance):
         module._compiled()
     limit_memory()
     give_back()

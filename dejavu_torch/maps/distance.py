@@ -1,56 +1,52 @@
-"""Distance of a query to every phase of a layer (section III-B, eq. 3)."""
+"""Distance of a query to every phase of a layer (section III-B, eq. 3); L1 by a loop that numba compiles."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from typing import Literal
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Literal, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import forward_ad
+from torch.nn import Parameter
+from torch.nn.functional import normalize
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
-from dejavu_torch.maps.l1 import compiled_l1
+from dejavu_torch.maps.compiling import compiled
 from dejavu_torch.types import InputError
 
+log = logging.getLogger("dejavu_torch")
+
 Metric = Literal["l1", "l2", "cosine"]
+Floats = NDArray[np.float32]
 
-
-def _l1(query: Tensor, templates: Tensor) -> Tensor:
-    distances = compiled_l1(query, templates)
-    return torch.cdist(query, templates, p=1.0) if distances is None else distances
-
-
-def _l2(query: Tensor, templates: Tensor) -> Tensor:
-    # the matrix-product form loses the small distances that decide a match
-    return torch.cdist(query, templates, p=2.0, compute_mode="donot_use_mm_for_euclid_dist")
-
-
-def _cosine(query: Tensor, templates: Tensor) -> Tensor:
-    unit = torch.nn.functional.normalize
-    return 1 - unit(query, dim=-1) @ unit(templates, dim=-1).T
-
-
-METRICS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"l1": _l1, "l2": _l2, "cosine": _cosine}
+WORTH_COMPILING = 2**14  # P x F above which the loop is faster than torch even for one query
+QUERIES_AT_ONCE = 64  # they stay in cache while the templates stream by
+TASK = 2**23  # |a - b| for one thread at a time, about half a millisecond
 
 
 def check_metric(metric: Metric) -> None:
     """Refuse an unknown metric by an InputError."""
-    if metric not in [*METRICS]:
-        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(METRICS)}")
+    if metric not in get_args(Metric):
+        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(get_args(Metric))}")
 
 
 def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> Tensor:
     """Distance of each query to the template of each phase: eq. 3 for all k at once.
 
     Args:
-        query: H, the *query's* values of the layer's features.
-        templates: mu(H, tau, k).
-        metric: "l1" (the paper: sum over features of |H - mu|), "l2" (Euclidean) or "cosine"
-            (1 - cosine similarity).
+        query: H, the *query's* values of the layer's features. templates: mu(H, tau, k).
+        metric: "l1" (the paper: sum over features of |H - mu|), "l2" (Euclidean) or "cosine" (1 - cosine).
 
     Shape: (Q,F), (P,F) -> (Q,P).
 
-    Convention: computed in float32 at least, whatever the autocast, without a tensor Q x P x F. "l1" without
-        gradients on the CPU runs in a compiled loop where numba is installed, see `l1_backend`.
+    Convention: in float32 at least, whatever the autocast, without a tensor Q x P x F. On the CPU "l1"
+        without gradients runs in a compiled loop if numba is installed.
 
     Raises:
         InputError: tensors that are not (Q,F) and (P,F), or an unknown metric.
@@ -65,5 +61,100 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
             f"phase_distances got {tuple(query.shape)} and {tuple(templates.shape)}; expected (Q,F) and (P,F)"
         )
     dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
+    query, templates = query.to(dtype), templates.to(dtype)
     with torch.autocast(query.device.type, enabled=False):
-        return METRICS[metric](query.to(dtype), templates.to(dtype))
+        if metric == "cosine":
+            return 1 - normalize(query, dim=-1) @ normalize(templates, dim=-1).T
+        if metric == "l1" and (distances := compiled_l1(query, templates)) is not None:
+            return distances
+        # the matrix-product form of l2 loses the small distances that decide a match
+        p, mode = 1.0 if metric == "l1" else 2.0, "donot_use_mm_for_euclid_dist"
+        return torch.cdist(query, templates, p, compute_mode=mode)
+
+
+def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
+    """L1 distances by the compiled loop: (Q,F), (P,F) -> (Q,P); None if torch has to compute them.
+
+    That is for gradients and whatever else follows or traces operations (vmap, torch.compile, export), on
+    other devices and dtypes, for few templates, and without numba.
+
+    Convention: a pair is summed in one order wherever it stands: a query alone has the distances, to the bit,
+        that it has in a batch, and equal templates have equal distances.
+    """
+    if templates.numel() < WORTH_COMPILING:
+        return None
+    a, b = _floats(query), _floats(templates)
+    if a is None or b is None or (kernel := _compiled()) is None:
+        return None
+    out = np.empty((len(a), len(b)), np.float32)
+    rows = max(1, min(QUERIES_AT_ONCE, len(a)))
+    width = 4 * max(1, TASK // (4 * rows * a.shape[1]))
+    tasks = [
+        (a[q : q + rows], b[p : p + width], out[q : q + rows, p : p + width])
+        for q in range(0, len(a), rows)
+        for p in range(0, len(b), width)
+    ]
+    threads = min(torch.get_num_threads(), out.size * a.shape[1] // TASK)
+    if threads < 2:
+        for task in tasks:
+            kernel(*task)
+    else:  # new threads, so that a fork, or calls from several threads, do no harm
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(lambda task: kernel(*task), tasks))
+    return torch.from_numpy(out)
+
+
+def _floats(tensor: Tensor) -> Floats | None:
+    """The numbers of a float32 tensor on the CPU, or None if its operations are followed or traced."""
+    if (
+        torch.compiler.is_compiling()
+        or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+        or is_in_torch_dispatch_mode()
+        or type(tensor) not in (Tensor, Parameter)
+        or (tensor.device.type, tensor.dtype) != ("cpu", torch.float32)
+        or (tensor.requires_grad and torch.is_grad_enabled())
+        or forward_ad.unpack_dual(tensor).tangent is not None
+    ):
+        return None
+    try:
+        floats: Floats = tensor.detach().contiguous().numpy()
+        return floats
+    except (RuntimeError, TypeError):  # tensors of vmap have no memory, sparse ones no rows
+        return None
+
+
+@cache
+def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
+    signature = "void(float32[:,::1], float32[:,::1], float32[:,:])"
+    try:  # sums in any order, but not "nnan" and "ninf": NaN and infinity have to arrive
+        return compiled(_distances, signature, fastmath={"reassoc", "nsz", "contract"})
+    except Exception as error:  # a broken compiler must not break what works without one
+        log.info("L1 distances by torch, not by numba: %s", " ".join(str(error).split()))
+        return None
+
+
+def _distances(query: Floats, templates: Floats, out: Floats) -> None:
+    """Four templates at a time, so that each number of a query is loaded once for all four; the last block
+    repeats the last template, so that every pair is summed in the same order."""
+    last = len(templates) - 1
+    for a in range(0, len(templates), 4):
+        b, c, d = min(a + 1, last), min(a + 2, last), min(a + 3, last)
+        for q in range(len(query)):
+            in_a = in_b = in_c = in_d = np.float32(0)
+            for f in range(query.shape[1]):
+                value = query[q, f]
+                in_a += abs(value - templates[a, f])
+                in_b += abs(value - templates[b, f])
+                in_c += abs(value - templates[c, f])
+                in_d += abs(value - templates[d, f])
+            out[q, a], out[q, b], out[q, c], out[q, d] = in_a, in_b, in_c, in_d
+
+
+def l1_backend() -> Literal["numba", "torch"]:
+    """What computes large L1 distances on the CPU without gradients; the first call compiles the loop.
+
+    Example:
+        >>> l1_backend() in ("numba", "torch")
+        True
+    """
+    return "torch" if _compiled() is None else "numba"

@@ -6,6 +6,7 @@ import json
 import math
 import types
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from hashlib import blake2b
 from inspect import formatannotation
 from pathlib import Path
@@ -24,12 +25,13 @@ FORMAT = 10
 NAME = "dejavu_torch-map"
 ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
+EXPORT = "or `dejavu train export` of the checkpoint"
 HEADER = "header"  # the digest that is of no tensor
 SHOWN = 60  # characters of a value in a message
 
 
 class Contents(NamedTuple):
-    """tensors: by name, which begins with its part and a dot. header: JSON values."""
+    """Tensors by their names, which begin with a part of the model and a dot, and a header of JSON values."""
 
     tensors: dict[str, Tensor]
     header: dict[str, Any]
@@ -56,12 +58,11 @@ def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
 
 
 def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
-    """Write the file whole or not at all; the same tensors and header give the same bytes.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    plain, metadata = _sealed(tensors, header)
+    """Write the file whole or, with an InputError, not at all; the same contents give the same bytes."""
+    try:
+        plain, metadata = _sealed(tensors, header)
+    except ValueError as error:
+        raise InputError(f"{path} was not written: {error}") from error
     with whole_file(path) as temporary:
         try:
             safetensors.torch.save_file(plain, temporary, metadata)
@@ -72,10 +73,7 @@ def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any])
 def _sealed(
     tensors: Mapping[str, Tensor], header: dict[str, Any]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors with memory of their own, as safetensors needs, and the metadata.
-
-    The metadata are one entry, since safetensors writes several in any order.
-    """
+    """Tensors with memory of their own, as safetensors needs, and one entry of metadata: it mixes several."""
     plain: dict[str, Tensor] = {}
     owners: set[int] = set()
     for name, tensor in tensors.items():
@@ -90,27 +88,19 @@ def _sealed(
 
 
 def read_map(path: Path) -> Contents:
-    """Tensors and header of a map file, as they were written.
-
-    Raises:
-        InputError: missing, truncated, foreign, damaged, or of another format.
-    """
+    """Tensors and header as written; an InputError if the file is missing, truncated, foreign, damaged, or of
+    another format."""
     check_regular(path, EXPECTED)
     try:
         with path.open("rb") as file:
             if file.read(len(ZIP)) == ZIP:
-                raise InputError(
-                    f"{path} is a checkpoint or another archive; expected a map, as `dejavu train export` "
-                    "makes of a checkpoint"
-                )
+                raise InputError(f"{path} is a checkpoint or another archive; expected {EXPECTED}, {EXPORT}")
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
             if NAME not in metadata:
-                raise InputError(
-                    f"{path} is no map of dejavu_torch, or an old one; expected {EXPECTED}; of an old one, "
-                    "learn the route anew"
-                )
-            sealed = json_values(metadata[NAME])
+                problem = f"{path} is no map of dejavu_torch, or an old one"
+                raise InputError(f"{problem}; expected {EXPECTED}; of an old one, learn the route anew")
+            sealed = json.loads(metadata[NAME])
             version = sealed["version"]
             if version != FORMAT:
                 newer = isinstance(version, int) and version > FORMAT
@@ -119,57 +109,31 @@ def read_map(path: Path) -> Contents:
                     f"{path} has map format {version!r:.40}; this version reads {FORMAT}: {cure}"
                 )
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
-        header, sums = sealed[HEADER], sealed["checksums"]
+        header, sums = sealed[HEADER], dict(sealed["checksums"] or {})
         seen = checksums(tensors, header)
     except InputError:
         raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
-    if seen != sums:
-        known = sums if isinstance(sums, dict) else {}
-        damaged = sorted(part for part in {*seen, *known} if seen.get(part) != known.get(part))
-        raise InputError(
-            f"{path} is damaged: its {' and '.join(damaged)}; expected the file as it was written"
-        )
+    damaged = sorted(part for part in {*seen, *sums} if seen.get(part) != sums.get(part))
+    if damaged:
+        raise InputError(f"{path} is damaged: its {' and '.join(damaged)}; expected it as it was written")
     return Contents(tensors, header)
 
 
 def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     """The tensors of one part of a file, by their own names."""
-    return {
-        name.removeprefix(f"{part}."): one for name, one in tensors.items() if name.startswith(f"{part}.")
-    }
-
-
-def json_values(text: str) -> Any:
-    """JSON values, of finite numbers, whole ones below 2^53; else ValueError."""
-    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
-
-
-def _finite(text: str) -> float:
-    if not math.isfinite(float(text)):
-        raise ValueError(f"{text} is no finite number")
-    return float(text)
-
-
-def _whole(text: str) -> int:
-    if abs(int(text)) >= LARGEST:
-        raise ValueError(f"{text:.40} is no whole number below 2^53")
-    return int(text)
+    prefix = f"{part}."
+    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
 def checked(value: Any, kind: Any, where: str) -> Any:
-    """A JSON value by a type annotation.
+    """A JSON value, if it is of a type; else an InputError. Numbers are finite, whole ones below 2^53.
 
     Args:
         kind: int, float, str, bool, None, Any, a Literal, a union, a sequence or mapping of these, or a
             NamedTuple, for a mapping with exactly its fields. A module is a mapping.
         where: names the value in messages.
-
-    Convention: numbers are finite, whole ones below 2^53.
-
-    Raises:
-        InputError: naming what is of another type.
 
     Example:
         >>> checked([4, 4], tuple[int, int], "block")
@@ -182,21 +146,20 @@ def checked(value: Any, kind: Any, where: str) -> Any:
     if hasattr(kind, "_fields"):
         return kind(**checked_fields(value, get_type_hints(kind), where))
     if origin in (Union, types.UnionType):
-        mappings = [one for one in inner if hasattr(one, "_fields") and isinstance(value, dict)]
-        for one in mappings or inner:
-            try:
+        named = [one for one in inner if hasattr(one, "_fields")]
+        if named and isinstance(value, dict):
+            return checked(value, named[0], where)
+        for one in inner:
+            with suppress(InputError):
                 return checked(value, one, where)
-            except InputError:
-                if mappings:
-                    raise
     elif origin in (tuple, list, Sequence) and isinstance(value, list | tuple):
         kinds = inner if origin is tuple and ... not in inner else inner[:1] * len(value)
         if len(kinds) == len(value):
-            items = [
-                checked(one, of, f"{where}[{i}]")
-                for i, (one, of) in enumerate(zip(value, kinds, strict=True))
-            ]
+            pairs = enumerate(zip(value, kinds, strict=True))
+            items = [checked(one, of, f"{where}[{i}]") for i, (one, of) in pairs]
             return items if origin is list else tuple(items)
+    elif origin in (dict, Mapping) and isinstance(value, dict):
+        return {name: checked(one, inner[1], f"{where}.{name}") for name, one in value.items()}
     elif _fits(value, origin, inner):
         return value
     limit = ", finite and below 2^53" if isinstance(value, int | float) else ""
@@ -205,13 +168,13 @@ def checked(value: Any, kind: Any, where: str) -> Any:
 
 def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
     """Whether a value is of a type other than a union, a sequence or a NamedTuple."""
+    if type(value) in (int, float) and not abs(value) < (LARGEST if type(value) is int else math.inf):
+        return False
     if origin is Literal:
         return any(type(value) is type(one) and value == one for one in inner)
-    if origin is int:
-        return type(value) is int and abs(value) < LARGEST
     if origin is float:
-        return type(value) in (int, float) and math.isfinite(value)
-    if origin in (str, bool, None, type(None)):
+        return type(value) in (int, float)
+    if origin in (int, str, bool, None, type(None)):
         return type(value) is (origin or type(None))
     return origin is Any or isinstance(value, dict)
 

@@ -24,9 +24,10 @@ class FrameTable(NamedTuple):
     """Which frames the places of a map show, and on which route they are.
 
     places: N, of the map. positions: (F,) float, how many even steps each frame lies from the first place of
-    its route; (0,) where place i is frame i. routes: of a merged map, in order, else ().
+    its route; (0,) if place i is frame i. routes: of a merged map, in order, else ().
 
-    Convention: places and frames count through all routes. -1, no place or frame, stays -1.
+    Convention: tensors of places and frames are int64 of any shape, and count through all routes. -1, no
+        place or frame, stays -1.
     """
 
     places: int
@@ -53,11 +54,11 @@ class FrameTable(NamedTuple):
         return borders(self.steps) if len(self.positions) else torch.arange(self.places + 1)
 
     def frame_of(self, places: Tensor) -> Tensor:
-        """The frame that each place shows; int64 of any shape."""
+        """The frame that each place shows."""
         return look_up(shown_frames(self.steps), places) if len(self.positions) else places
 
     def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each frame, -1 for one before the first place; int64 of any shape.
+        """The place nearest to each frame, -1 for one before the first place.
 
         Raises:
             InputError: a frame that the reference does not have.
@@ -73,12 +74,11 @@ class FrameTable(NamedTuple):
         return self.place_of(self.frame_of(places))
 
     def route_of(self, places: Tensor) -> Tensor:
-        """The number of the route that each place is on; int64 of any shape."""
+        """The number of the route that each place is on."""
         ends = torch.tensor([route.places for route in self.routes], device=places.device).cumsum(0)
         return torch.where(places >= 0, torch.searchsorted(ends, places.contiguous(), right=True), -1)
 
     def own_frame_of(self, places: Tensor) -> Tensor:
-        """As `frame_of`, each frame counted on its own route; int64 of any shape."""
-        counts = torch.tensor([0, *(route.frames for route in self.routes)], device=places.device)
-        before = look_up(counts.cumsum(0), self.route_of(places))
-        return torch.where(places >= 0, self.frame_of(places) - before, -1)
+        """As `frame_of`, with frames counted on their own route."""
+        starts = torch.tensor([0, *(route.frames for route in self.routes)], device=places.device).cumsum(0)
+        return torch.where(places >= 0, self.frame_of(places) - look_up(starts, self.route_of(places)), -1)

@@ -17,13 +17,11 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
 
     The score of place i is (one[i mod tau1] + other[i mod tau2]) / divisor. Among the places r, r + tau1,
     r + 2 tau1, ... the longer layer has one distance, and those of the shorter one are a window that slides
-    along a circle of its residues: O(tau1 + tau2) for any number of places. Rounded sums are equal more often
-    than their terms are, so the first of equal scores is sought among all r that reach the lowest.
+    along a circle of its residues: O(tau1 + tau2) for any number of places, which is at least the longer tau.
+    Rounded sums are equal more often than their terms are, so the first of equal scores is sought among all r
+    that reach the lowest.
 
-    Args:
-        one, other: distances of each layer at its first tau places. places: at least the longer tau.
-
-    Shape: (Q,tau1), (Q,tau2) -> (Q,), (Q,) int64; `places` where no score is finite.
+    Shape: (Q,tau1), (Q,tau2) -> (Q,), (Q,) int64; `places` if no score is finite.
 
     Example:
         >>> lowest(torch.tensor([[3.0, 0.0]]), torch.tensor([[1.0, 1.0, 0.0]]), places=6)
@@ -58,10 +56,7 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
 
 @lru_cache(maxsize=16)
 def _circles(outer: int, inner: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Residues modulo `inner` in the order in which steps of `outer` visit them, and where each r begins.
-
-    Shape: -> (inner,), (outer,) int64.
-    """
+    """Residues modulo `inner` in the order in which steps of `outer` visit them, and where each r begins."""
     circles = math.gcd(outer, inner)
     starts, steps = torch.arange(circles), torch.arange(inner // circles)
     order = ((starts[:, None] + steps * outer) % inner).flatten()
@@ -70,18 +65,16 @@ def _circles(outer: int, inner: int, device: torch.device) -> tuple[Tensor, Tens
 
 
 def sliding_minimum(values: Tensor, width: int) -> Tensor:
-    """The lowest of each value and the width - 1 after it, around the circle of the last dimension.
-
-    O(n) for any width: every window is the end of one block of `width` values and the beginning of the next.
+    """The lowest of each value and the width - 1 after it, around the circle of the last dimension, in O(n):
+    every window is the end of one block of `width` values and the beginning of the next.
 
     Source: M. van Herk, A fast algorithm for local minimum and maximum filters on rectangular and octagonal
         kernels, Pattern Recognition Letters 13 (1992).
     """
     size = values.shape[-1]
-    padding = -(size + width - 1) % width  # of the last block
-    blocks = torch.cat([values, values[..., : width - 1], values[..., :padding]], -1).unflatten(
-        -1, (-1, width)
-    )
-    from_start = blocks.cummin(-1).values.flatten(-2)
-    to_end = blocks.flip(-1).cummin(-1).values.flip(-1).flatten(-2)
+    length = -(-(size + width - 1) // width) * width
+    turns = torch.cat([values] * -(-length // size), -1)
+    parts = turns[..., :length].unflatten(-1, (-1, width))
+    from_start = parts.cummin(-1).values.flatten(-2)
+    to_end = parts.flip(-1).cummin(-1).values.flip(-1).flatten(-2)
     return torch.minimum(to_end[..., :size], from_start[..., width - 1 : width - 1 + size])

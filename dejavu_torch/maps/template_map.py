@@ -17,14 +17,12 @@ from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.summary import MapSummary, summarise
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
-from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
-PLACE_BYTES = 16  # per place, while a query is scored
 PHASE_COST = 8  # of a phase of two layers that are searched, in places that are scored in the same time
 SEARCH_COST = 2**15  # of any search, in the same unit
 
@@ -40,29 +38,11 @@ class TemplateState(NamedTuple):
     temperature: float | None
 
 
-class Segment(NamedTuple):
-    """Places [start, stop) that the same layers cover, by their positions in the plan.
-
-    lap: places until the scores repeat. cost: of `lowest` here, in places that are scored in the same time:
-    that of a search of two layers, if it is less than `lap`, else `lap`.
-    """
-
-    start: int
-    stop: int
-    layers: tuple[int, ...]
-    lap: int
-    cost: int
-
-
-def segments(plan: Plan, places: int) -> Iterator[Segment]:
-    """Cut 0..places at every start and stop of a layer: within a segment L of eq. 4 is constant."""
+def segments(plan: Plan, places: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
+    """Places [start, stop) that the same layers cover, and these, L of eq. 4, as positions in the plan."""
     cuts = sorted({0, places, *(layer.start for layer in plan), *(layer.stop for layer in plan)})
     for start, stop in pairwise(cuts):
-        members = tuple(j for j, layer in enumerate(plan) if layer.start <= start and stop <= layer.stop)
-        sizes = [plan[j].period.numerator for j in members]
-        lap = reduce(lambda length, size: min(math.lcm(length, size), stop - start), sizes, 1)
-        cost = min(lap, PHASE_COST * sum(sizes)) if len(members) == 2 else lap
-        yield Segment(start, stop, members, lap, cost)
+        yield start, stop, tuple(j for j, layer in enumerate(plan) if layer.start <= start < layer.stop)
 
 
 def weight_per_feature(metric: Metric, features: int) -> float:
@@ -73,8 +53,8 @@ def weight_per_feature(metric: Metric, features: int) -> float:
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
     """How unlikely each place is, in nats: -log softmax(-S / T) over places; (Q,N) -> (Q,N), lower is better.
 
-    It keeps the order of places and makes the scores of different queries comparable: what no template
-    explains raises S at all places, and this not at all. A place that scores +inf stays +inf.
+    It makes the scores of different queries comparable: what no template explains raises S at all places, and
+    this not at all. A place that scores +inf stays +inf.
 
     Example:
         >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()
@@ -90,22 +70,19 @@ def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
 class TemplateMap(PlaceMap):
     """A route in sum(P x F) template numbers instead of N x D, and the L1 matcher of section III-B.
 
-    Buffers (compressed sparse rows; their size is the storage claim):
+    Buffers, the tensors of a file:
         layers: (L,5) int64, period numerator, period denominator, phases, start, stop.
-        feature_ptr: (L+1,) int64, where each layer's features begin in `feature_index`.
-        feature_index: (sum F,) int32.
+        feature_ptr, feature_index: (L+1,) int64, where each layer's features begin in (sum F,) int32.
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
         weights: (D,) float, the factor of each feature's difference in eq. 3; (0,) for 1.
 
     Args:
-        plan: the layers.
-        templates: one (P,F) tensor per layer, as `PhaseTemplates` gives them; they may carry gradients.
-        places: N, frames of the reference traverse.
-        dimension: D, features per frame.
+        plan, templates: the layers, and a tensor (P,F) for each, as `PhaseTemplates` gives them.
+        places, dimension: N, and D features per frame.
         metric: distance of eq. 3, see `phase_distances`.
         reduction: "sum" is eq. 4 as printed. "mean" divides it by the number of features summed over (l2:
             their roots, cosine: the layers), so that places are comparable whatever covers them.
-        temperature: T of `log_posterior`, which scores then are; None, the paper's letter, leaves S as it is.
+        temperature: T of `log_posterior`, which scores then are, in their units; None leaves S as it is.
         weights: see above; None for 1.
 
     Shape: scores: query features (Q,D) -> (Q,N), lower is better, uncovered +inf.
@@ -114,8 +91,7 @@ class TemplateMap(PlaceMap):
         features: |w H - w mu| = w |H - mu|. Gradients reach the queries and the templates.
 
     Raises:
-        InputError: templates that do not fit the plan, an unknown metric or reduction, a temperature of 0 or
-            less; scores: features of another dimension.
+        InputError: arguments that do not fit together or are unknown; scores: features of another dimension.
 
     Example:
         >>> plan = (FrequencyLayer(2, 2, 0, 3, (0,)),)
@@ -151,12 +127,10 @@ class TemplateMap(PlaceMap):
             raise InputError(f"reduction {reduction!r} is unknown; expected 'mean' or 'sum'")
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
         for layer, block in zip(plan, templates, strict=True):
-            phases, features = layer.phases, len(layer.features)
-            if block.shape != (phases, features):
-                raise InputError(
-                    f"a layer of {phases} phases and {features} features got templates {tuple(block.shape)}; "
-                    f"expected ({phases}, {features})"
-                )
+            shape = layer.phases, len(layer.features)
+            if block.shape != shape:
+                seen = f"a layer of {shape[0]} phases and {shape[1]} features"
+                raise InputError(f"{seen} got templates {tuple(block.shape)}; expected {shape}")
         rows = [(*layer.period.as_integer_ratio(), layer.phases, layer.start, layer.stop) for layer in plan]
         index = [feature for layer in plan for feature in layer.features]
         pointer = [0, *accumulate(len(layer.features) for layer in plan)]
@@ -168,25 +142,11 @@ class TemplateMap(PlaceMap):
         self.register_buffer("weights", torch.zeros(0) if weights is None else weights.float())
         self.register_buffer("lap_phases", torch.zeros(0, dtype=torch.int64), persistent=False)
         self.to(numbers.device)
-        self.loaded()
         self.check()
-
-    @property
-    def temperature(self) -> float | None:
-        """T of `log_posterior`, in units of the scores, or None."""
-        return self._temperature
-
-    @temperature.setter
-    def temperature(self, value: float | None) -> None:
-        if value is not None and not (isinstance(value, (int, float)) and 0 < value < math.inf):
-            raise InputError(f"the temperature is {value!r}; expected a number above 0")
-        self._temperature = value
+        self.loaded()
 
     def loaded(self) -> None:
         """Derive the plan, its segments and the phases of each layer from the buffers."""
-        problem = self._plan_problem()
-        if problem:
-            raise InputError(f"the map does not fit together: {problem}")
         index = self.feature_index.split(self.feature_ptr.diff().tolist())
         self.plan: Plan = tuple(
             FrequencyLayer(Fraction(a, b), phases, start, stop, tuple(features.tolist()))
@@ -195,23 +155,44 @@ class TemplateMap(PlaceMap):
         check_plan(self.plan, self.places, self.dimension)
         covered = sum(layer.stop - layer.start for layer in self.plan)
         if max(self.places, covered) > MAX_PLACES:
-            raise InputError(
-                f"a map of {self.places} places, {covered} in all layers; expected at most {MAX_PLACES}"
-            )
+            seen = f"a map of {self.places} places, {covered} in all layers"
+            raise InputError(f"{seen}; expected at most {MAX_PLACES}")
         # phases repeat after as many places as the numerator of the period
-        laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
-        check_room(PLACE_BYTES * (self.places + sum(laps)), f"a map of {self.places} places")
-        pairs = list(zip(self.plan, laps, strict=True))
+        self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
+        pairs = zip(self.plan, self.laps, strict=True)
         phases = [layer.phase(torch.arange(layer.start, layer.start + lap)) for layer, lap in pairs]
         self.lap_phases = torch.cat([torch.zeros(0, dtype=torch.int64), *phases]).to(self.layers.device)
-        self.laps = [slice(end - lap, end) for lap, end in zip(laps, accumulate(laps), strict=True)]
         self.segments = tuple(segments(self.plan, self.places))
+
+    def disagreement(self) -> str:
+        count, last = self.layers.numel() // 5, self.feature_index.numel()
+        shapes = {"layers": (count, 5), "feature_ptr": (count + 1,), "feature_index": (last,)}
+        for name, shape in shapes.items():
+            buffer = getattr(self, name)
+            if buffer.shape != shape or buffer.dtype not in (torch.int32, torch.int64):
+                return f"{name} {tuple(buffer.shape)} {buffer.dtype}; expected {shape} int32 or int64"
+        sizes = self.feature_ptr.diff()
+        if bool((sizes < 0).any()) or (int(self.feature_ptr[0]), int(self.feature_ptr[-1])) != (0, last):
+            return f"feature_ptr does not rise from 0 to {last}"
+        if bool((self.layers[:, 1] < 1).any()):
+            return "a period with a denominator below 1"
+        numbers = int((self.layers[:, 2] * sizes).sum())
+        for name, lengths in (("templates", [numbers]), ("weights", [self.dimension, 0])):
+            values = getattr(self, name)
+            if values.ndim != 1 or len(values) not in lengths:
+                return f"{name} {tuple(values.shape)}; expected {' or '.join(f'({n},)' for n in lengths)}"
+            if not values.is_floating_point() or not values.isfinite().all():
+                return f"{name} that are not finite floats"
+        T = self.temperature
+        if T is not None and not (isinstance(T, (int, float)) and 0 < T < math.inf):
+            return f"the temperature is {T!r}; expected a number above 0"
+        return ""
 
     def settings(self) -> dict[str, Any]:
         return {"metric": self.metric, "reduction": self.reduction}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What the state holds beside the tensors."""
+        """See `PlaceMap`."""
         return super().get_extra_state() | {"temperature": self.temperature}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -236,99 +217,82 @@ class TemplateMap(PlaceMap):
     def distances(self, queries: Tensor, layers: Sequence[int] | None = None) -> list[Tensor]:
         """Eq. 3 for every layer, or for some by their positions in the plan: (Q,D) -> L tensors (Q,P)."""
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
-            raise InputError(
-                f"the query features are {tuple(queries.shape)}; the map expects (Q, {self.dimension})"
-            )
+            seen = f"the query features are {tuple(queries.shape)}"
+            raise InputError(f"{seen}; the map expects (Q, {self.dimension})")
         queries, features, blocks = self.weighted(queries), self.layer_features(), self.blocks()
         return [
             phase_distances(queries.index_select(1, features[j]), blocks[j], self.metric)
             for j in (range(len(blocks)) if layers is None else layers)
         ]
 
-    def along(self, distances: Tensor, layer: int, start: int, count: int) -> Tensor:
-        """Distances of a layer at `count` places that it covers, from `start` on: (Q,P) -> (Q,count)."""
-        lap = self.lap_phases[self.laps[layer]]
-        first = (start - self.plan[layer].start) % len(lap)
-        if first + count <= len(lap):
-            return distances.index_select(1, lap[first : first + count])
-        lap = lap.roll(-first) if first else lap
-        return distances.index_select(1, lap).repeat(1, -(-count // len(lap)))[:, :count]
-
     def divisor(self, layers: Sequence[int]) -> float:
         """What the sum of the distances of these layers is divided by in S."""
         per_layer = (weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
         return sum(per_layer) if self.reduction == "mean" else 1.0
 
-    def combine(self, distances: Sequence[Tensor], segments: Sequence[Segment] | None = None) -> Tensor:
-        """S(i) from the phase distances of each layer (eq. 4): L tensors (Q,P) -> (Q,N).
-
-        Args:
-            segments: whose places, in order; None for all. A place that no layer covers scores +inf.
-        """
-        parts = []
-        for start, stop, layers, *_ in self.segments if segments is None else segments:
-            if layers:
-                rows = [self.along(distances[j], j, start, stop - start) for j in layers]
+    def combine(self, distances: Sequence[Tensor], start: int = 0, stop: int | None = None) -> Tensor:
+        """S of the places [start, stop) from the phase distances of each layer (eq. 4): L tensors (Q,P) ->
+        (Q,stop - start). A place that no layer covers scores +inf."""
+        stop = self.places if stop is None else stop
+        laps, parts = self.lap_phases.split(self.laps), []
+        for begin, end, layers in self.segments:
+            first, count = max(start, begin), min(stop, end) - max(start, begin)
+            if count > 0 and layers:
+                rows = [_along(distances[j], laps[j], first - self.plan[j].start, count) for j in layers]
                 total: Tensor = reduce(torch.add, rows)
                 parts.append(total / self.divisor(layers) if self.reduction == "mean" else total)
-            else:
-                parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, stop - start))
+            elif count > 0:
+                parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, count))
         return torch.cat(parts, 1)
 
     def scores(self, queries: Tensor) -> Tensor:
         """S(i) of all places (eq. 3, eq. 4): (Q,D) -> (Q,N)."""
-        distances = self.distances(queries)
-        if not distances:
+        return self._scores_between(queries, 0, self.places)
+
+    def score_blocks(
+        self, queries: Tensor, start: int = 0, stop: int | None = None
+    ) -> Iterator[tuple[int, Tensor]]:
+        """See `PlaceMap`: one block, from the layers that cover these places."""
+        stop = self.places if stop is None else stop
+        if self.temperature is None:
+            yield start, self._scores_between(queries, start, stop)
+        else:  # a softmax is over all places
+            yield start, self.scores(queries)[:, start:stop]
+
+    def _scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+        members = [j for j, layer in enumerate(self.plan) if layer.start < stop and layer.stop > start]
+        found = dict(zip(members, self.distances(queries, members), strict=True))
+        if not found:
             dtype = torch.promote_types(queries.dtype, torch.float32)
-            return queries.new_full((queries.shape[0], self.places), math.inf, dtype=dtype)
-        scores = self.combine(distances)
+            return queries.new_full((queries.shape[0], stop - start), math.inf, dtype=dtype)
+        distances = [found.get(j, found[members[0]]) for j in range(len(self.plan))]  # no other row is read
+        scores = self.combine(distances, start, stop)
         return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
     @property
     def block_places(self) -> int:
         """See `PlaceMap`: a number for each place in each layer of a segment."""
-        return self.places * max([1, *(len(segment.layers) for segment in self.segments)])
-
-    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
-        """See `PlaceMap`: from the layers that cover these places."""
-        inside = [segment for segment in self.segments if segment.start < stop and segment.stop > start]
-        members = sorted({j for segment in inside for j in segment.layers})
-        if not members or self.temperature is not None:
-            return super().scores_between(queries, start, stop)
-        rows = dict(zip(members, self.distances(queries, members), strict=True))
-        distances = [rows.get(j, rows[members[0]]) for j in range(len(self.plan))]  # no other row is read
-        return self.combine(distances, inside)[:, start - inside[0].start : stop - inside[0].start]
+        return self.places * max([1, *(len(layers) for _, _, layers in self.segments)])
 
     @torch.no_grad()
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """See `PlaceMap`: segments of two layers are searched, others scanned until their scores repeat."""
-        cost = SEARCH_COST + sum(segment.cost for segment in self.segments)
-        if self.temperature is not None or not self.plan or cost >= self.places:
+        """See `PlaceMap`: from two layers that cover the same places, unless these are few."""
+        chunks = {(layer.start, layer.stop) for layer in self.plan}
+        if self.temperature is not None or len(self.plan) != 2 or len(chunks) != 1:
             return None
-        distances, found = self.distances(queries), []
-        for segment in self.segments:
-            start, _, layers, lap, cost = segment
-            if cost < lap:
-                one, other = (
-                    self.along(distances[j], j, start, self.plan[j].period.numerator) for j in layers
-                )
-                score, place = lowest(one, other, lap, self.divisor(layers))
-            else:
-                score, place = self.combine(distances, [segment._replace(stop=start + lap)]).min(1)
-            found.append((score, start + place))
-        scores, places = (torch.stack(column, 1) for column in zip(*found, strict=True))
-        best = scores.amin(1)
-        first = places.masked_fill(scores != best[:, None], self.places).amin(1)
-        return best, torch.where(best.isfinite(), first, -1)
+        ((start, stop),) = chunks
+        if SEARCH_COST + PHASE_COST * sum(layer.period.numerator for layer in self.plan) >= stop - start:
+            return None
+        pairs = zip(self.distances(queries), self.lap_phases.split(self.laps), strict=True)
+        one, other = (distances.index_select(1, lap) for distances, lap in pairs)
+        score, place = lowest(one, other, stop - start, self.divisor([0, 1]))
+        return score, torch.where(score.isfinite(), start + place, -1)
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
         """Make parameters of the templates, of the weights, or of both, until `freeze`.
 
         Args:
-            start: (D,) the weights to begin with where the map has none; None or (0,) is 1 for every feature.
-
-        Raises:
-            InputError: a start of another shape.
+            start: (D,) the weights to begin with if the map has none; None or (0,) is 1 for every feature.
         """
         self.freeze()
         if weights and not len(self.weights):
@@ -340,15 +304,10 @@ class TemplateMap(PlaceMap):
             self.templates, self.weights = self._times(own), own
         for name, wanted in (("templates", templates), ("weights", weights)):
             if wanted:
-                value = getattr(self, name).detach().clone()
-                delattr(self, name)
-                self.register_parameter(name, nn.Parameter(value))
+                setattr(self, name, nn.Parameter(getattr(self, name).detach().clone()))
 
     def freeze(self) -> None:
-        """Make buffers of what was trained.
-
-        Convention: |w H - mu| is the same with both signs turned, so no weight is left below 0.
-        """
+        """Make buffers of what was trained; no weight is left below 0, since |w H - mu| = |-w H + mu|."""
         for name, parameter in list(self.named_parameters()):
             delattr(self, name)
             self.register_buffer(name, parameter.detach().clone())
@@ -360,8 +319,7 @@ class TemplateMap(PlaceMap):
     def _times(self, factors: Tensor) -> Tensor:
         """The flat templates, each feature times its factor (D,)."""
         pairs = zip(self.blocks(), self.layer_features(), strict=True)
-        scaled = [(block * factors[features]).flatten() for block, features in pairs]
-        return torch.cat(scaled) if scaled else self.templates
+        return torch.cat([self.templates[:0], *((block * factors[f]).flatten() for block, f in pairs)])
 
     def summary(self) -> MapSummary:
         """See `MapSummary`; the parts are those of the route."""
@@ -370,47 +328,29 @@ class TemplateMap(PlaceMap):
         route["layers"] = self.layers.nbytes + self.feature_ptr.nbytes + self.feature_index.nbytes
         return summarise(self.plan, self.places, route)
 
-    def _plan_problem(self) -> str:
-        """What is wrong with the buffers that the plan is derived from; empty if nothing is."""
-        count, last = self.layers.numel() // 5, self.feature_index.numel()
-        shapes = {"layers": (count, 5), "feature_ptr": (count + 1,), "feature_index": (last,)}
-        for name, shape in shapes.items():
-            buffer = getattr(self, name)
-            if buffer.shape != shape or buffer.dtype not in (torch.int32, torch.int64):
-                return f"{name} {tuple(buffer.shape)} {buffer.dtype}; expected {shape} int32 or int64"
-        pointer = self.feature_ptr.tolist()
-        if pointer != sorted(pointer) or (pointer[0], pointer[-1]) != (0, last):
-            return f"feature_ptr does not rise from 0 to {last}"
-        return "a period with a denominator below 1" if bool((self.layers[:, 1] < 1).any()) else ""
-
-    def disagreement(self) -> str:
-        numbers = sum(layer.phases * len(layer.features) for layer in self.plan)
-        for name, sizes in (("templates", [numbers]), ("weights", [self.dimension, 0])):
-            values = getattr(self, name)
-            if values.ndim != 1 or len(values) not in sizes:
-                expected = " or ".join(f"({size},)" for size in sizes)
-                return f"{name} {tuple(values.shape)}; expected {expected}"
-            if not values.is_floating_point() or not values.isfinite().all():
-                return f"{name} that are not finite floats"
-        return ""
-
     def extra_repr(self) -> str:
         sizes = f"places={self.places}, dimension={self.dimension}, layers={len(self.plan)}"
-        return f"{sizes}, template_numbers={self.templates.numel()}, {_repr(self)}"
+        return f"{sizes}, template_numbers={self.templates.numel()}, metric={self.metric!r}"
+
+
+def _along(distances: Tensor, lap: Tensor, first: int, count: int) -> Tensor:
+    """Distances of a layer at `count` of its places, whose phases repeat after a lap: (Q,P) -> (Q,count)."""
+    first %= len(lap)
+    if first + count <= len(lap):
+        return distances.index_select(1, lap[first : first + count])
+    lap = lap.roll(-first) if first else lap
+    return distances.index_select(1, lap).repeat(1, -(-count // len(lap)))[:, :count]
 
 
 class TemplateMapper(Mapper):
     """The paper's mapper (section III-A): layers of what repeats, and a template for each of their phases.
 
     Args:
-        periods: finds the layers; None is `SpectrogramAnalysis` with its defaults.
+        periods: finds the layers, without gradient; None is `SpectrogramAnalysis` with its defaults.
         metric, reduction, temperature: of the maps, see `TemplateMap`.
         trainable: make the templates nn.Parameters, to be fine-tuned, instead of buffers.
 
-    Shape: features (N,D) -> TemplateMap of N places; one without layers, on which every place scores +inf,
-        if nothing repeats.
-
-    Convention: periods get no gradient; the templates do, where gradients are enabled.
+    Shape: features (N,D) -> TemplateMap of N places; if nothing repeats, all places score +inf.
 
     Raises:
         InputError: see `TemplateMap`, and what `periods` refuses.
@@ -433,9 +373,8 @@ class TemplateMapper(Mapper):
     ) -> None:
         super().__init__()
         if periods is not None and not isinstance(periods, PeriodFinder):
-            raise InputError(
-                f"periods is a {type(periods).__name__}; expected a PeriodFinder such as SpectrogramAnalysis"
-            )
+            seen = f"periods is a {type(periods).__name__}"
+            raise InputError(f"{seen}; expected a PeriodFinder such as SpectrogramAnalysis")
         self.trainable = trainable
         self.periods: PeriodFinder | None = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
@@ -461,8 +400,4 @@ class TemplateMapper(Mapper):
         return route
 
     def extra_repr(self) -> str:
-        return _repr(self)
-
-
-def _repr(one: TemplateMap | TemplateMapper) -> str:
-    return f"metric={one.metric!r}, reduction={one.reduction!r}, temperature={one.temperature}"
+        return f"metric={self.metric!r}, reduction={self.reduction!r}, temperature={self.temperature}"

@@ -27,12 +27,12 @@ def phase_mask(
         frames: how many, counted from 0, or (n,) int64 the frames themselves.
         period: tau, frames; whole or rational.
         phases: P; None is the paper's case, one phase per frame of a whole period.
-        start, stop: the chunk [start, stop); a stop of None has no end. M is 0 outside.
+        start, stop: the chunk [start, stop), outside of which M is 0; a stop of None has no end.
 
     Shape: -> (P,n), 1 where frame i of the chunk has phase k, else 0.
 
-    Convention: phases count 0..P-1 from absolute frame 0, so with phases = period
-        M(i, tau, k) = 1 where mod(i - k, tau) = 0.
+    Convention: phases count 0..P-1 from absolute frame 0: with phases = period M(i, tau, k) = 1 where
+        mod(i - k, tau) = 0.
 
     Raises:
         InputError: a fractional period without `phases`, or a chunk that ends after a number of frames.
@@ -63,8 +63,8 @@ class PhaseTemplates(nn.Module):
 
     Shape: features (N,D), plan of L layers -> tuple of L tensors (P,F).
 
-    Convention: the mean runs over the layer's own chunk only. A phase that no frame of the chunk has gets 0,
-        which nothing reads. Gradients reach the features; the plan is exact numbers and gets none.
+    Convention: the mean runs over the layer's own chunk. A phase without frames gets 0, which nothing reads.
+        Gradients reach the features; the plan is exact numbers and gets none.
 
     Raises:
         InputError: a layer that reaches beyond the N frames or the D features.
@@ -95,8 +95,7 @@ def check_plan(plan: Sequence[FrequencyLayer], places: int, dimension: int) -> N
 def _means(features: Tensor, layer: FrequencyLayer) -> Tensor:
     """Eq. 1 for one layer, some frames of its chunk at a time: (N,D) -> (P,F)."""
     chosen = torch.tensor(layer.features, device=features.device)
-    total = features.new_zeros(layer.phases, len(layer.features))
-    count = features.new_zeros(layer.phases, 1)
+    total, count = features.new_zeros(layer.phases, len(chosen)), features.new_zeros(layer.phases, 1)
     at_once = max(1, MASK_NUMBERS // layer.phases)
     frames = torch.arange(layer.start, layer.stop, device=features.device).split(at_once)
     for some, values in zip(frames, features[layer.start : layer.stop].split(at_once), strict=True):

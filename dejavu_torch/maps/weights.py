@@ -22,10 +22,7 @@ SCALE = ".scale"  # follows the name of a weight; torch allows no dot in the nam
 
 
 def quantised(weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Whole numbers and scales whose product is a weight, to within half a scale.
-
-    Args:
-        weight: float32, finite, below 1e38.
+    """Whole numbers and scales whose product is a float32 weight, to within half a scale.
 
     Shape: (O,...) -> int8 (O,...), bfloat16 (O,).
 
@@ -49,6 +46,12 @@ def _over(scale: Tensor, weight: Tensor) -> Tensor:
     return scale.float().view(-1, *[1] * (weight.ndim - 1))
 
 
+def rounded(weight: Tensor) -> Tensor:
+    """A weight after rounding to 8 bits."""
+    whole, scale = quantised(weight.detach())
+    return whole * _over(scale, whole)
+
+
 def fits(weight: Tensor) -> bool:
     """Whether a weight can be in 8 bits: float32, of 2 or more dimensions, not empty, below 1e38."""
     if is_lazy(weight) or weight.dtype != torch.float32 or weight.ndim < 2 or not weight.numel():
@@ -56,30 +59,27 @@ def fits(weight: Tensor) -> bool:
     return bool(weight.detach().abs().max() < HUGE)
 
 
-def rounded(weight: Tensor) -> Tensor:
-    """A weight after rounding to 8 bits."""
-    whole, scale = quantised(weight.detach())
-    return whole * _over(scale, whole)
+def _fitting(module: nn.Module) -> list[nn.Parameter]:
+    return [weight for weight in module.parameters() if fits(weight)]
 
 
 @torch.no_grad()
 def round_weights(module: nn.Module) -> bool:
     """Round in place all parameters that fit into 8 bits, but no buffers; whether there are any."""
-    weights = [weight for weight in module.parameters() if fits(weight)]
-    for weight in weights:
+    for weight in _fitting(module):
         weight.copy_(rounded(weight))
-    return bool(weights)
+    return bool(_fitting(module))
 
 
 def is_rounded(module: nn.Module) -> bool:
     """Whether `round_weights` would change nothing."""
-    return all(torch.equal(weight, rounded(weight)) for weight in module.parameters() if fits(weight))
+    return all(torch.equal(weight, rounded(weight)) for weight in _fitting(module))
 
 
 @contextmanager
 def in_bits(module: nn.Module, bits: int) -> Iterator[None]:
     """Within the block the module has weights of so many bits."""
-    kept = [(weight, weight.detach().clone()) for weight in module.parameters() if bits == 8 and fits(weight)]
+    kept = [(weight, weight.detach().clone()) for weight in _fitting(module)] if bits == 8 else []
     if kept:
         round_weights(module)
     try:
@@ -92,27 +92,20 @@ def in_bits(module: nn.Module, bits: int) -> Iterator[None]:
 
 def packed(module: nn.Module) -> dict[str, Tensor]:
     """The tensors of a module's state; each parameter that fits as whole numbers and scales."""
-    found: dict[str, Tensor] = {}
-    weights = {name for name, _ in module.named_parameters(remove_duplicate=False)}
-    for name, tensor in module.state_dict().items():
-        if name in weights and fits(tensor):
-            found[name], found[name + SCALE] = quantised(tensor)
-        elif isinstance(tensor, Tensor):
-            found[name] = tensor
+    found = {name: one for name, one in module.state_dict().items() if isinstance(one, Tensor)}
+    for name, weight in module.named_parameters(remove_duplicate=False):
+        if fits(weight):
+            found[name], found[name + SCALE] = quantised(weight.detach())
     return found
 
 
 def unpacked(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors of a file; below a prefix, products in place of whole numbers and scales.
-
-    Raises:
-        InputError: numbers that `quantised` does not return.
-    """
+    """The tensors of a file; below a prefix, products in place of whole numbers and scales that `quantised`
+    returned; others are an InputError."""
     found = dict(tensors)
-    for scales in [name for name in tensors if name.startswith(prefix) and name.endswith(SCALE)]:
-        name = scales.removesuffix(SCALE)
-        if name in tensors:
-            found[name] = _product(name, tensors[name], found.pop(scales))
+    for name in tensors:
+        if name.startswith(prefix) and name + SCALE in tensors:
+            found[name] = _product(name, tensors[name], found.pop(name + SCALE))
     return found
 
 

@@ -1,4 +1,4 @@
-"""What every way of finding periods offers."""
+"""What every way to find periods offers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ from dejavu_torch.types import Plan
 class PeriodFinder(nn.Module, ABC):
     """Finds which features repeat, where and how often. Subclass it to bring your own.
 
-    A map file names a finder of this package only: a map learned with your own loads without it.
+    A map file names finders of this package only: a map learned with your own loads without it.
     """
 
     @abstractmethod
     def plan(self, features: Tensor) -> Plan:
-        """Layers of a route: exact numbers, where gradients stop.
-
-        Shape: features (N,D) -> plan; empty where nothing repeats.
-        """
+        """The layers of a route, without gradient: features (N,D) -> plan, empty if nothing repeats."""

@@ -24,15 +24,13 @@ class ImposedPeriods(PeriodFinder):
     Args:
         periods: P of each layer, distinct, >= 2, in bins; None chooses `supportive_periods` for the route.
         bin: places that share a phase, >= 1; the tolerance is a sensible size.
-        stagger: the bins of the layers drift past each other, to tell places apart that share a bin: the
-            periods are P * bin places and, in turn, a tenth of a bin more and less. What `support_of`
-            says then holds for nearly all places.
+        stagger: bins of different layers drift past each other, to tell apart places that share a bin: the
+            periods are P * bin places and, in turn, a tenth of a bin more and less.
 
-    Shape: features (N,D), N >= 2 -> plan of L layers, each of period P * bin places and P phases over 0..N,
-        each of all D features.
+    Shape: features (N,D), N >= 2 -> plan of L layers, each of P phases over 0..N and all D features.
 
     Convention: the last bin may be short. Periods that cannot tell the bins of the route apart are allowed
-        and logged in a line; one period of as many phases as bins is a classifier of places.
+        and logged; one period of as many phases as bins is a classifier of places.
 
     Raises:
         InputError: periods or a bin out of range, or features not (N,D) with N >= 2 and D >= 1.
@@ -54,8 +52,7 @@ class ImposedPeriods(PeriodFinder):
                     f"imposed periods are {periods}; expected distinct whole numbers >= 2, <= {LONGEST}"
                 )
         self.periods = None if periods is None else list(periods)
-        self.bin = bin
-        self.stagger = stagger
+        self.bin, self.stagger = bin, stagger
 
     def plan(self, features: Tensor) -> Plan:
         if features.ndim != 2 or len(features) < 2 or features.shape[1] < 1:
@@ -64,8 +61,7 @@ class ImposedPeriods(PeriodFinder):
             )
         places, dimension = features.shape
         bins = -(-places // self.bin)
-        # a route of a single bin leaves nothing to tell apart
-        periods = self.periods or supportive_periods(max(2, bins))
+        periods = self.periods or supportive_periods(bins)
         check_room(4 * sum(periods) * dimension, f"a template for each of {sum(periods)} imposed phases")
         distinct = math.lcm(*periods)
         if distinct < bins:

@@ -4,62 +4,101 @@ from __future__ import annotations
 
 import logging
 import math
+from fractions import Fraction
 from inspect import signature
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.periods.finder import PeriodFinder
-from dejavu_torch.periods.layers import layers_of
-from dejavu_torch.periods.stft import Spectrogram
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
+
+torchaudio: Any
+try:  # its compiled library refuses a torch of another build
+    import torchaudio.functional  # type: ignore[no-redef]
+except (ImportError, OSError, RuntimeError):
+    torchaudio = None
+BACKEND = "torchaudio" if torchaudio else "torch.stft"  # of the spectrogram
 
 log = logging.getLogger("dejavu_torch")
 
 NUMBERS_AT_ONCE = 2**22  # of a chunk's features, so that memory does not grow with their number
 HANN_PEAK = 2 / 3  # share of its power that a pure wave holds in its own bin under a Hann window
 
+Bin = TypeVar("Bin", int, Tensor)
+
 
 class Spectrum(NamedTuple):
-    """Power of every feature at every frequency of one chunk [start, stop), n = stop - start places.
-
-    power: (n // 2 + 1, D); bin k is the frequency k / n per place, the period n / k places.
-    """
+    """Power (n // 2 + 1, D) of each feature in a chunk [start, stop) of n places; bin k is period n / k."""
 
     start: int
     stop: int
     power: Tensor
 
 
+def chunk_power(chunk: Tensor) -> Tensor:
+    """Power of the Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
+    if not chunk.isfinite().all():
+        raise InputError("spectrogram got features that are not finite; expected finite numbers")
+    centred = chunk - chunk.mean(0)
+    # rounding leaves a constant feature a trace of power: zero it, or noise would name its period
+    constant = centred.abs().amax(0) <= 8 * torch.finfo(chunk.dtype).eps * chunk.abs().amax(0)
+    waves = centred.masked_fill(constant, 0.0).T
+    n, window = len(chunk), torch.hann_window(len(chunk), dtype=chunk.dtype, device=chunk.device)
+    power: Tensor
+    if torchaudio:
+        power = torchaudio.functional.spectrogram(waves, 0, window, n, n, n, 2.0, False, center=False)
+    else:
+        power = torch.stft(waves, n, n, window=window, center=False, return_complex=True).abs().square()
+    return power[..., 0].T
+
+
 def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", "local"]) -> Tensor:
-    """The `count` strongest bins of each feature among bins 2..last, strongest first (section III-A).
+    """The `count` strongest bins of each feature among bins 2..last with power, strongest first.
 
     Args:
-        peaks: "bins" ranks all bins by power; "local" ranks only local maxima, so that a peak and
-            its own leakage into the next bin are not taken for two periods.
+        peaks: "bins" ranks all bins; "local" only local maxima, so that the leakage of a peak into the next
+            bin is no second period.
 
-    Shape: (K,D) -> (count,D) int64, -1 if a feature has no more such bins.
-
-    Convention: a bin without power is no candidate; of equal bins the lower one wins.
+    Shape: (K,D) -> (count,D) int64, -1 if a feature has no more such bins; of equal bins the lower one wins.
     """
-    bins, features = power.shape
     candidates = torch.zeros_like(power, dtype=torch.bool)
     candidates[2 : last + 1] = power[2 : last + 1] > 0
     if peaks == "local":
-        edge = power.new_full((1, features), -math.inf)
+        edge = power.new_full((1, power.shape[1]), -math.inf)
         candidates &= (power > torch.cat([edge, power[:-1]])) & (power >= torch.cat([power[1:], edge]))
     ranked = power.masked_fill(~candidates, -math.inf)
     order = ranked.argsort(dim=0, descending=True, stable=True)[:count]
     found = order.masked_fill(~candidates.gather(0, order), -1)
-    return nn.functional.pad(found, (0, 0, 0, max(0, count - bins)), value=-1)
+    return nn.functional.pad(found, (0, 0, 0, count - len(found)), value=-1)
+
+
+def bin_period(length: int, k: Bin) -> Bin:
+    """Period of bin k of a spectrum over `length` places, in whole places: round(length / k), halves up.
+
+    Example:
+        >>> bin_period(1024, 11), bin_period(1024, 6)  # the paper's two periods
+        (93, 171)
+    """
+    return (2 * length + k) // (2 * k)
+
+
+def layers_of(bins: Tensor, start: int, stop: int) -> list[FrequencyLayer]:
+    """Layers of the chunk [start, stop) by the strongest bins (count,D) of each feature, -1 for none: by
+    increasing period, features of equal `bin_period` share one."""
+    rank, feature = (bins > 0).nonzero(as_tuple=True)
+    period = bin_period(stop - start, bins[rank, feature])
+    return [
+        FrequencyLayer(Fraction(tau), tau, start, stop, tuple(feature[period == tau].unique().tolist()))
+        for tau in period.unique().tolist()
+    ]
 
 
 def noise_share(bins: int, features: int, false_alarm: float) -> float:
-    """Share of its power that any of so many features of white noise holds in one bin, with this probability.
+    """The share of its power that white noise in any of the features has in one bin, with this probability.
 
-    Fisher's test for a hidden period, P(largest of K shares > g) <= K * (1 - g)**(K - 1), with Bonferroni's
-    bound over the D features of a chunk.
+    Fisher's test, P(largest of K shares > g) <= K (1 - g)^(K - 1), and Bonferroni's bound over D features.
 
     Source: R. A. Fisher, Tests of significance in harmonic analysis, Proc. R. Soc. A 125 (1929).
 
@@ -74,27 +113,25 @@ class SpectrogramAnalysis(PeriodFinder):
     """Which features repeat, where and how often, by the spectrogram of each (section III-A).
 
     Args:
-        window: places per spectrum, which is also the length of a chunk.
-        hop: places from one chunk to the next; None is `window`, chunks side by side.
-        min_period: shortest period considered, in places. The longest is half the window (bin 2): bins 0
-            and 1 hold the mean, slow drift, and their leakage through the Hann window.
-        strongest: how many of its strongest frequencies a feature keeps.
-        peaks: "local" ranks local maxima of the spectrum, "bins" ranks all its bins (the paper).
-        false_alarm: a chunk gets layers only if some frequency holds a larger share of its feature's power
-            than white noise would anywhere in the chunk with at most this probability (`noise_share`).
-            Smooth footage passes, whether it repeats or not. None: every chunk gets layers (the paper).
-        short: for a route shorter than the window: "shrink" the window to it and log that, or "refuse".
+        window: places per spectrum, the length of a chunk. hop: places from one chunk to the next; None is
+            `window`.
+        min_period: shortest period, in places. The longest is half the window, bin 2: bins 0 and 1 hold mean
+            and slow drift.
+        strongest: how many frequencies a feature keeps.
+        peaks: "local" ranks local maxima of the spectrum, "bins" all its bins (the paper).
+        false_alarm: probability that white noise gives a chunk layers at all (`noise_share`). Smooth footage
+            passes, whether it repeats or not. None: every chunk gets layers (the paper).
+        short: for a route shorter than the window: "shrink" the window and log that, or "refuse".
 
-    Shape: features (N,D) -> tuple of G spectra, one for each chunk, each (n // 2 + 1, D).
+    Shape: features (N,D) -> tuple of G spectra, one for each chunk.
 
-    Convention: Hann window, not centred. The places after the last whole window are a shorter window of
-        their own, left out if they are fewer than two of the shortest periods. A feature that does not
-        vary inside a chunk has no power there. Features of equal `bin_period` share a layer. A chunk too
-        short for any wave to pass `false_alarm` is logged.
+    Convention: Hann window, not centred. The places after the last whole window are a shorter chunk, left out
+        if they are fewer than two of the shortest periods. A feature that is constant in a chunk has no power
+        there. A chunk too short to pass `false_alarm` is logged.
 
     Raises:
-        InputError: an argument out of range; features that are not float (N,D) or not finite, or fewer
-            places than two of the shortest periods, or than the window if `short` is "refuse".
+        InputError: an argument out of range; features that are not finite floats (N,D); a route that is too
+            short.
 
     Example:
         >>> wave = torch.sin(torch.arange(256) * 2 * torch.pi / 32)[:, None]
@@ -113,34 +150,28 @@ class SpectrogramAnalysis(PeriodFinder):
         short: Literal["shrink", "refuse"] = "shrink",
     ) -> None:
         super().__init__()
-        if min_period < 2 or window < 2 * min_period or strongest < 1:
-            raise InputError(
-                f"spectrogram got window={window}, min_period={min_period}, strongest={strongest}; "
-                "expected min_period >= 2, window >= 2 * min_period, strongest >= 1"
-            )
-        if hop is not None and not 1 <= hop <= window:
-            raise InputError(f"spectrogram got hop={hop}; expected 1..{window} (the window)")
-        if peaks not in ("local", "bins") or short not in ("shrink", "refuse"):
-            raise InputError(
-                f"spectrogram got peaks={peaks!r}, short={short!r}; expected peaks 'local' or 'bins', "
-                "short 'shrink' or 'refuse'"
-            )
-        if false_alarm is not None and not 0 < false_alarm < 1:
-            raise InputError(
-                f"spectrogram got false_alarm={false_alarm}; expected None or a number in (0, 1)"
-            )
+        sizes = f"window={window}, min_period={min_period}"
+        for fits, seen, expected in (
+            (min_period >= 2, sizes, "min_period >= 2"),
+            (window >= 2 * min_period, sizes, "window >= 2 * min_period"),
+            (strongest >= 1, f"{strongest=}", "strongest >= 1"),
+            (hop is None or 1 <= hop <= window, f"{hop=}", f"1..{window} (the window)"),
+            (peaks in ("local", "bins"), f"{peaks=}", "'local' or 'bins'"),
+            (short in ("shrink", "refuse"), f"{short=}", "'shrink' or 'refuse'"),
+            (false_alarm is None or 0 < false_alarm < 1, f"{false_alarm=}", "None or a number in (0, 1)"),
+        ):
+            if not fits:
+                raise InputError(f"spectrogram got {seen}; expected {expected}")
         self.window, self.hop, self.min_period, self.strongest = window, hop, min_period, strongest
         self.peaks, self.false_alarm, self.short = peaks, false_alarm, short
         self._logged: set[str] = set()
 
     def chunks(self, places: int) -> list[tuple[int, int]]:
-        """The chunks [start, stop) that a route of so many places is cut into."""
+        """The chunks [start, stop) of a route of so many places."""
         shortest = 2 * self.min_period
         if places < shortest:
-            raise InputError(
-                f"the route has {places} place{'s' * (places != 1)}; expected at least {shortest}, "
-                f"two periods of {self.min_period}"
-            )
+            seen = f"the route has {places} place{'s' * (places != 1)}"
+            raise InputError(f"{seen}; expected at least {shortest}, two periods of {self.min_period}")
         if places < self.window and self.short == "refuse":
             raise InputError(
                 f"the route has {places} places; expected at least {self.window}, the window, "
@@ -155,43 +186,41 @@ class SpectrogramAnalysis(PeriodFinder):
         return chunks
 
     def forward(self, features: Tensor) -> tuple[Spectrum, ...]:
-        check_features(features)
-        chunks = self.chunks(len(features))
-        return tuple(Spectrum(start, stop, chunk_power(features[start:stop])) for start, stop in chunks)
+        return tuple(Spectrum(a, b, chunk_power(features[a:b])) for a, b in self._chunks_of(features))
 
     @torch.no_grad()
     def plan(self, features: Tensor) -> Plan:
-        """The layers of a route, where gradients stop.
-
-        Shape: features (N,D) -> plan, ordered by chunk and then by period.
-        """
-        check_features(features)
-        places = len(features)
-        chunks = self.chunks(places)
-        if places < self.window:
-            self._warn_once(f"window shrunk from {self.window} to {places} places, the whole route")
+        """See `PeriodFinder`; by chunk and then by period."""
         layers: list[FrequencyLayer] = []
+        chunks = self._chunks_of(features)
+        if len(features) < self.window:
+            self._warn_once(f"window shrunk from {self.window} to {len(features)} places, the whole route")
         for start, stop in chunks:
             bins, share = self._strongest(features[start:stop])
             if self._exceeds_noise(share, start, stop):
                 layers += layers_of(bins, start, stop)
         return tuple(layers)
 
+    def _chunks_of(self, features: Tensor) -> list[tuple[int, int]]:
+        known = isinstance(features, Tensor)
+        if known and features.ndim == 2 and features.is_floating_point():
+            return self.chunks(len(features))
+        seen = f"{tuple(features.shape)} {features.dtype}" if known else f"a {type(features).__name__}"
+        raise InputError(f"spectrogram got {seen}; expected a float tensor (N,D)")
+
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
-        kept, shares = [], []
+        found, shares = [], []
+        count, last = min(self.strongest, len(chunk) // 2 + 1), len(chunk) // self.min_period
         for columns in chunk.split(max(1, NUMBERS_AT_ONCE // len(chunk)), 1):
             power = chunk_power(columns)
-            bins = strongest_bins(
-                power, min(self.strongest, len(power)), len(chunk) // self.min_period, self.peaks
-            )
+            bins = strongest_bins(power, count, last, self.peaks)
             share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
-            kept.append(bins)
+            found.append(bins)
             shares.append(share.where(bins > 0, 0.0).amax(0))
-        return torch.cat(kept, 1), torch.cat(shares)
+        return torch.cat(found, 1), torch.cat(shares)
 
     def _exceeds_noise(self, share: Tensor, start: int, stop: int) -> bool:
-        """Whether any frequency of a chunk is stronger than noise that is new at every place."""
         if self.false_alarm is None:
             return True
         least = noise_share((stop - start) // 2, len(share), self.false_alarm)
@@ -206,28 +235,3 @@ class SpectrogramAnalysis(PeriodFinder):
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in signature(type(self)).parameters)
-
-
-def check_features(features: Tensor) -> None:
-    """Refuse what is not a float tensor (N,D)."""
-    if not isinstance(features, Tensor):
-        raise InputError(f"spectrogram got a {type(features).__name__}; expected a float tensor (N,D)")
-    if features.ndim != 2 or not features.is_floating_point():
-        raise InputError(
-            f"spectrogram got {tuple(features.shape)} {features.dtype}; expected float features (N,D)"
-        )
-
-
-def chunk_power(chunk: Tensor) -> Tensor:
-    """Power of the Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
-    if not chunk.isfinite().all():
-        raise InputError("spectrogram got features that are not finite; expected finite numbers")
-    length = len(chunk)
-    centred = chunk - chunk.mean(0)
-    # rounding leaves a constant feature a trace of power: zero it, or noise would name its period
-    constant = centred.abs().amax(0) <= 8 * torch.finfo(chunk.dtype).eps * chunk.abs().amax(0)
-    transform = Spectrogram(
-        n_fft=length, hop_length=length, center=False, power=2.0, wkwargs={"dtype": chunk.dtype}
-    )
-    power: Tensor = transform.to(chunk)(centred.masked_fill(constant, 0.0).T)[..., 0].T
-    return power

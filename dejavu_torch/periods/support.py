@@ -6,20 +6,18 @@ import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from itertools import count
-from typing import NamedTuple
 
 import numpy as np
 
-from dejavu_torch.types import InputError
+SMALLEST = 4  # period: a layer of 2 or 3 phases hardly tells places from noise
+CORRECTS = 1  # wrong layers that supportive periods survive
 
 
 def common_period(periods: Sequence[Fraction | int]) -> Fraction:
-    """Least common multiple of the periods, at least one: the number of places they can tell apart.
-
-    Not their product: the paper's 93 and 171 share a factor 3.
+    """Least common multiple of one or more periods: the number of places they can tell apart.
 
     Example:
-        >>> common_period([93, 171]), common_period([Fraction(195, 2), 171])
+        >>> common_period([93, 171]), common_period([Fraction(195, 2), 171])  # 93 and 171 share a factor 3
         (Fraction(5301, 1), Fraction(11115, 1))
     """
     numerators, denominators = zip(*(Fraction(period).as_integer_ratio() for period in periods), strict=True)
@@ -37,69 +35,44 @@ def shared_factor(a: Fraction | int, b: Fraction | int) -> Fraction:
     return Fraction(math.gcd(a.numerator, b.numerator), math.lcm(a.denominator, b.denominator))
 
 
-class Support(NamedTuple):
-    """How whole periods support each other over a route.
+def support_of(periods: Sequence[int], places: int) -> tuple[int, int]:
+    """How whole periods >= 1 support each other over a route of at least 3 places.
 
-    code_distance: least number of layers in which two places differ, the Hamming distance of their residue
-    code; 0 if some look alike. torus_distance: least distance of two places D > 1 apart on the torus of
-    their phases, sum over layers of min(D mod tau, tau - D mod tau).
+    Returns:
+        The code distance, in how many layers any two places differ at least: (code distance - 1) // 2 wrong
+        layers are survived. The torus distance, the least sum over layers of
+        min(D mod tau, tau - D mod tau) for places D > 1 apart.
 
     Source: R. W. Watson and C. W. Hastings, Self-checked computation using residue arithmetic, Proc. IEEE
         54 (1966).
-    """
-
-    code_distance: int
-    torus_distance: int
-
-    @property
-    def corrects(self) -> int:
-        """How many wrong layers the nearest code word survives."""
-        return max(0, (self.code_distance - 1) // 2)
-
-
-def support_of(periods: Sequence[int], places: int) -> Support:
-    """The mutual support of whole periods, each at least 1, over a route of at least 3 places.
 
     Example:
         >>> support_of([4, 5, 7], 100)
-        Support(code_distance=1, torus_distance=1)
+        (1, 1)
     """
     tau = np.array(periods)[:, None]
     phase = np.arange(1, places) % tau  # of every difference D
     around = np.minimum(phase, tau - phase).sum(0)
-    return Support(int((phase != 0).sum(0).min()), int(around[1:].min()))
+    return int((phase != 0).sum(0).min()), int(around[1:].min())
 
 
-def supportive_periods(places: int, corrects: int = 1, smallest: int = 4) -> tuple[int, ...]:
-    """Distinct whole periods, increasing, that tell the places apart, also with some layers wrong.
-
-    Args:
-        places: N, places to tell apart, at least 2.
-        corrects: wrong layers to survive, >= 0.
-        smallest: shortest period allowed, >= 2; a layer of 2 or 3 phases hardly tells places from noise.
+def supportive_periods(places: int) -> tuple[int, ...]:
+    """Distinct whole periods >= 4, increasing, that tell the places apart, also with one layer wrong.
 
     Convention: the pairwise co-prime set of the fewest templates; of several the one of the largest code
         distance, then of the largest torus distance, then of the longest shortest period.
 
-    Raises:
-        InputError: an argument out of range.
-
     Example:
-        >>> supportive_periods(540), supportive_periods(540, corrects=0)
-        ((4, 5, 7, 9, 11, 13), (4, 5, 7, 9))
+        >>> supportive_periods(540)
+        (4, 5, 7, 9, 11, 13)
     """
-    if places < 2 or corrects < 0 or smallest < 2:
-        raise InputError(
-            f"supportive_periods got {places=}, {corrects=}, {smallest=}; expected places >= 2, "
-            "corrects >= 0, smallest >= 2"
-        )
 
     def suffices(chosen: tuple[int, ...]) -> bool:
-        """Whether any but 2 * corrects of them, at worst the smallest, tell the places apart."""
-        core = len(chosen) - 2 * corrects
+        """Whether any but 2 * CORRECTS of them, at worst the smallest, tell the places apart."""
+        core = len(chosen) - 2 * CORRECTS
         return core > 0 and math.prod(chosen[:core]) >= places
 
-    totals = ([*filter(suffices, _co_prime_sets(total, smallest))] for total in count(smallest))
+    totals = ([*filter(suffices, _co_prime_sets(total, SMALLEST))] for total in count(SMALLEST))
     return max(next(filter(None, totals)), key=lambda chosen: (support_of(chosen, max(places, 3)), chosen))
 
 

@@ -18,7 +18,7 @@ from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from dejavu_torch import phase_distances
-from dejavu_torch.maps import l1
+from dejavu_torch.maps import distance as l1
 
 ENOUGH = (64, l1.WORTH_COMPILING // 64)  # the smallest templates that are left to the compiled loop
 

@@ -33,51 +33,43 @@ def random_values(draw: random.Random, generator: torch.Generator, *shape: int) 
 
 
 def random_map(draw: random.Random, generator: torch.Generator) -> TemplateMap:
-    """One to three chunks with gaps, most of two layers, whose periods share any factor or are equal."""
-    plan, place = [], 0
-    for _ in range(draw.choice([1, 1, 2, 3])):
-        start = place + draw.choice([0, 0, 1, 7, 30])
-        factor, layers = draw.choice([1, 1, 2, 3, 6]), draw.choice([1, 2, 2, 2, 2, 2, 3])
-        place = start + draw.choice([draw.randint(1, 60), draw.randint(60, 1200)])
-        for _ in range(layers):
-            period = Fraction(factor * draw.randint(1, 14), draw.choice([1, 1, 1, 2, 5]))
-            phases = draw.choice([period.numerator, period.numerator, 1, 4])
-            some = tuple(sorted(draw.sample(range(3), draw.randint(1, 3))))
-            ends = place if draw.random() < 0.9 else draw.randint(start + 1, place)
-            plan.append(FrequencyLayer(period, phases, start, ends, some))
+    """Two layers, whose periods share any factor or are equal, over a part of the route or all of it."""
+    start, factor = draw.choice([0, 0, 1, 7, 30]), draw.choice([1, 1, 2, 3, 6])
+    stop = start + factor * 14 + draw.choice([draw.randint(1, 60), draw.randint(60, 1200)])
+    plan = []
+    for _ in range(2):
+        period = Fraction(factor * draw.randint(1, 14), draw.choice([1, 1, 1, 2, 5]))
+        phases = draw.choice([period.numerator, period.numerator, 1, 4])
+        some = tuple(sorted(draw.sample(range(3), draw.randint(1, 3))))
+        plan.append(FrequencyLayer(period, phases, start, stop, some))
     blocks = [random_values(draw, generator, layer.phases, len(layer.features)) for layer in plan]
     metric, reduction = draw.choice(["l1", "l2"]), draw.choice(["sum", "mean"])
-    return TemplateMap(tuple(plan), blocks, place + draw.choice([0, 0, 5]), 3, metric, reduction)
+    return TemplateMap(tuple(plan), blocks, stop + draw.choice([0, 0, 5]), 3, metric, reduction)
 
 
 @pytest.fixture
 def always(monkeypatch: pytest.MonkeyPatch) -> None:
     """Maps of any size are searched."""
-    monkeypatch.setattr(template_map, "PHASE_COST", 1)
-    monkeypatch.setattr(template_map, "SEARCH_COST", -(10**9))
+    monkeypatch.setattr(template_map, "PHASE_COST", 0)
+    monkeypatch.setattr(template_map, "SEARCH_COST", 0)
 
 
-def check(route: TemplateMap, queries: Tensor) -> tuple[int, int]:
+def check(route: TemplateMap, queries: Tensor) -> None:
     found = route.lowest(queries)
     assert found is not None
     expected = best_match(route.scores(queries))
     assert torch.equal(found[0], expected.score)
     assert torch.equal(found[1], expected.index)
-    searched = sum(segment.cost < segment.lap for segment in route.segments)
-    return searched, len(route.segments) - searched
 
 
 @pytest.mark.usefixtures("always")
 @pytest.mark.parametrize("seed", range(4))
 def test_equals_the_scan_in_random_cases(seed: int) -> None:
     draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
-    pairs = scanned = 0
-    for _ in range(500):
+    for _ in range(300):
         route = random_map(draw, generator)
         with patch.object(layer_search, "AHEAD", draw.choice([1, 7, 4096])):
-            found = check(route, random_values(draw, generator, draw.randint(1, 5), 3))
-        pairs, scanned = pairs + found[0], scanned + found[1]
-    assert min(pairs, scanned) > 200
+            check(route, random_values(draw, generator, draw.randint(1, 5), 3))
 
 
 @pytest.mark.usefixtures("always")
@@ -134,6 +126,8 @@ def test_a_map_it_is_not_worth_for_has_no_such_way() -> None:
     assert TemplateMap((*LONG, third), [*blocks, torch.rand(289, 2)], 60_000, 2).lowest(queries) is None
     assert TemplateMap(LONG, blocks, 60_000, 2, temperature=1.0).lowest(queries) is None
     assert TemplateMap((), (), 60_000, 2).lowest(queries) is None
+    later = FrequencyLayer(LONG[1].period, LONG[1].phases, 1, 60_000, (1,))
+    assert TemplateMap((LONG[0], later), blocks, 60_000, 2).lowest(queries) is None
     assert TemplateMap(LONG, blocks, 60_000, 2).lowest(queries) is not None
 
 

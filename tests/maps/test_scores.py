@@ -213,10 +213,10 @@ def test_mean_does_not_grow_with_the_number_of_features(metric: object) -> None:
 def test_segments_cut_the_route_where_coverage_changes(route: reference.Route) -> None:
     values, plan = route
     parts = list(segments(plan, len(values)))
-    assert parts[0].start == 0
-    assert parts[-1].stop == len(values)
-    assert all(a.stop == b.start for a, b in pairwise(parts))
-    for start, stop, members, *_ in parts:
+    assert parts[0][0] == 0
+    assert parts[-1][1] == len(values)
+    assert all(a[1] == b[0] for a, b in pairwise(parts))
+    for start, stop, members in parts:
         for i in range(start, stop):
             assert members == tuple(j for j, layer in enumerate(plan) if layer.start <= i < layer.stop)
 

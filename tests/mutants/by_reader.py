@@ -29,11 +29,11 @@ MUTANTS = [
         ("tests/maps/test_template_map.py::test_trained_weights_freeze_to_none_below_0",),
     ),
     Mutant(
-        "Among equal scores the lowest place wins, also where the fast search of a template map finds "
-        "the same score in several segments (chunks).",
-        "dejavu_torch/maps/template_map.py",
-        "first = places.masked_fill(scores != best[:, None], self.places).amin(1)",
-        "first = places.masked_fill(scores != best[:, None], -1).amax(1)",
+        "Among equal scores the lowest place wins, also if the fast search of a template map finds "
+        "the same score at several phases.",
+        "dejavu_torch/maps/layer_search.py",
+        'place.masked_fill(missed, places).amin(1), "amin")',
+        'place.masked_fill(missed, places).amin(1), "amax", include_self=False)',
         ("tests/maps/test_layer_search.py::test_equals_the_scan_in_random_cases",),
     ),
     Mutant(

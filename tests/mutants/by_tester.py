@@ -8,7 +8,7 @@ MUTANTS = [
     Mutant(
         "A layer covers the last place of its chunk.",
         "dejavu_torch/maps/template_map.py",
-        "if layer.start <= start and stop <= layer.stop",
+        "if layer.start <= start < layer.stop",
         "if layer.start <= start and stop < layer.stop",
         ("tests/maps/test_scores.py::-k segments or convention_1 or uncovered",),
     ),
@@ -36,15 +36,15 @@ MUTANTS = [
     Mutant(
         "The cosine distance of features of the same direction is 0.",
         "dejavu_torch/maps/distance.py",
-        "return 1 - unit(query, dim=-1)",
-        "return 2 - unit(query, dim=-1)",
+        "return 1 - normalize(query, dim=-1)",
+        "return 2 - normalize(query, dim=-1)",
         ("tests/maps/test_distance.py::-k definition or distance_0",),
     ),
     Mutant(
         "Small l2 distances between large features are kept.",
         "dejavu_torch/maps/distance.py",
-        'compute_mode="donot_use_mm_for_euclid_dist"',
-        'compute_mode="use_mm_for_euclid_dist"',
+        'else 2.0, "donot_use_mm_for_euclid_dist"',
+        'else 2.0, "use_mm_for_euclid_dist"',
         ("tests/maps/test_distance.py::test_small_distances_between_large_features_are_kept",),
     ),
     Mutant(
@@ -109,8 +109,8 @@ MUTANTS = [
     Mutant(
         "A map file that is damaged in any bit is refused.",
         "dejavu_torch/maps/file.py",
-        "if seen != sums:",
-        "if seen.keys() != sums.keys():",
+        "if seen.get(part) != sums.get(part)",
+        "if (part in seen) != (part in sums)",
         ("tests/maps/test_file.py::-k any_flipped",),
     ),
     Mutant(

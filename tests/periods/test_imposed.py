@@ -46,7 +46,7 @@ def test_the_plan_does_not_depend_on_the_features() -> None:
 def test_no_periods_given_chooses_supportive_ones_for_the_route() -> None:
     chosen = tuple(layer.phases for layer in ImposedPeriods(bin=5).plan(torch.rand(2698, 2)))
     assert chosen == supportive_periods(540)  # 2698 frames: the last bin is short
-    assert support_of(chosen, 540).corrects == 1
+    assert support_of(chosen, 540)[0] >= 3
 
 
 @pytest.mark.parametrize("frames", [2, 5, 6, 11])

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.periods.layers import bin_period, layers_of
+from dejavu_torch.periods.spectrogram import bin_period, layers_of
 
 
 @pytest.mark.parametrize(("k", "period"), [(11, 93), (6, 171), (2, 512), (128, 8), (3, 341), (10, 102)])

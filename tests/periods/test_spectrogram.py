@@ -17,8 +17,7 @@ from torch import Tensor
 
 from dejavu_torch import SpectrogramAnalysis
 from dejavu_torch.periods import spectrogram
-from dejavu_torch.periods.layers import bin_period
-from dejavu_torch.periods.spectrogram import noise_share, strongest_bins
+from dejavu_torch.periods.spectrogram import bin_period, noise_share, strongest_bins
 from dejavu_torch.types import Plan
 
 

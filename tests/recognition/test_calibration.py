@@ -43,9 +43,6 @@ class Table:
     def scores(self, queries: Tensor) -> Tensor:
         return queries
 
-    def scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
-        return queries[:, start:stop]
-
 
 def answers(seed: int, count: int = 200) -> tuple[Tensor, Tensor]:
     draw = torch.Generator().manual_seed(seed)
