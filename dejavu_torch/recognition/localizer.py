@@ -163,7 +163,7 @@ class Localizer(Matcher):
             self.local.skipped += queries
         elif isinstance(filter, PlaceFilter) and self.states:
             for _ in range(queries):
-                self.states = self.states | {0: filter.predicted(self.states[0])}
+                self.states = self.states | {0: filter.moved(self.states[0], len(self.states[0]) - 1)}
 
     @property
     def posterior(self) -> Tensor | None:

@@ -143,8 +143,8 @@ MUTANTS = [
         "In a PlaceFilter what drives off the end of the map is off the map afterwards: the prediction "
         "adds up to 1.",
         "dejavu_torch/recognition/filter.py",
-        "off = stay * (on.sum() - moved.sum()) + leave * total + (1 - enter) * off",
-        "off = leave * total + (1 - enter) * off",
+        "off = stay * (on.sum() - moved.sum()) + leave * (1 - off) + (1 - enter) * off",
+        "off = leave * (1 - off) + (1 - enter) * off",
         ("tests/recognition/test_filter.py::-k literal_loop or drives_off",),
     ),
     Mutant(

@@ -160,8 +160,8 @@ MUTANTS = [
     Mutant(
         "A filter's search that tells nothing is made again for the next query.",
         "dejavu_torch/recognition/filter.py",
-        "if moments.varied:  # a query",
-        "if True:  # a query",
+        "if near is None and moments.varied:  # a query",
+        "if near is None:  # a query",
         (
             "tests/test_behaviour.py::test_a_search_that_tells_nothing_is_made_again",
             "tests/recognition/test_filter.py::test_a_search_that_says_nothing_is_made_again",

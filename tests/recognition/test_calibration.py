@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, open_source
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.evaluation.rejection import calibration_error
 from dejavu_torch.features.views import Stretches, Views
 from dejavu_torch.model import HIGHEST
 from dejavu_torch.recognition.calibration import (
@@ -25,7 +26,6 @@ from dejavu_torch.recognition.calibration import (
     Track,
     Trial,
     calibrated,
-    calibration_error,
     confidence_of,
     fit,
 )

@@ -150,13 +150,13 @@ def test_off_the_map_is_noticed_and_left() -> None:
 def test_who_drives_off_the_end_is_off_the_map() -> None:
     filter_ = PlaceFilter((0, 1), jump=0, leave=0, enter=0)
     at_the_end = torch.tensor([0.0, 0, 0, 1, 0])
-    assert torch.allclose(filter_.predicted(at_the_end), torch.tensor([0.0, 0, 0, 0, 1]))
+    assert torch.allclose(filter_.moved(at_the_end, 4), torch.tensor([0.0, 0, 0, 0, 1]))
 
 
 def test_a_query_that_scores_all_places_alike_says_nothing() -> None:
     filter_, before = PlaceFilter(), torch.rand(8).softmax(0)
     for alike in (torch.full((1, 7), 3.1), torch.full((1, 7), torch.inf)):
-        assert torch.allclose(filter_.posterior(alike, before)[0], filter_.predicted(before))
+        assert torch.allclose(filter_.posterior(alike, before)[0], filter_.moved(before, 7))
 
 
 def test_what_a_filter_learned_is_kept_by_its_state() -> None:
@@ -236,7 +236,6 @@ def test_no_graph_grows_from_batch_to_batch() -> None:
         (lambda: PlaceFilter()(torch.rand(2, 4), -torch.ones(5)), ["adds up to -5", "to 1"]),
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.ones(5)), ["adds up to 5", "to 1"]),
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.full((5,), math.nan)), ["adds up to nan"]),
-        (lambda: PlaceFilter().predicted(torch.ones(1)), ["posterior (1,)"]),
         (lambda: PlaceFilter(within=2.5), ["within is 2.5", "whole"]),  # type: ignore[arg-type]
         (lambda: PlaceFilter(search_every=2.5), ["search_every is 2.5"]),  # type: ignore[arg-type]
         (lambda: PlaceFilter(threshold=math.nan), ["threshold is NaN"]),
