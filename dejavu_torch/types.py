@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -212,24 +212,22 @@ class Match(_Columns):
     probability: Tensor | None = None
     sequences: Mapping[int, Match] = MappingProxyType({})
 
-    def with_probability(
-        self, probability: Tensor | None, sequences: Mapping[int, Match] | None = None
-    ) -> Match:
-        """The same with another probability, and other sequences unless None."""
-        match = Match(*self)
-        match.probability = probability
-        match.sequences = self.sequences if sequences is None else sequences
+    def _replace(self, **changes: Any) -> Match:
+        probability = changes.pop("probability", self.probability)
+        sequences = changes.pop("sequences", self.sequences)
+        match = super()._replace(**changes)
+        match.probability, match.sequences = probability, sequences
         return match
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
         """The same change of every column; `sequences` stay."""
         probability = None if self.probability is None else change(self.probability)
-        return Match(*map(change, self)).with_probability(probability, self.sequences)
+        return Match(*map(change, self))._replace(probability=probability, sequences=self.sequences)
 
     def renumbered(self, place: Callable[[Tensor], Tensor]) -> Match:
         """Places by other numbers, in `sequences` too; -1 must stay."""
         sequences = {T: match.renumbered(place) for T, match in self.sequences.items()}
-        return self._replace(index=place(self.index)).with_probability(self.probability, sequences)
+        return self._replace(index=place(self.index), sequences=sequences)
 
     @staticmethod
     def joined(parts: Iterable[Match]) -> Match:
@@ -238,10 +236,8 @@ class Match(_Columns):
         known = [part.probability for part in parts if part.probability is not None]
         probability = torch.cat(known) if len(known) == len(parts) else None
         sequences = {T: Match.joined(part.sequences[T] for part in parts) for T in parts[0].sequences}
-        return Match(*map(torch.cat, zip(*parts, strict=True))).with_probability(probability, sequences)
-
-    def _replace(self, **changes: Tensor) -> Match:
-        return Match(*super()._replace(**changes)).with_probability(self.probability, self.sequences)
+        joined = Match(*map(torch.cat, zip(*parts, strict=True)))
+        return joined._replace(probability=probability, sequences=sequences)
 
 
 class Training(NamedTuple):

@@ -45,7 +45,7 @@ def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
 
 def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
-    match = matched(4, 9, -1, 2).with_probability(sure)
+    match = matched(4, 9, -1, 2)._replace(probability=sure)
     figure, axis = plot_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")
     (points,) = axis.collections
     shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))

@@ -192,7 +192,7 @@ MUTANTS = [
     ),
     Mutant(
         "Beside a sequence stand only lengths that the queries and the places have room for.",
-        "dejavu_torch/recognition/localizer.py",
+        "dejavu_torch/evaluation/contenders.py",
         "if length <= min(queries, places))",
         "if length <= queries)",
         ("tests/recognition/test_matcher.py::test_lengths_that_there_is_room_for",),
@@ -388,8 +388,8 @@ MUTANTS = [
     Mutant(
         "The borders of routes that a sequence keeps are those of the places, through all routes.",
         "dejavu_torch/recognition/localizer.py",
-        "starts = (sum(one.places for one in route.routes[:i]) for i",
-        "starts = (route.routes[i - 1].places for i",
+        "accumulate(one.places for one in routes[:-1])",
+        "(one.places for one in routes[:-1])",
         ("tests/test_growth.py::test_a_sequence_does_not_run_from_one_route_into_the_next",),
     ),
     Mutant(

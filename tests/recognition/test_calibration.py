@@ -369,7 +369,7 @@ def test_an_export_tells_how_to_get_probabilities(model: DejaVu, tmp_path: Path)
 def test_matches_join_and_change_with_and_without_probability() -> None:
     one = Match(torch.tensor([1]), torch.tensor([0.5]), torch.tensor([True]))
     assert Match.joined([one, one]).probability is None
-    sure = one.with_probability(torch.tensor([0.9]))
+    sure = one._replace(probability=torch.tensor([0.9]))
     assert sure._replace(index=torch.tensor([2])).probability is sure.probability
     both = Match.joined([sure, sure]).map(lambda column: column[1:])
     assert (both.probability, len(both)) == (torch.tensor([0.9]), 3)
