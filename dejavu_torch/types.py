@@ -17,16 +17,13 @@ from torch import Tensor, nn
 from dejavu_torch.text import printable
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least one: 256 MB
-AT_ONCE = 64  # frames read at a time, where nobody says how many
+AT_ONCE = 64  # frames read at a time by default
 FRAME_NUMBERS = 2**28  # in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
 
 
 class InputError(ValueError):
-    """Bad input. Its message is one line: what was seen and what was expected.
-
-    Names in it may hold anything: what is not printable is escaped, and a long text loses its middle.
-    """
+    """Bad input. Its message is one line, printable and not too long: what was seen and what was expected."""
 
     def __init__(self, message: object) -> None:
         text = printable(message)
@@ -38,11 +35,10 @@ class InputError(ValueError):
 class Traverse(ABC):
     """Frames along a route, in order, read in batches: never all of them in memory.
 
-    A traverse can be iterated any number of times and yields the same values each time, whatever the batch
-    size.
+    It can be iterated any number of times and yields the same values each time, whatever the batch size.
 
     Attributes:
-        name: in messages, a path or a `sim:` address; see `printable`.
+        name: in messages, a path or a `sim:` address.
         length: number of frames N, or None if only reading to the end can tell.
         place: (N,) float64, the true position of each frame in reference frames, or None if unknown.
         cut: how the frames were cut out of one long image, and which of all such cuts they are: two traverses
@@ -71,7 +67,7 @@ class Traverse(ABC):
         for batch in self.batches(self.batch_size()):
             if seen >= stop:
                 return
-            part = batch[max(0, start - seen) : max(0, stop - seen)]
+            part = batch[max(0, start - seen) : stop - seen]
             if len(part):
                 yield part
             seen += len(batch)
@@ -95,11 +91,7 @@ class Traverse(ABC):
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
-        """Shape of one frame: (C,H,W), or (D,) if the traverse holds features.
-
-        Raises:
-            InputError: there are no frames.
-        """
+        """Shape of one frame: (C,H,W), or (D,) if the traverse holds features."""
         for batch in self.batches(1):
             return tuple(batch.shape[1:])
         raise InputError(f"{self.name} holds no frames; expected at least one")
@@ -117,8 +109,7 @@ class Traverse(ABC):
         return f"{self.name} {self.length}"
 
     def state(self, start: int, stop: int) -> str:
-        """Changes if the frames [start, stop) do, as far as can be told without reading them; such as the
-        times of their files."""
+        """Changes with the frames [start, stop), as far as can be known unread, such as by times of files."""
         return ""
 
     def count(self) -> int:
@@ -126,11 +117,7 @@ class Traverse(ABC):
         return sum(map(len, self.batches(self.batch_size()))) if self.length is None else self.length
 
     def batch_size(self, most: int = AT_ONCE) -> int:
-        """How many frames to read at a time: `most`, or fewer if frames are large.
-
-        Raises:
-            InputError: a frame of more than 2^28 numbers.
-        """
+        """How many frames to read at a time: `most`, or fewer if they are large; refuses too large ones."""
         shape = self.frame_shape
         numbers = math.prod(shape)
         if numbers > FRAME_NUMBERS:
@@ -149,8 +136,7 @@ class FrequencyLayer:
         start, stop: the chunk [start, stop) in places.
         features: the indices of the features that take part, increasing.
 
-    Convention: a place is a frame of the reference, or an even step if frames were resampled (section IV-B).
-        phase(i) = floor((i mod period) * phases / period) counts from absolute place 0.
+    Convention: phase(i) = floor((i mod period) * phases / period) counts from absolute place 0.
     """
 
     period: Fraction
@@ -162,17 +148,13 @@ class FrequencyLayer:
     def __post_init__(self) -> None:
         object.__setattr__(self, "period", Fraction(self.period))
         a, b = self.period.as_integer_ratio()
+        seen = f"a layer has period {self.period} and {self.phases} phases"
         if a <= 0 or self.phases < 1:
-            raise InputError(
-                f"a layer has period {self.period} and {self.phases} phases; expected period > 0, phases >= 1"
-            )
+            raise InputError(f"{seen}; expected period > 0, phases >= 1")
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
         if max(self.stop * b, a * self.phases) >= 2**63:
-            raise InputError(
-                f"a layer has period {self.period}, {self.phases} phases and the end {self.stop}; "
-                "expected numbers whose products are below 2^63"
-            )
+            raise InputError(f"{seen} up to {self.stop}; expected numbers whose products are below 2^63")
         if not self.features or not all(i < j for i, j in pairwise((-1, *self.features))):
             raise InputError(
                 "a layer's feature indices must be non-empty, non-negative and strictly increasing"
@@ -201,12 +183,10 @@ class _Columns(NamedTuple):
 class Match(_Columns):
     """Where each query was found (eq. 5) and whether to believe it (eq. 6): index, score, accepted.
 
-    index: (Q,) int64, the reported place, -1 where no place has a finite score; (Q,k) candidates, best first.
-    score: float, the lowest S; lower is better, +inf where nothing covers.
-    accepted: bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
-    probability: float64, of being right, where the map is calibrated, else None; of candidates only the first
-        has one, the others NaN. sequences: by T, the matches (Q,) by sequences of T queries, where wanted.
-        Both are outside the tuple.
+    index: (Q,) int64, the reported place, -1 if no place has a finite score; (Q,k) candidates, best first.
+    score: float, lower is better, +inf where nothing covers. accepted: bool, see `DejaVu.acceptance`.
+    probability: float64, of being right, if the map is calibrated, else None; NaN for all but the first
+        candidate. sequences: by T, matches (Q,) by sequences of T queries. Both are outside the tuple.
     """
 
     probability: Tensor | None = None
@@ -241,26 +221,10 @@ class Match(_Columns):
 
 
 class Training(NamedTuple):
-    """How a map was trained; None of it where it was learnt by eq. 1.
-
-    steps: of the optimiser. seed: of the run, None where none was set.
-    """
+    """How a map was trained: steps of the optimiser, and the run's seed, None if none was set."""
 
     steps: int
     seed: int | None
-
-
-class GroundTruth(NamedTuple):
-    """The correct places of each query, and the queries and places that are not scored.
-
-    positives: (Q,R) int64, every correct place of each query, -1 as padding; a row of -1 has none.
-    judged: (Q,) bool, False where the ground truth does not mention a query: it is left out of every score.
-    ignored: (Q,S) int64, places that count neither as correct nor as wrong, -1 as padding; S may be 0.
-    """
-
-    positives: Tensor
-    judged: Tensor
-    ignored: Tensor
 
 
 class SequenceModel(nn.Module, ABC):
@@ -274,11 +238,7 @@ class SequenceModel(nn.Module, ABC):
 
     @abstractmethod
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        """The state before the first query.
-
-        Args:
-            fixed: of the shape that it keeps, as an exported graph needs.
-        """
+        """The state before the first query; `fixed`: of the shape that it keeps, as in an exported graph."""
 
     @abstractmethod
     def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
@@ -298,24 +258,8 @@ class SequenceModel(nn.Module, ABC):
 
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:
-        """Refuse, or warn of, a number of queries or places that it makes no sense for.
-
-        Args:
-            queries: None where it is not known.
-
-        Raises:
-            InputError: naming what does not fit.
-        """
+        """Refuse, or warn of, a number of places or of queries, if known, that it makes no sense for."""
 
     def threshold_of(self, threshold: float | None) -> float | None:
-        """What a score has to be below to be accepted, where it is `threshold` for single queries; None where
-        nobody said."""
+        """What a score has to be below to be accepted, if it is `threshold` for single queries."""
         return threshold
-
-
-class PRCurve(NamedTuple):
-    """Precision and recall when every query with score <= threshold reports; each (T,) float64."""
-
-    precision: Tensor
-    recall: Tensor
-    threshold: Tensor

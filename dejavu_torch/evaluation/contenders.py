@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import as_ground_truth, counted
-from dejavu_torch.evaluation.curves import Scores, curve_of, evaluate
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted
+from dejavu_torch.evaluation.curves import PRCurve, Scores, curve_of, evaluate
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import GroundTruth, Match, PRCurve, SequenceModel
+from dejavu_torch.types import Match, SequenceModel
 
 LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
 

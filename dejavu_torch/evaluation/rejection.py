@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Picture, canvas
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions that a report tells of
 BINS = 10

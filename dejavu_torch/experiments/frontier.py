@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import check_output_folder, whole_file, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
@@ -29,7 +30,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
 SHOWN = (1.0, 1.6, 3.2, 5.0, 10.0)  # of the table

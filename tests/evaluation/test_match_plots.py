@@ -7,7 +7,7 @@ import torch
 from drawn import matched, render, texts
 
 from dejavu_torch import PlaceFilter, SequenceMatcher
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
     PosteriorImage,
     Row,
@@ -20,7 +20,7 @@ from dejavu_torch.evaluation.match_plots import (
     posterior_image,
     score_matrix,
 )
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 
 def dots(axis: object) -> dict[str, list[tuple[float, float]]]:

@@ -123,22 +123,22 @@ MUTANTS = [
     Mutant(
         "A query that nothing covers reports the place -1.",
         "dejavu_torch/recognition/select.py",
-        "found.append((torch.where(score.isfinite(), index, -1), score))",
-        "found.append((index, score))",
+        "index = torch.where(finite, index, -1)",
+        "pass",
         ("tests/recognition/test_select.py::test_convention_2_a_query_that_nothing_covers_reports_nothing",),
     ),
     Mutant(
         "Behind the last candidate with a finite score the place is -1.",
         "dejavu_torch/recognition/select.py",
-        "torch.where(score.isfinite(), index, -1)",
-        "torch.where(score.isfinite() | (rank > 0), index, -1)",
+        "torch.where(finite, index, -1)",
+        "torch.where(finite | (torch.arange(k) > 0), index, -1)",
         ("tests/recognition/test_candidates.py::test_equals_reference",),
     ),
     Mutant(
         "Of a sequence, a place that nothing covers for the latest query is not reported.",
         "dejavu_torch/recognition/sequence.py",
-        "best = best.masked_fill(~valid[len(state) :], math.inf)",
-        "pass",
+        ".masked_fill(~valid[-len(used) :], math.inf)",
+        "",
         (
             "tests/recognition/test_sequence.py::test_convention_2_a_place_that_nothing_covers_is_not_reported",
         ),
@@ -381,8 +381,8 @@ MUTANTS = [
     Mutant(
         "A sequence does not run from one route of a merged map into the next.",
         "dejavu_torch/recognition/sequence.py",
-        "cuts, ways = [*firsts[1:]], []",
-        "cuts, ways = [], []",
+        "rows.tensor_split([*firsts[1:]], 1)",
+        "rows.tensor_split([], 1)",
         ("tests/recognition/test_sequence.py::test_trajectories_stay_on_their_route",),
     ),
     Mutant(
