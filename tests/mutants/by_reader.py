@@ -366,7 +366,7 @@ MUTANTS = [
     Mutant(
         "A live answer on a merged map gives the frame as counted on its own route.",
         "dejavu_torch/live/localizer.py",
-        "frame=int(found.table.own_frame_of(match.index)) if routes else shown,",
+        "frame=int(table.own_frame_of(match.index)) if routes else shown,",
         "frame=shown,",
         ("tests/test_cli_growth.py::test_live_names_the_route",),
     ),
