@@ -11,8 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.types import InputError, Match, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel
 
 IMPOSSIBLE = 1e-30  # a probability that still has a gradient
 LIKELY = 0.99  # of all probability: a stretch of places with less is not scored alone
@@ -229,8 +228,9 @@ class LocalSearch:
         self.search: Moments | None = None  # of the last search
         self.since = 0  # queries from it on
 
-    def __call__(self, query: Tensor) -> LocalScores:
-        """Scores as of `PlaceFilter` of the next query, (1,K)."""
+    def __call__(self, query: Tensor, whole: bool = False) -> tuple[Tensor, int]:
+        """Scores as of `PlaceFilter` of the next query (1,K): (1,W), with the best place, and the first of
+        the W places, which are all if `whole`."""
         filter, places, moments, since = self.filter, self.route.places, self.search, self.since
         near = None if moments is None or since >= filter.search_every else self._likely()
         belief, start = (self.posterior, 0) if near is None else near
@@ -253,7 +253,11 @@ class LocalSearch:
         elsewhere = -elsewhere.clamp(torch.finfo(belief.dtype).tiny, 1).log()
         found = filter.near_scores(belief[None, :-1], scores)
         found = torch.where(found.isfinite(), torch.minimum(found, elsewhere), math.inf)
-        return LocalScores(found, start, elsewhere, moments.valid)
+        if not others or (not whole and bool(found.amin() < elsewhere)):
+            return found, start
+        row = elsewhere.repeat(1, places).masked_fill_(~moments.valid, math.inf)
+        row[:, start : start + found.shape[1]] = found
+        return row, 0
 
     def _likely(self) -> tuple[Tensor, int] | None:
         """The belief of the stretch that holds most of it and of `within` places to each side, and the first
@@ -279,28 +283,6 @@ class LocalSearch:
         whole = (_rest(self.belief, others) / max(1, others)).repeat(places + 1)
         whole[self.start : self.start + len(on)], whole[-1] = on, self.belief[-1]
         return whole
-
-
-class LocalScores(NamedTuple):
-    """Scores (1,W) of the places from `start` on; all others that are covered, (1,N), score `elsewhere`."""
-
-    scores: Tensor
-    start: int
-    elsewhere: Tensor
-    covered: Tensor
-
-    def row(self) -> Tensor:
-        """(1,N)"""
-        row = self.elsewhere.repeat(self.covered.shape).masked_fill_(~self.covered, math.inf)
-        row[:, self.start : self.start + self.scores.shape[1]] = self.scores
-        return row
-
-    def best(self) -> Match:
-        """The best place, (1,1); most often without a row of all places."""
-        near = best_candidates(self.scores, 1, 0)
-        if bool(near.score < self.elsewhere):
-            return near._replace(index=near.index + self.start)
-        return best_candidates(self.row(), 1, 0)
 
 
 def updated(expected: Tensor, likelihood: Tensor, rest: Tensor | float = 0) -> Tensor:

@@ -128,6 +128,13 @@ class Localizer:
         beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.lengths}
         return match._replace(sequences=beside)
 
+    def _locally(self, descriptor: Tensor) -> Match:
+        assert self.local is not None
+        whole = self.matching.k is not None or self.matching.on_scores is not None
+        scores, start = self.local(descriptor, whole)
+        match = self._matched(scores)
+        return match._replace(index=match.index + start)
+
     def _matched(self, scores: Tensor, confidence: Tensor | None = None) -> Match:
         """The best places by the scores that they are found by."""
         if self.matching.on_scores is not None:
@@ -148,10 +155,7 @@ class Localizer:
 
     def _by_scores(self, descriptors: Tensor, route: PlaceMap) -> Match:
         if self.local is not None:
-            near = map(self.local, descriptors.split(1))
-            if self.matching.k is None and self.matching.on_scores is None:
-                return self._answer(Match.joined(one.best() for one in near))
-            return Match.joined(self._matched(one.row()) for one in near)
+            return Match.joined(map(self._locally, descriptors.split(1)))
         parts = descriptors.split(max(1, SCORES_AT_ONCE // route.places))
         return Match.joined(self.match(route.scores(part)) for part in parts)
 
