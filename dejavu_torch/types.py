@@ -36,23 +36,15 @@ class Traverse(ABC):
     """Frames along a route, in order, read in batches: never all of them in memory.
 
     It can be iterated any number of times and yields the same values each time, whatever the batch size.
-
-    Attributes:
-        name: in messages, a path or a `sim:` address.
-        length: number of frames N, or None if only reading to the end can tell.
-        place: (N,) float64, the true position of each frame in reference frames, or None if unknown.
-        cut: how the frames were cut out of one long image, and which of all such cuts they are: two traverses
-            that were cut alike show the same places. None if they were not.
-        seeks: whether `between` reads nothing before the first frame asked for.
-        sized: whether the size of the frames was asked for, as by `width=` of a video.
     """
 
-    name: str = "traverse"
-    length: int | None = None
-    place: Tensor | None = None
+    name: str = "traverse"  # in messages, a path or a `sim:` address
+    length: int | None = None  # number of frames N, None if only reading to the end can tell
+    place: Tensor | None = None  # (N,) float64, the true position of each frame in reference frames
+    # how the frames were cut out of one long image, and which of all such cuts they are: alike, same places
     cut: tuple[tuple[int, ...], range] | None = None
-    seeks: bool = False
-    sized: bool = False
+    seeks: bool = False  # whether `between` reads nothing before the first frame asked for
+    sized: bool = False  # whether the size of the frames was asked for, as by `width=` of a video
 
     @abstractmethod
     def batches(self, size: int) -> Iterator[Tensor]:
@@ -247,14 +239,6 @@ class SequenceModel(nn.Module, ABC):
         Args:
             firsts: the first place of each route of the map.
         """
-
-    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """`step` over consecutive batches (B,N); no gradient passes from one to the next."""
-        state = None
-        for scores in batches:
-            state = self.start(scores.shape[1]).to(scores) if state is None else state
-            found, state = self.step(scores, state.detach())
-            yield found
 
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:

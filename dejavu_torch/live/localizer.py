@@ -26,23 +26,17 @@ ROUNDING = 1e-3  # by which a value may miss the range from 0 to 1
 
 
 class LiveMatch(NamedTuple):
-    """Where a frame was found.
-
-    place, score, accepted: as of `Match`. frame: the reference frame that the place shows, -1 for none; name:
-    its name, if it has one; route: on a merged map, the name of its route. posterior: the probability that a
-    filter gives the place; probability: that of being right; NaN if there is none. milliseconds: from the
-    frame to this answer.
-    """
+    """Where a frame was found; place, score, probability and accepted as of `Match`, NaN for none."""
 
     place: int
-    frame: int
-    name: str
+    frame: int  # the reference frame that the place shows, -1 for none
+    name: str  # of that frame, if it has one
     score: float
-    posterior: float
+    posterior: float  # the probability that a filter gives the place
     probability: float
     accepted: bool
-    milliseconds: float
-    route: str = ""
+    milliseconds: float  # from the frame to this answer
+    route: str = ""  # of a merged map, the one that the frame is on
 
 
 class LiveLocalizer:
@@ -59,11 +53,10 @@ class LiveLocalizer:
 
     Convention: the answers are those of `DejaVu.localize`, but for rounding. A frame that is refused changes
         nothing. `localizer(frame, left_out)` says how many frames were skipped since the one before: a
-        `PlaceFilter` moves once more for each of them.
+        `PlaceFilter` moves once more for each.
 
     Raises:
-        InputError: a model without a map, or whose places are at even steps along the ground; calling it: a
-            frame of another type or shape, or outside [0, 1].
+        InputError: no map, or one of even steps along the ground; a frame of another type, shape or range.
 
     Example:
         >>> route = torch.rand(60, 1, 32, 32)
@@ -120,8 +113,7 @@ class LiveLocalizer:
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) probabilities of each place, and of being off the map, after the latest frame; None without
-        a filter, or before the first frame."""
+        """(N+1,) of a filter after the latest frame; None without one, or before the first frame."""
         return self._localizer.posterior
 
     def _describe(self, batch: Tensor) -> Tensor:

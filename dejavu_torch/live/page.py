@@ -50,15 +50,12 @@ class Page:
     """Serves the page at http://127.0.0.1:PORT/ from threads of its own, as a context manager.
 
     Args:
-        port: 0 is any that is free; `url` says which.
+        port: 0 is any that is free; `url` says which. One in use is refused.
         title: a line below the heading.
         reference: gives pictures of the reference's frames.
 
     Convention: only requests for 127.0.0.1 and localhost are answered, so that no other site can ask for it
         by a name of its own.
-
-    Raises:
-        InputError: a port that is in use, or none.
     """
 
     def __init__(
@@ -98,7 +95,6 @@ class Page:
         self.snapshot = snapshot
 
     def answer(self, request: BaseHTTPRequestHandler) -> None:
-        """Answer one request."""
         host = request.headers.get("Host", "").partition(":")[0]
         address = urlsplit(request.path)
         body, kind, status = b"", "text/plain", HTTPStatus.OK
@@ -149,8 +145,8 @@ def curve(scores: Tensor, posterior: bool) -> list[float]:
     """What the page draws of all places, as at most `COLUMNS` heights in [0, 1].
 
     Args:
-        scores: (N,): the height of a column is that of its best place; the best of all has 1, the worst 0.
-        posterior: they are probabilities (N+1,), the last of being off the map: a column is a sum of places.
+        scores: (N,), a column is as high as its best place, 1 for the best of all and 0 for the worst; or a
+            posterior (N+1,), a column is a sum of places.
 
     Example:
         >>> curve(torch.tensor([3.0, 1.0, 2.0, torch.inf]), posterior=False)
@@ -185,12 +181,10 @@ def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
 
 
 class ReferencePictures:
-    """Pictures of the frames of a reference, for `Page`.
+    """Pictures of the frames of the map's reference, which has so many, for `Page`.
 
-    Args:
-        reference: the traverse that the map was learned from. If it can only be read in order, as a video, a
-            thread makes small pictures of at most `KEPT` frames, of which the nearest is shown.
-        frames: how many the map's reference has; another number is refused.
+    Of a traverse that can only be read in order, as a video, a thread makes small pictures of at most `KEPT`
+    frames, of which the nearest is shown.
     """
 
     def __init__(self, reference: Traverse, frames: int) -> None:

@@ -39,16 +39,13 @@ class Platt(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """What makes probabilities of confidences, None where nothing does.
+    """What makes probabilities of confidences, None if nothing does."""
 
-    single: of queries by themselves. filter: of a `PlaceFilter` with its defaults.
-    """
-
-    single: Platt | None
-    filter: Platt | None
+    single: Platt | None  # of queries by themselves
+    filter: Platt | None  # of a `PlaceFilter` that searches for every query
 
     def of(self, sequence: SequenceModel | None) -> Platt | None:
-        """The one for a way of matching; a filter that does not score all places has none."""
+        """The one for a way of matching."""
         if sequence is None:
             return self.single
         return self.filter if isinstance(sequence, PlaceFilter) and sequence.search_every == 1 else None
@@ -68,13 +65,11 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
     """The slope and offset under which the answers that were seen are most likely.
 
     Args:
+        confidence: (n,) float; -inf is left out. right: (n,) bool.
         weight: (n,) how often each answer counts; None is once.
 
-    Shape: confidence (n,) float and right (n,) bool -> Platt.
-
     Convention: the targets are not 1 and 0, but (r + 1) / (r + 2) and 1 / (w + 2) for r right and w wrong
-        answers, so that the fit is finite. Confidence of -inf is left out. A slope is never negative: if
-        right answers had less confidence, each has the share of right ones as its probability.
+        answers, so that the fit is finite. If right answers had less confidence, the slope is 0.
 
     Source: Platt, Advances in Large Margin Classifiers (1999); by Newton's method, as of Lin, Lin and Weng,
         Machine Learning 68 (2007).
@@ -119,10 +114,8 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
 
 
 def confidence_of(scores: Tensor) -> Tensor:
-    """How much the best place of each query stands out, (Q,N) -> (Q,); -inf where none is found.
-
-    Minus its score, and `MARGIN` times how much lower it is than the best beyond `TOLERANCE` places.
-    """
+    """Confidence in the best place of each query, (Q,N) -> (Q,); -inf if none is found: minus its score, plus
+    `MARGIN` times how much lower it is than the best beyond `TOLERANCE` places."""
     return confidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE))
 
 
@@ -134,12 +127,9 @@ def confidence(candidates: Match) -> Tensor:
 
 
 class Track:
-    """Confidence of a filter's answers, which one posterior cannot give: off the map it follows the best of
-    places that are all wrong.
+    """Confidence in a filter's answers: their log odds, and how much single queries stood out there lately.
 
-    The log odds of the answer, and `SPREADS` times how much single queries stood out there lately: how
-    many standard deviations they scored below their mean, and `MARGIN` times how many below the best place
-    beyond `TOLERANCE`.
+    The posterior alone does not do: off the map it follows the best of wrong places.
     """
 
     def __init__(self) -> None:
@@ -171,15 +161,12 @@ def _around(index: Tensor, radius: int, scores: Tensor) -> Tensor:
 
 @torch.no_grad()
 def calibrated(route: PlaceMap, trials: Iterable[Trial], another_visit: bool = False) -> Calibration:
-    """Fit on queries whose places are known, and on the same with the place and its surroundings, twice the
-    tolerance to each side, left out: answers off the map, of which none is right.
+    """Fit on queries whose places are known, and on the same without the scores near these places: answers
+    off the map, of which none is right.
 
     Args:
         another_visit: the queries are of another visit, whose own wrong answers show how often to expect one.
             Those off the map then count, together, for as many as lack to `MISSED`.
-
-    Raises:
-        InputError: no right answer of single queries, or none whose place is known.
     """
     answers: tuple[list[Tensor], list[Tensor]] = [], []  # of single queries, and of a filter
     for descriptors, places in trials:

@@ -19,17 +19,15 @@ UNLIKELY = 1e-4  # of all probability: a place with less ends such a stretch
 
 
 class Moments(NamedTuple):
-    """Mean and standard deviation (Q,1) of each query's finite scores, whether these differ at all, and which
-    scores are finite (Q,N)."""
+    """Mean and standard deviation (Q,1) of the finite scores, 1 if all are alike; and which are finite."""
 
     mean: Tensor
     spread: Tensor
-    varied: Tensor
-    valid: Tensor
+    varied: Tensor  # (Q,1), whether the scores differ at all
+    valid: Tensor  # (Q,N)
 
 
 def moments_of(scores: Tensor) -> Moments:
-    """Of scores (Q,N); the spread is 1 where all are alike."""
     valid = scores.isfinite()
     count = valid.sum(1, keepdim=True).clamp(min=1)
     mean = torch.where(valid, scores, 0).sum(1, keepdim=True) / count
@@ -42,13 +40,12 @@ def moments_of(scores: Tensor) -> Moments:
 class PlaceFilter(SequenceModel):
     """Where the latest query is, from all queries so far: the forward algorithm of a hidden Markov model.
 
-    Its states are the N places and one more, off the map. From one query to the next the camera moves forward
-    by 0 to V places, jumps to any place, leaves the map or enters it anywhere; driving off its end leaves it.
-    A place scored z standard deviations below the mean of a query's scores has the likelihood
-    exp(sharpness z), being off the map exp(sharpness off_map).
+    Its states are the N places and one more, off the map. A place scored z standard deviations below the mean
+    of a query's scores has the likelihood exp(sharpness z), being off the map exp(sharpness off_map).
 
     Args:
         moves: probabilities of moving by 0, 1, .., V places from one query to the next; they add up to 1.
+            Driving off the end of the map leaves it.
         jump: probability of being anywhere on the map next. leave, enter: of leaving and entering the map.
         sharpness: nats for a standard deviation; low, as consecutive frames are alike.
         off_map: standard deviations; a place that stands out less than this suggests being off the map.
@@ -61,15 +58,14 @@ class PlaceFilter(SequenceModel):
     Shape: scores (Q,N), the posterior (N+1,) before them or None -> (Q,N), -log of a probability in nats.
 
     Convention: causal. exp(-score) is at most the probability that the right place lies within `within`
-        places. The state is the posterior (N+1,), its last element that of being off the map, and all 0
-        before the first query. A place that nothing covers scores +inf; a query that scores all places alike
-        changes nothing. The settings from `moves` to `off_map` are parameters.
+        places. The state is the posterior, its last element that of being off the map, and all 0 before the
+        first query. A place that nothing covers scores +inf. `moves` to `off_map` are parameters.
 
     Source: an off-map state is in the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021);
         motion model and likelihood are ours.
 
     Raises:
-        InputError: settings out of range; forward: scores or a posterior of another shape or range.
+        InputError: settings, scores or a posterior of another shape or out of range.
 
     Example:
         >>> scores = torch.tensor([[0.0, 5, 5, 5, 5, 5], [5, 0, 5, 5, 0, 5], [5, 5, 0, 5, 5, 5]])
@@ -151,13 +147,8 @@ class PlaceFilter(SequenceModel):
         return torch.stack(rows)
 
     def likelihoods(self, scores: Tensor, moments: Moments) -> Tensor:
-        """Likelihoods of each query up to a factor, the greatest of each row 1.
-
-        Args:
-            scores: of W places. moments: of the scores of all places, which may be more.
-
-        Shape: (Q,W) -> (Q,W+2): of each place, of being off the map, and of a place that scores as the mean.
-        """
+        """Likelihoods of W places, of being off the map, and of a place that scores as the mean, up to a
+        factor: (Q,W) -> (Q,W+2), the greatest of each row 1."""
         valid, sharpness = scores.isfinite(), self.log_sharpness.to(scores).exp()
         z = torch.where(valid, moments.mean - scores, 0) / moments.spread
         others = torch.stack([self.off_map.to(z), z.new_zeros(())]).expand(len(z), 2)
@@ -172,10 +163,10 @@ class PlaceFilter(SequenceModel):
         return torch.cat([((1 - off) / places).expand(places), off[None]])
 
     def moved(self, belief: Tensor, places: int, start: int = 0) -> Tensor:
-        """The belief before the next query.
+        """The belief before the next query, of up to V more places, if there are.
 
         A belief (W+1,) holds the probability of each of the places [start, start + W) and of being off the
-        map; all other places have the rest together. The result has up to V more places, while there are.
+        map; all other places have the rest together.
         """
         moves, rates = (logits.to(belief).softmax(0) for logits in (self.move_logits, self.rate_logits))
         (stay, jump, leave), enter = rates, self.enter_logit.sigmoid().to(belief)
@@ -229,8 +220,8 @@ class LocalSearch:
         self.since = 0  # queries from it on
 
     def __call__(self, query: Tensor, whole: bool = False) -> tuple[Tensor, int]:
-        """Scores as of `PlaceFilter` of the next query (1,K): (1,W), with the best place, and the first of
-        the W places, which are all if `whole`."""
+        """Scores (1,W) for the next query (1,K), the best among them, and the first of these places; `whole`:
+        of all places."""
         filter, places, moments, since = self.filter, self.route.places, self.search, self.since
         near = None if moments is None or since >= filter.search_every else self._likely()
         belief, start = (self.posterior, 0) if near is None else near
@@ -260,8 +251,7 @@ class LocalSearch:
         return row, 0
 
     def _likely(self) -> tuple[Tensor, int] | None:
-        """The belief of the stretch that holds most of it and of `within` places to each side, and the first
-        of these; None if no stretch does."""
+        """The belief of a stretch that holds nearly all of it, if any, with a margin; and its first place."""
         assert self.belief is not None
         on, within = self.belief[:-1], self.filter.within
         (likely,) = (on > UNLIKELY).nonzero(as_tuple=True)

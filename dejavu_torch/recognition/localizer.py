@@ -27,23 +27,16 @@ LISTED = 16  # numbers held for each of the best of a query, while two lists are
 
 
 class Matching(NamedTuple):
-    """How queries are matched.
+    """How queries are matched."""
 
-    sequence: scores consecutive queries together; None matches each by itself.
-    lengths: T of further sequences beside it, at the speeds of a `SequenceMatcher`.
-    k: candidates of a query; None gives matches (Q,). radius: places, any two of them differ by more.
-    rule: which are accepted. platt: makes probabilities; None makes none.
-    on_scores: is given the scores (B,N) that places are found by. search: of single queries.
-    """
-
-    sequence: SequenceModel | None = None
-    lengths: tuple[int, ...] = ()
-    k: int | None = None
-    radius: int = 0
+    sequence: SequenceModel | None = None  # None matches each query by itself
+    lengths: tuple[int, ...] = ()  # T of further sequences beside it, at the speeds of a `SequenceMatcher`
+    k: int | None = None  # candidates of a query; None gives matches (Q,)
+    radius: int = 0  # places, any two candidates differ by more
     rule: Acceptance = Acceptance()
-    platt: Platt | None = None
-    on_scores: Callable[[Tensor], None] | None = None
-    search: Search = "auto"
+    platt: Platt | None = None  # makes probabilities
+    on_scores: Callable[[Tensor], None] | None = None  # is given the scores (B,N) that places are found by
+    search: Search = "auto"  # of single queries
 
 
 SINGLE = Matching()  # each query by itself
@@ -106,7 +99,7 @@ class Localizer:
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
-        """So many queries were left out: a `PlaceFilter` moves once more for each."""
+        """So many queries were skipped: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
         if self.local is not None:
             self.local.skipped += queries
@@ -136,7 +129,6 @@ class Localizer:
         return match._replace(index=match.index + start)
 
     def _matched(self, scores: Tensor, confidence: Tensor | None = None) -> Match:
-        """The best places by the scores that they are found by."""
         if self.matching.on_scores is not None:
             self.matching.on_scores(scores)
         return self._answer(best_candidates(scores, self.matching.k or 1, self.matching.radius), confidence)

@@ -35,13 +35,16 @@ def search(route: PlaceMap, queries: Tensor, n: int, method: Search = "auto") ->
     own = route.lowest(queries) if n == 1 and method == "auto" else None
     if own is not None:
         return own[0][:, None], own[1][:, None]
-    found = []
-    for part in queries.split(max(1, SCORES_AT_ONCE // max(1, route.block_places))):
-        best = empty_topk(part, n)
+    score, place = empty_topk(queries, n)
+    at_once, first = max(1, SCORES_AT_ONCE // max(1, route.block_places)), 0
+    for part in queries.split(at_once):
         for start, scores in route.score_blocks(part):
-            best = with_block(best, scores, start)
-        found.append(best)
-    score, place = (torch.cat(column) for column in zip(*found, strict=True))
+            better = (scores.amin(1) < score[first : first + len(part), -1]).nonzero()[:, 0]
+            if len(better):
+                scores = scores[better] if len(better) < len(scores) else scores
+                block, better = topk(scores, min(n, scores.shape[1]), start), better + first
+                score[better], place[better] = merge_topk((score[better], place[better]), block)
+        first += len(part)
     return score, place
 
 
@@ -51,17 +54,6 @@ def empty_topk(queries: Tensor, n: int) -> Best:
         (len(queries), n), math.inf, dtype=torch.promote_types(queries.dtype, torch.float32)
     )
     return score, torch.full_like(score, torch.iinfo(torch.int64).max, dtype=torch.int64)
-
-
-def with_block(best: Best, scores: Tensor, start: int) -> Best:
-    """The best of these and of the scores (Q,W) of later places, from `start` on."""
-    n = best[0].shape[1]
-    (better,) = (scores.amin(1) < best[0][:, -1]).nonzero(as_tuple=True)
-    if not len(better):
-        return best
-    block = topk(scores[better] if len(better) < len(scores) else scores, min(n, scores.shape[1]), start)
-    score, place = merge_topk((best[0][better], best[1][better]), block)
-    return best[0].to(score).index_copy(0, better, score), best[1].index_copy(0, better, place)
 
 
 def topk(scores: Tensor, n: int, start: int = 0) -> Best:

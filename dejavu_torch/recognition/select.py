@@ -15,15 +15,11 @@ PROBABLE = 0.5  # what a calibrated map accepts from by default
 
 
 class Acceptance(NamedTuple):
-    """Which answers are accepted; `DejaVu.acceptance` chooses it.
+    """Which answers are accepted; `DejaVu.acceptance` chooses it."""
 
-    threshold: those whose score is below; None accepts every finite score. precision: instead, those that are
-    at least so probably right. given: whether one of the two was asked for, or is stored in the map.
-    """
-
-    threshold: float | None = None
-    precision: float | None = None
-    given: bool = True
+    threshold: float | None = None  # those whose score is below; None accepts every finite score
+    precision: float | None = None  # instead, those that are at least so probably right
+    given: bool = True  # whether one of the two was asked for, or is stored in the map
 
     def __str__(self) -> str:
         if self.precision is not None:

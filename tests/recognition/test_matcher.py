@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from helpers import streamed
 from torch import Tensor
 
 from dejavu_torch.evaluation.contenders import lengths_beside
@@ -40,7 +41,7 @@ def test_a_sequence_and_what_stands_beside_it(
     """A matcher's at its own speeds, a filter's at speed 1, out of the scores of single queries."""
     found = matched(Matching(sequence, (1, 5, 11)), size=size)
     with torch.no_grad():
-        (own,) = sequence.stream([SCORES])
+        (own,) = streamed(sequence, [SCORES])
     assert found.index.tolist() == own.argmin(1).tolist()
     assert torch.allclose(found.score, own.min(1).values)
     assert list(found.sequences) == [1, 5, 11]
