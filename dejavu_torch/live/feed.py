@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 
 from dejavu_torch.data.camera import Frame
 from dejavu_torch.types import InputError
@@ -15,20 +16,12 @@ WAITING = 2  # frames read ahead, if none is dropped
 
 
 class FrameReader:
-    """Iterates frames that a thread of its own reads, as a context manager.
+    """Iterates frames that a thread of its own reads, as a context manager; what reading raises comes last.
 
     Args:
         newest: only the newest frame waits; earlier ones are dropped, and counted in `dropped`.
-        timeout: seconds without a frame after which the source has stalled; None waits forever.
+        timeout: seconds without a frame after which the source has stalled, an InputError; None waits.
         name: of the source, for messages.
-
-    Raises:
-        InputError: iterating: the source stalled, or what reading it raises, after the frames before.
-
-    Example:
-        >>> with FrameReader(Frame(i, i / 30, None) for i in range(3)) as reader:
-        ...     [frame.number for frame in reader]
-        [0, 1, 2]
     """
 
     def __init__(
@@ -82,20 +75,16 @@ class FrameReader:
 
     def _drop(self) -> int:
         """Drop the frames that wait; how many they were."""
-        for count in range(WAITING):
-            try:
+        count = 0
+        with suppress(queue.Empty):
+            while True:
                 self._waiting.get_nowait()
-            except queue.Empty:
-                return count
-        return WAITING
+                count += 1
+        return count
 
 
 def in_real_time(frames: Iterable[Frame], name: str, rate: float | None = None) -> Iterator[Frame]:
-    """Each frame no earlier than its timestamp says, counted from the first.
-
-    Args:
-        rate: frames a second of a source without times, which is refused without.
-    """
+    """Each frame no earlier than its timestamp says, from the first on, or `rate` frames a second."""
     began: float | None = None
     for frame in frames:
         seconds = frame.number / rate if rate and math.isnan(frame.seconds) else frame.seconds

@@ -135,24 +135,17 @@ class LiveLocalizer:
 
 
 def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> Tensor:
-    """One frame as a batch (1,C,H,W) of floats in [0, 1], or one frame's ready features (D,) as (1,D).
-
-    Example:
-        >>> as_batch(np.zeros((480, 640, 3), np.uint8)).shape
-        torch.Size([1, 3, 480, 640])
-    """
+    """One frame as a batch (1,C,H,W) of floats in [0, 1], or one frame's ready features (D,) as (1,D)."""
     if isinstance(frame, np.ndarray) and frame.dtype.name in DTYPES:
         frame = torch.from_numpy(np.require(frame, frame.dtype.newbyteorder("="), ["C", "W"]))
     shape = tuple(getattr(frame, "shape", ()))
     kind = str(getattr(frame, "dtype", type(frame).__name__)).removeprefix("torch.")
     last, first = shape[-1:] in ((1,), (3,)), shape[:1] in ((1,), (3,))
     image = len(shape) == 2 or (len(shape) == 3 and (last or first))
-    known = isinstance(frame, Tensor) and kind in DTYPES
-    if not known or not (image or (len(shape) == 1 and kind != "uint8")):
-        raise InputError(f"the frame is {f'{shape} {kind}' if shape else f'a {kind}'}; expected {EXPECTED}")
-    if 0 in shape:
-        raise InputError(f"the frame is {shape}, which holds nothing; expected {EXPECTED}")
-    assert isinstance(frame, Tensor)
+    fits = image or (len(shape) == 1 and kind != "uint8")
+    if not isinstance(frame, Tensor) or kind not in DTYPES or not fits or 0 in shape:
+        seen = f"{shape} {kind}{', which holds nothing' if 0 in shape else ''}" if shape else f"a {kind}"
+        raise InputError(f"the frame is {seen}; expected {EXPECTED}")
     values = frame.detach().to(device)
     if len(shape) == 1:
         return values.float()[None]

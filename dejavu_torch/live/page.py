@@ -142,18 +142,8 @@ def _number(value: Any) -> Any:
 
 
 def curve(scores: Tensor, posterior: bool) -> list[float]:
-    """What the page draws of all places, as at most `COLUMNS` heights in [0, 1].
-
-    Args:
-        scores: (N,), a column is as high as its best place, 1 for the best of all and 0 for the worst; or a
-            posterior (N+1,), a column is a sum of places.
-
-    Example:
-        >>> curve(torch.tensor([3.0, 1.0, 2.0, torch.inf]), posterior=False)
-        [0.0, 1.0, 0.5, 0.0]
-        >>> curve(torch.tensor([0.25, 0.5, 0.0, 0.25]), posterior=True)
-        [0.25, 0.5, 0.0]
-    """
+    """What the page draws of all places, as at most `COLUMNS` heights in [0, 1]: of scores (N,) that of the
+    best place in a column, 1 for the best of all and 0 for the worst; of a posterior (N+1,) the sum."""
     scores = scores.detach().float().cpu()
     places = len(scores) - posterior
     columns = min(COLUMNS, places)

@@ -73,14 +73,6 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
 
     Source: Platt, Advances in Large Margin Classifiers (1999); by Newton's method, as of Lin, Lin and Weng,
         Machine Learning 68 (2007).
-
-    Raises:
-        InputError: no right answer.
-
-    Example:
-        >>> platt = fit(torch.tensor([0.0, 1, 2, 3]), torch.tensor([False, False, True, True]))
-        >>> platt.probability(torch.tensor([0.0, 1.5, 3])).round(decimals=1)
-        tensor([0.2000, 0.5000, 0.8000], dtype=torch.float64)
     """
     known = ~confidence.isneginf()
     if not bool((right & known).any()):

@@ -57,12 +57,7 @@ def empty_topk(queries: Tensor, n: int) -> Best:
 
 
 def topk(scores: Tensor, n: int, start: int = 0) -> Best:
-    """The n lowest of each row, (Q,W) -> (Q,n); `start` is the place of the first column.
-
-    Example:
-        >>> topk(torch.tensor([[3.0, 1.0, 1.0, 0.0]]), 2)[1]
-        tensor([[3, 1]])
-    """
+    """The n lowest of each row, (Q,W) -> (Q,n); `start` is the place of the first column."""
     if n == 1:
         score, index = scores.min(1, keepdim=True)
         return score, index + start

@@ -54,23 +54,15 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
 
 
 def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None = None) -> Match:
-    """The best place, then again and again the best of those further than `radius` from all before.
+    """The best place, then again and again the best of those further than `radius` places from all before.
 
     Args:
-        k: how many, from 1 to N. radius: the suppression radius in places, at least 0.
         places: (Q,N) of the scores, if these are not all places in order.
 
     Shape: (Q,N) -> Match of (Q,k).
 
     Convention: of equal scores the first wins. If no place with a finite score is left, the place is -1 and
         the score +inf; all others are accepted.
-
-    Raises:
-        InputError: not (Q,N), or k or radius out of range.
-
-    Example:
-        >>> best_candidates(torch.tensor([[5.0, 1.0, 2.0, 4.0, 3.0]]), k=3, radius=1)[:2]
-        (tensor([[ 1,  4, -1]]), tensor([[1., 3., inf]]))
     """
     if not isinstance(scores, Tensor):
         raise InputError(f"scores are a {type(scores).__name__}; expected a tensor (Q,N)")

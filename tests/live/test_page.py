@@ -101,6 +101,7 @@ def test_curve_keeps_the_highest_of_many_places() -> None:
     heights = curve(scores, posterior=False)
     assert (len(heights), max(heights), heights.index(max(heights))) == (512, 1.0, 512 * 70_001 // 100_000)
     assert curve(torch.full((4,), math.inf), posterior=False) == [0.0] * 4
+    assert curve(torch.tensor([3.0, 1.0, 2.0, math.inf]), posterior=False) == [0.0, 1.0, 0.5, 0.0]
 
 
 @pytest.mark.parametrize("places", [1, 7, 512, 700, 100_000])
