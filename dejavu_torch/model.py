@@ -51,7 +51,7 @@ from dejavu_torch.model_file import (
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.recognition.calibration import Calibration
-from dejavu_torch.recognition.localizer import Localizer, Matcher, Matching
+from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Best, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
@@ -453,7 +453,7 @@ class DejaVu(nn.Module):
         localizer = self.localizer(matching)
         if order is None:
             return localizer(descriptors)
-        matcher, place = Matcher(matching), order.argsort()
+        matcher, place = Localizer(None, matching), order.argsort()
         parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
         scores = (self.map.scores(part.to(self.map.positions.device)) for part in parts)
         with torch.no_grad():

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,16 +17,13 @@ from torch import Tensor, nn
 from dejavu_torch.text import printable
 
 BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least one: 256 MB
-AT_ONCE = 64  # frames read at a time, where nobody says how many
+AT_ONCE = 64  # frames read at a time by default
 FRAME_NUMBERS = 2**28  # in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
 
 
 class InputError(ValueError):
-    """Bad input. Its message is one line: what was seen and what was expected.
-
-    Names in it may hold anything: what is not printable is escaped, and a long text loses its middle.
-    """
+    """Bad input. Its message is one line, printable and not too long: what was seen and what was expected."""
 
     def __init__(self, message: object) -> None:
         text = printable(message)
@@ -38,25 +35,16 @@ class InputError(ValueError):
 class Traverse(ABC):
     """Frames along a route, in order, read in batches: never all of them in memory.
 
-    A traverse can be iterated any number of times and yields the same values each time, whatever the batch
-    size.
-
-    Attributes:
-        name: in messages, a path or a `sim:` address; see `printable`.
-        length: number of frames N, or None if only reading to the end can tell.
-        place: (N,) float64, the true position of each frame in reference frames, or None if unknown.
-        cut: how the frames were cut out of one long image, and which of all such cuts they are: two traverses
-            that were cut alike show the same places. None if they were not.
-        seeks: whether `between` reads nothing before the first frame asked for.
-        sized: whether the size of the frames was asked for, as by `width=` of a video.
+    It can be iterated any number of times and yields the same values each time, whatever the batch size.
     """
 
-    name: str = "traverse"
-    length: int | None = None
-    place: Tensor | None = None
+    name: str = "traverse"  # in messages, a path or a `sim:` address
+    length: int | None = None  # number of frames N, None if only reading to the end can tell
+    place: Tensor | None = None  # (N,) float64, the true position of each frame in reference frames
+    # how the frames were cut out of one long image, and which of all such cuts they are: alike, same places
     cut: tuple[tuple[int, ...], range] | None = None
-    seeks: bool = False
-    sized: bool = False
+    seeks: bool = False  # whether `between` reads nothing before the first frame asked for
+    sized: bool = False  # whether the size of the frames was asked for, as by `width=` of a video
 
     @abstractmethod
     def batches(self, size: int) -> Iterator[Tensor]:
@@ -71,7 +59,7 @@ class Traverse(ABC):
         for batch in self.batches(self.batch_size()):
             if seen >= stop:
                 return
-            part = batch[max(0, start - seen) : max(0, stop - seen)]
+            part = batch[max(0, start - seen) : stop - seen]
             if len(part):
                 yield part
             seen += len(batch)
@@ -95,11 +83,7 @@ class Traverse(ABC):
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
-        """Shape of one frame: (C,H,W), or (D,) if the traverse holds features.
-
-        Raises:
-            InputError: there are no frames.
-        """
+        """Shape of one frame: (C,H,W), or (D,) if the traverse holds features."""
         for batch in self.batches(1):
             return tuple(batch.shape[1:])
         raise InputError(f"{self.name} holds no frames; expected at least one")
@@ -117,8 +101,7 @@ class Traverse(ABC):
         return f"{self.name} {self.length}"
 
     def state(self, start: int, stop: int) -> str:
-        """Changes if the frames [start, stop) do, as far as can be told without reading them; such as the
-        times of their files."""
+        """Changes with the frames [start, stop), as far as can be known unread, such as by times of files."""
         return ""
 
     def count(self) -> int:
@@ -126,11 +109,7 @@ class Traverse(ABC):
         return sum(map(len, self.batches(self.batch_size()))) if self.length is None else self.length
 
     def batch_size(self, most: int = AT_ONCE) -> int:
-        """How many frames to read at a time: `most`, or fewer if frames are large.
-
-        Raises:
-            InputError: a frame of more than 2^28 numbers.
-        """
+        """How many frames to read at a time: `most`, or fewer if they are large; refuses too large ones."""
         shape = self.frame_shape
         numbers = math.prod(shape)
         if numbers > FRAME_NUMBERS:
@@ -149,8 +128,7 @@ class FrequencyLayer:
         start, stop: the chunk [start, stop) in places.
         features: the indices of the features that take part, increasing.
 
-    Convention: a place is a frame of the reference, or an even step if frames were resampled (section IV-B).
-        phase(i) = floor((i mod period) * phases / period) counts from absolute place 0.
+    Convention: phase(i) = floor((i mod period) * phases / period) counts from absolute place 0.
     """
 
     period: Fraction
@@ -162,17 +140,13 @@ class FrequencyLayer:
     def __post_init__(self) -> None:
         object.__setattr__(self, "period", Fraction(self.period))
         a, b = self.period.as_integer_ratio()
+        seen = f"a layer has period {self.period} and {self.phases} phases"
         if a <= 0 or self.phases < 1:
-            raise InputError(
-                f"a layer has period {self.period} and {self.phases} phases; expected period > 0, phases >= 1"
-            )
+            raise InputError(f"{seen}; expected period > 0, phases >= 1")
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
         if max(self.stop * b, a * self.phases) >= 2**63:
-            raise InputError(
-                f"a layer has period {self.period}, {self.phases} phases and the end {self.stop}; "
-                "expected numbers whose products are below 2^63"
-            )
+            raise InputError(f"{seen} up to {self.stop}; expected numbers whose products are below 2^63")
         if not self.features or not all(i < j for i, j in pairwise((-1, *self.features))):
             raise InputError(
                 "a layer's feature indices must be non-empty, non-negative and strictly increasing"
@@ -201,35 +175,31 @@ class _Columns(NamedTuple):
 class Match(_Columns):
     """Where each query was found (eq. 5) and whether to believe it (eq. 6): index, score, accepted.
 
-    index: (Q,) int64, the reported place, -1 where no place has a finite score; (Q,k) candidates, best first.
-    score: float, the lowest S; lower is better, +inf where nothing covers.
-    accepted: bool, score below the threshold, or probability high enough, see `DejaVu.acceptance`.
-    probability: float64, of being right, where the map is calibrated, else None; of candidates only the first
-        has one, the others NaN. sequences: by T, the matches (Q,) by sequences of T queries, where wanted.
-        Both are outside the tuple.
+    index: (Q,) int64, the reported place, -1 if no place has a finite score; (Q,k) candidates, best first.
+    score: float, lower is better, +inf where nothing covers. accepted: bool, see `DejaVu.acceptance`.
+    probability: float64, of being right, if the map is calibrated, else None; NaN for all but the first
+        candidate. sequences: by T, matches (Q,) by sequences of T queries. Both are outside the tuple.
     """
 
     probability: Tensor | None = None
     sequences: Mapping[int, Match] = MappingProxyType({})
 
-    def with_probability(
-        self, probability: Tensor | None, sequences: Mapping[int, Match] | None = None
-    ) -> Match:
-        """The same with another probability, and other sequences unless None."""
-        match = Match(*self)
-        match.probability = probability
-        match.sequences = self.sequences if sequences is None else sequences
+    def _replace(self, **changes: Any) -> Match:
+        probability = changes.pop("probability", self.probability)
+        sequences = changes.pop("sequences", self.sequences)
+        match = super()._replace(**changes)
+        match.probability, match.sequences = probability, sequences
         return match
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
         """The same change of every column; `sequences` stay."""
         probability = None if self.probability is None else change(self.probability)
-        return Match(*map(change, self)).with_probability(probability, self.sequences)
+        return Match(*map(change, self))._replace(probability=probability, sequences=self.sequences)
 
     def renumbered(self, place: Callable[[Tensor], Tensor]) -> Match:
         """Places by other numbers, in `sequences` too; -1 must stay."""
         sequences = {T: match.renumbered(place) for T, match in self.sequences.items()}
-        return self._replace(index=place(self.index)).with_probability(self.probability, sequences)
+        return self._replace(index=place(self.index), sequences=sequences)
 
     @staticmethod
     def joined(parts: Iterable[Match]) -> Match:
@@ -238,33 +208,15 @@ class Match(_Columns):
         known = [part.probability for part in parts if part.probability is not None]
         probability = torch.cat(known) if len(known) == len(parts) else None
         sequences = {T: Match.joined(part.sequences[T] for part in parts) for T in parts[0].sequences}
-        return Match(*map(torch.cat, zip(*parts, strict=True))).with_probability(probability, sequences)
-
-    def _replace(self, **changes: Tensor) -> Match:
-        return Match(*super()._replace(**changes)).with_probability(self.probability, self.sequences)
+        joined = Match(*map(torch.cat, zip(*parts, strict=True)))
+        return joined._replace(probability=probability, sequences=sequences)
 
 
 class Training(NamedTuple):
-    """How a map was trained; None of it where it was learnt by eq. 1.
-
-    steps: of the optimiser. seed: of the run, None where none was set.
-    """
+    """How a map was trained: steps of the optimiser, and the run's seed, None if none was set."""
 
     steps: int
     seed: int | None
-
-
-class GroundTruth(NamedTuple):
-    """The correct places of each query, and the queries and places that are not scored.
-
-    positives: (Q,R) int64, every correct place of each query, -1 as padding; a row of -1 has none.
-    judged: (Q,) bool, False where the ground truth does not mention a query: it is left out of every score.
-    ignored: (Q,S) int64, places that count neither as correct nor as wrong, -1 as padding; S may be 0.
-    """
-
-    positives: Tensor
-    judged: Tensor
-    ignored: Tensor
 
 
 class SequenceModel(nn.Module, ABC):
@@ -278,11 +230,7 @@ class SequenceModel(nn.Module, ABC):
 
     @abstractmethod
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        """The state before the first query.
-
-        Args:
-            fixed: of the shape that it keeps, as an exported graph needs.
-        """
+        """The state before the first query; `fixed`: of the shape that it keeps, as in an exported graph."""
 
     @abstractmethod
     def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
@@ -292,34 +240,10 @@ class SequenceModel(nn.Module, ABC):
             firsts: the first place of each route of the map.
         """
 
-    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """`step` over consecutive batches (B,N); no gradient passes from one to the next."""
-        state = None
-        for scores in batches:
-            state = self.start(scores.shape[1]).to(scores) if state is None else state
-            found, state = self.step(scores, state.detach())
-            yield found
-
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:
-        """Refuse, or warn of, a number of queries or places that it makes no sense for.
-
-        Args:
-            queries: None where it is not known.
-
-        Raises:
-            InputError: naming what does not fit.
-        """
+        """Refuse, or warn of, a number of places or of queries, if known, that it makes no sense for."""
 
     def threshold_of(self, threshold: float | None) -> float | None:
-        """What a score has to be below to be accepted, where it is `threshold` for single queries; None where
-        nobody said."""
+        """What a score has to be below to be accepted, if it is `threshold` for single queries."""
         return threshold
-
-
-class PRCurve(NamedTuple):
-    """Precision and recall when every query with score <= threshold reports; each (T,) float64."""
-
-    precision: Tensor
-    recall: Tensor
-    threshold: Tensor

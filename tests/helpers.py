@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
-from dejavu_torch.types import FrequencyLayer, InputError, Plan, Traverse
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel, Traverse
 
 
 @contextmanager
@@ -23,6 +23,15 @@ def refused(*words: str) -> Iterator[None]:
     message = str(caught.value)
     assert "\n" not in message
     assert [word for word in words if word not in message] == [], message
+
+
+def streamed(model: SequenceModel, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+    """`step` over consecutive batches of scores (B,N)."""
+    state = None
+    for scores in batches:
+        state = model.start(scores.shape[1]).to(scores) if state is None else state
+        found, state = model.step(scores, state)
+        yield found
 
 
 def all_of(traverse: Traverse, batch: int = 64) -> Tensor:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from footage import REFERENCE, SIDE, camera, footage
-from helpers import refused, template_model
+from helpers import refused, streamed, template_model
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -400,8 +400,8 @@ def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
     for speeds in ((1.0,), (0.8, 1.0, -1.2)):
         matcher = SequenceMatcher(7, speeds)
         scores = [[model.map.scores(one) for one in queries_of(model, queries)] for model in models]
-        expected = torch.cat([torch.cat([*matcher.stream(part)]) for part in scores], 1)
-        whole = torch.cat(list(matcher.stream(map(merged.map.scores, queries_of(merged, queries)))))
+        expected = torch.cat([torch.cat([*streamed(matcher, part)]) for part in scores], 1)
+        whole = torch.cat(list(streamed(matcher, map(merged.map.scores, queries_of(merged, queries)))))
         assert not torch.equal(whole, expected)  # as one route's places they would count
         assert torch.equal(merged.localize(queries, sequence=matcher).index, expected.argmin(1))
         seen: list[Tensor] = []

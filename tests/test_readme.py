@@ -247,9 +247,9 @@ def test_live_in_python_as_shown(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_line_of_json_shown_has_the_keys_of_those_printed() -> None:
     from dejavu_torch.cli.live import line_of
-    from dejavu_torch.data.camera import Shot
+    from dejavu_torch.data.camera import Frame
     from dejavu_torch.live.localizer import LiveMatch
 
     (shown,) = re.findall(r"```json\n(.*?)```", LIVE, re.DOTALL)
-    printed = line_of(Shot(0, 0.0, torch.zeros(1, 1, 1)), LiveMatch(0, 0, "", 0.0, 1.0, 1.0, True, 1.0))
+    printed = line_of(Frame(0, 0.0, torch.zeros(1, 1, 1)), LiveMatch(0, 0, "", 0.0, 1.0, 1.0, True, 1.0))
     assert list(json.loads(shown)) == list(json.loads(printed))

@@ -15,11 +15,11 @@ from typing import NoReturn
 import numpy as np
 
 from dejavu_torch.cli.process import interrupts_raise, reader_left
-from dejavu_torch.data.camera import Camera, Shot, is_stream, shots_of, stretched
+from dejavu_torch.data.camera import Camera, Frame, is_stream, shots_of, stretched
 from dejavu_torch.data.source import open_source
-from dejavu_torch.live.feed import Feed, in_real_time
+from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
-from dejavu_torch.live.page import Moment, Page, ReferencePictures
+from dejavu_torch.live.page import Page, ReferencePictures, Snapshot
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, SequenceModel
@@ -62,7 +62,7 @@ def follow(
                 pictures = ReferencePictures(open_source(reference), frames)
             page = stack.enter_context(Page(port, title, pictures))
             _tell(f"the page is at {page.url}")
-        feed = stack.enter_context(Feed(shots, newest, timeout if is_stream(source) else None, name))
+        feed = stack.enter_context(FrameReader(shots, newest, timeout if is_stream(source) else None, name))
         try:
             with interrupts_raise(), suppress(KeyboardInterrupt):
                 latest = -1
@@ -77,7 +77,7 @@ def follow(
                         posterior = localizer.posterior
                         drawn = localizer.scores if posterior is None else posterior
                         counts = (taken.frames, feed.dropped, *taken.percentiles())
-                        page.show(Moment(shot, match, drawn, posterior is not None, *counts))
+                        page.show(Snapshot(shot, match, drawn, posterior is not None, *counts))
                 else:
                     if page is not None and not is_stream(source):
                         _stay(page.url)
@@ -92,7 +92,7 @@ def follow(
 
 def shots_from(
     source: str, model: DejaVu, realtime: bool, shown: bool = False
-) -> tuple[Iterable[Shot], bool, str]:
+) -> tuple[Iterable[Frame], bool, str]:
     """What a source gives, whether only its newest frame counts, and its name.
 
     Args:
@@ -116,14 +116,14 @@ def shots_from(
     return shots, realtime, traverse.name
 
 
-def _noted(camera: Camera) -> Iterable[Shot]:
+def _noted(camera: Camera) -> Iterable[Frame]:
     for shot in camera:
         if camera.note and not shot.number:
             log.warning("%s", camera.note)
         yield shot
 
 
-def line_of(shot: Shot, match: LiveMatch) -> str:
+def line_of(shot: Frame, match: LiveMatch) -> str:
     """An answer as a line of JSON."""
     facts = {
         "frame": shot.number,

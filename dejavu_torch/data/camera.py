@@ -28,7 +28,7 @@ PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,rtmp,rtmps,rtm
 OPENING = 10.0  # seconds that an address may take to answer
 
 
-class Shot(NamedTuple):
+class Frame(NamedTuple):
     """A frame of a stream.
 
     number: from 0, of all frames that came. seconds: of its timestamp, NaN where it has none. pixels: (H,W,3)
@@ -84,7 +84,7 @@ class Camera:
             self.name = "standard input"
         self.note = ""
 
-    def __iter__(self) -> Iterator[Shot]:
+    def __iter__(self) -> Iterator[Frame]:
         number = 0
         try:
             container, stream = self._open()
@@ -145,7 +145,7 @@ class Camera:
         stream.thread_type = "SLICE"  # threads by frames hold some of them back
         return container, stream
 
-    def _shots(self, container: InputContainer, stream: VideoStream) -> Iterator[Shot]:
+    def _shots(self, container: InputContainer, stream: VideoStream) -> Iterator[Frame]:
         first: tuple[int, int] | None = None
         high, wide = self.size or (0, 0)
         base = stream.time_base
@@ -159,7 +159,7 @@ class Camera:
                     f"{first[0]} x {first[1]} as frame 0"
                 )
             seconds = math.nan if frame.pts is None or base is None else float(frame.pts * base)
-            yield Shot(number, seconds, pixels_of(frame, Path(self.name), wide, high))
+            yield Frame(number, seconds, pixels_of(frame, Path(self.name), wide, high))
 
 
 def _mode_is(path: str, test: Any) -> bool:
@@ -182,7 +182,7 @@ def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> 
     return f"{name}: {seen}, which stretches them"
 
 
-def shots_of(traverse: Traverse) -> Iterator[Shot]:
+def shots_of(traverse: Traverse) -> Iterator[Frame]:
     """The frames of a traverse one by one, those of a video with their times."""
     for i, batch in enumerate(traverse.batches(1)):
-        yield Shot(i, traverse.frame_time(i), batch[0])
+        yield Frame(i, traverse.frame_time(i), batch[0])

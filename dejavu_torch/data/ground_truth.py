@@ -20,10 +20,23 @@ from torch.nn.utils.rnn import pad_sequence
 from dejavu_torch.data.arrays import HEADER, read_header
 from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_text, reading
 from dejavu_torch.memory import check_room
-from dejavu_torch.types import GroundTruth, InputError, Traverse
+from dejavu_torch.types import InputError, Traverse
 
 PAIRS_AT_ONCE = 2**20
 PLACE_BYTES = 32  # of each place in a table of right places, with what is computed from it
+
+
+class GroundTruth(NamedTuple):
+    """The correct places of each query, and the queries and places that are not scored.
+
+    positives: (Q,R) int64, every correct place of each query, -1 as padding; a row of -1 has none.
+    judged: (Q,) bool, False where the ground truth does not mention a query: it is left out of every score.
+    ignored: (Q,S) int64, places that count neither as correct nor as wrong, -1 as padding; S may be 0.
+    """
+
+    positives: Tensor
+    judged: Tensor
+    ignored: Tensor
 
 
 def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.maps.template_map import TemplateMap
-from dejavu_torch.types import FrequencyLayer, GroundTruth
+from dejavu_torch.types import FrequencyLayer
 
 DISTANCES_AT_ONCE = 2**22  # numbers of Q x P held at a time
 

@@ -19,7 +19,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.recognition.localizer import SINGLE, Matcher, Matching
+from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching
 from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -90,7 +90,7 @@ def nearest_frames(
     scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
     if k > 1:
         scores = (part[:, nearest] for part in scores)
-    matcher, nearest = Matcher(matching), nearest.cpu()
+    matcher, nearest = Localizer(None, matching), nearest.cpu()
     found = Match.joined(map(matcher.match, scores))
 
     def of_one(frame: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ def nearest_frames(
         sequences[1] = sequences[1].renumbered(of_one)
     if matching.sequence is None or matcher.own == 1:  # single queries
         found = found._replace(index=of_one(found.index))
-    return found.with_probability(None, sequences)
+    return found._replace(probability=None, sequences=sequences)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:

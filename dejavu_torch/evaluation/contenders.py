@@ -8,9 +8,12 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import as_ground_truth, counted
-from dejavu_torch.evaluation.curves import Scores, curve_of, evaluate
-from dejavu_torch.types import GroundTruth, Match, PRCurve
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted
+from dejavu_torch.evaluation.curves import PRCurve, Scores, curve_of, evaluate
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import Match, SequenceModel
+
+LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
 
 # Told apart by the colour-blind where they share a picture; keys are those of report.json, `map` is ours.
 COLOURS = {
@@ -127,3 +130,16 @@ def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
         if one.k is None or (one.k, one.bytes, one.scores) not in same:
             kept[key] = one
     return kept
+
+
+def lengths_beside(sequence: SequenceModel | None, queries: int, places: int) -> tuple[int, ...]:
+    """The T to set beside a sequence, its own among them, that so many queries and places have room for.
+
+    Example:
+        >>> lengths_beside(SequenceMatcher(7), queries=100, places=12)
+        (1, 5, 7, 11)
+    """
+    if sequence is None:
+        return ()
+    own = {sequence.length} if isinstance(sequence, SequenceMatcher) else set()
+    return tuple(length for length in sorted({*LENGTHS, *own}) if length <= min(queries, places))

@@ -7,12 +7,20 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
-from dejavu_torch.types import GroundTruth, InputError, Match, PRCurve
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted, is_right
+from dejavu_torch.types import InputError, Match
 
 RECALL_DEFINITION = (
     "TP / all queries with a right answer; *_reported: TP / (TP + FN), a wrong report is no FN"
 )
+
+
+class PRCurve(NamedTuple):
+    """Precision and recall when every query with score <= threshold reports; each (T,) float64."""
+
+    precision: Tensor
+    recall: Tensor
+    threshold: Tensor
 
 
 class Scores(NamedTuple):

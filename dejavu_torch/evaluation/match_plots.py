@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted, is_right
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.plots import (
@@ -34,7 +34,7 @@ from dejavu_torch.evaluation.plots import (
 )
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 CELLS = 400  # rows and columns of a score matrix, at most
 PIXELS = 1000  # rows and columns of a posterior, at most

@@ -178,7 +178,7 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
     index, scores, accepted_, right = zip(*reports, strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
     if "probability" in cells:
-        match = match.with_probability(torch.tensor(right, dtype=torch.float64))
+        match = match._replace(probability=torch.tensor(right, dtype=torch.float64))
     return Matches(torch.tensor(queries), match, torch.tensor(ranked))
 
 

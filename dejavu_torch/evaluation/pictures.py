@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.positions import unit_of
 from dejavu_torch.evaluation.activation import activation_rates, best_phases, layer_distances
 from dejavu_torch.evaluation.components import components
@@ -56,7 +57,7 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import FrequencyLayer, GroundTruth, Match, Plan, SequenceModel, Traverse
+from dejavu_torch.types import FrequencyLayer, Match, Plan, SequenceModel, Traverse
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 EXAMPLES = 4  # places of which the frames of both traverses are shown

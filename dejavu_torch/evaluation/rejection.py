@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Picture, canvas
-from dejavu_torch.recognition.calibration import calibration_error
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions that a report tells of
 BINS = 10
@@ -138,3 +138,26 @@ def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) ->
         f"what it says; the expected calibration error is {error:.3f}.",
     )
     return {"reliability": picture}
+
+
+def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> float:
+    """Expected calibration error: how far probabilities lie from the shares of right answers, on average.
+
+    Args:
+        bins: of equal width, in which queries of like probability are compared.
+
+    Shape: probability (n,) and right (n,) bool -> a number from 0 to 1; NaN without answers.
+
+    Source: Naeini, Cooper and Hauskrecht, AAAI 2015.
+
+    Example:
+        >>> calibration_error(torch.full((4,), 0.875), torch.tensor([True, True, True, False]))
+        0.125
+    """
+    if not len(right):
+        return math.nan
+    probability = probability.double()
+    bin_of = (probability * bins).long().clamp(0, bins - 1)
+    both = torch.stack([probability, right.double()], 1)
+    sums = torch.zeros(bins, 2, dtype=torch.float64).index_add_(0, bin_of, both)
+    return float((sums[:, 0] - sums[:, 1]).abs().sum()) / len(right)

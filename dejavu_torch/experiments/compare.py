@@ -24,7 +24,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqslam_baseline
-from dejavu_torch.evaluation.contenders import Contender, contend
+from dejavu_torch.evaluation.contenders import Contender, contend, lengths_beside
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
@@ -46,7 +46,7 @@ from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import Matching, lengths_beside
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse

@@ -11,6 +11,7 @@ from torch import Tensor
 
 import dejavu_torch
 from dejavu_torch.data.ground_truth import (
+    GroundTruth,
     check_ground_truth,
     describe_ground_truth,
     find_ground_truth,
@@ -35,7 +36,7 @@ from dejavu_torch.evaluation.report import Report
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import printable
-from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 RANKS = (5, 10)  # among so many candidates a right place is looked for
 

@@ -15,11 +15,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import check_output_folder, whole_file, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.coded_video import CodedVideo
-from dejavu_torch.evaluation.contenders import evaluate_each, sequences_as_json
+from dejavu_torch.evaluation.contenders import LENGTHS, evaluate_each, lengths_beside, sequences_as_json
 from dejavu_torch.evaluation.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.experiments.bench import peak_memory
@@ -27,9 +28,9 @@ from dejavu_torch.experiments.reproduce import paper_model
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
-from dejavu_torch.recognition.localizer import LENGTHS, Matching, lengths_beside
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
 SHOWN = (1.0, 1.6, 3.2, 5.0, 10.0)  # of the table

@@ -21,7 +21,7 @@ from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.video import Video
 from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.live.feed import Feed, in_real_time
+from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
@@ -105,7 +105,7 @@ def _case(
     model, first = long_model(video, places, numbers)
     localizer = LiveLocalizer(model)
     found, milliseconds = 0, []
-    with Feed(shots_of(video)) as feed:
+    with FrameReader(shots_of(video)) as feed:
         for shot in feed:
             if shot.number == WARM:
                 began, busy = time.perf_counter(), time.process_time()
@@ -116,7 +116,7 @@ def _case(
     cpu = (time.process_time() - busy) / (frames - WARM)
     p50, p99 = (float(p) / 1e3 for p in np.percentile(milliseconds[WARM:], (50, 99)))
     localizer.reset()
-    with Feed(in_real_time(shots_of(video), "drive"), newest=True) as feed:
+    with FrameReader(in_real_time(shots_of(video), "drive"), newest=True) as feed:
         for shot in feed:
             localizer(shot.pixels)
     by = " x ".join(map(str, size))

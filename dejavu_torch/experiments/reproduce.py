@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
@@ -25,7 +25,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 LENGTHS = (256, 512, 1024, 2048)
 PATCH = (32, 32)  # pixels: as many rows as the region of ground has in a frame, and some more

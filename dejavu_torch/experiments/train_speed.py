@@ -17,6 +17,7 @@ from torch import nn
 from tqdm import tqdm
 
 import dejavu_torch
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.curves import evaluate
@@ -28,7 +29,7 @@ from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.precision import has_bf16
 from dejavu_torch.training.task import PlaceRecognitionTask
-from dejavu_torch.types import GroundTruth, InputError, Traverse
+from dejavu_torch.types import InputError, Traverse
 
 ROUTE = ("sim:aerial?frames=1000", "sim:aerial?frames=1000&traverse=1")
 STEPS = 600

@@ -3,115 +3,93 @@
 from __future__ import annotations
 
 import math
+import queue
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 
-from dejavu_torch.data.camera import Shot
+from dejavu_torch.data.camera import Frame
 from dejavu_torch.types import InputError
 
-WAITING = 2  # frames that are read ahead where none is dropped
+WAITING = 2  # frames read ahead, if none is dropped
 
 
-class Feed:
-    """Iterates frames that a thread of its own reads.
+class FrameReader:
+    """Iterates frames that a thread of its own reads, as a context manager; what reading raises comes last.
 
     Args:
-        shots: read by the thread.
-        newest: only the newest frame waits: earlier ones are dropped, and counted. Else the reading waits.
-        timeout: seconds without a frame after which the source has stalled; None waits forever.
+        newest: only the newest frame waits; earlier ones are dropped, and counted in `dropped`.
+        timeout: seconds without a frame after which the source has stalled, an InputError; None waits.
         name: of the source, for messages.
-
-    Attributes:
-        dropped: frames so far.
-
-    Convention: a context manager; after it the thread ends with the frame that it reads. One that is stuck in
-        a read does not keep the process.
-
-    Raises:
-        InputError: iterating: the source stalled, or what reading it raises, after the frames before.
-
-    Example:
-        >>> with Feed(Shot(i, i / 30, None) for i in range(3)) as feed:
-        ...     [shot.number for shot in feed]
-        [0, 1, 2]
     """
 
     def __init__(
         self,
-        shots: Iterable[Shot],
+        frames: Iterable[Frame],
         newest: bool = False,
         timeout: float | None = None,
         name: str = "the source",
     ) -> None:
-        self.shots, self.newest, self.timeout, self.name = shots, newest, timeout, name
-        self.dropped = 0
-        self._waiting: list[Shot] = []
-        self._changed = threading.Condition()
-        self._over = False
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._read, name="dejavu feed", daemon=True)
+        self.frames, self.newest, self.timeout, self.name = frames, newest, timeout, name
+        self.dropped, self._closed = 0, False
+        # frames, and at the end None or what reading them raised
+        self._waiting: queue.Queue[Frame | BaseException | None] = queue.Queue(WAITING)
+        # a thread that is stuck in a read does not keep the process
+        self._thread = threading.Thread(target=self._read, name="dejavu reader", daemon=True)
 
-    def __enter__(self) -> Feed:
+    def __enter__(self) -> FrameReader:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        with self._changed:
-            self._over = True
-            self._waiting.clear()
-            self._changed.notify_all()
+        self._closed = True
+        self._drop()
         self._thread.join(0.5)
 
-    def __iter__(self) -> Iterator[Shot]:
+    def __iter__(self) -> Iterator[Frame]:
         while True:
-            with self._changed:
-                if not self._changed.wait_for(lambda: self._waiting or self._over, self.timeout):
-                    raise InputError(
-                        f"{self.name} stalled: no frame in {self.timeout:g} seconds; expected it to go on"
-                    )
-                if not self._waiting:
-                    if self._error is not None:
-                        raise self._error
-                    return
-                shot = self._waiting.pop(0)
-                self._changed.notify_all()
-            yield shot
+            try:
+                frame = self._waiting.get(timeout=self.timeout)
+            except queue.Empty:
+                seen = f"{self.name} stalled: no frame in {self.timeout:g} seconds"
+                raise InputError(f"{seen}; expected it to go on") from None
+            if frame is None:
+                return
+            if isinstance(frame, BaseException):
+                raise frame
+            yield frame
 
     def _read(self) -> None:
+        end: BaseException | None = None
         try:
-            for shot in self.shots:
-                with self._changed:
-                    if self.newest:
-                        self.dropped += len(self._waiting)
-                        self._waiting.clear()
-                    self._changed.wait_for(lambda: len(self._waiting) < WAITING or self._over)
-                    if self._over:
-                        return
-                    self._waiting.append(shot)
-                    self._changed.notify_all()
+            for frame in self.frames:
+                if self.newest:
+                    self.dropped += self._drop()
+                self._waiting.put(frame)
+                if self._closed:
+                    break
         except BaseException as error:
-            self._error = error
-        finally:
-            with self._changed:
-                self._over = True
-                self._changed.notify_all()
+            end = error
+        self._waiting.put(end)
+
+    def _drop(self) -> int:
+        """Drop the frames that wait; how many they were."""
+        count = 0
+        with suppress(queue.Empty):
+            while True:
+                self._waiting.get_nowait()
+                count += 1
+        return count
 
 
-def in_real_time(shots: Iterable[Shot], name: str, rate: float | None = None) -> Iterator[Shot]:
-    """Each frame no earlier than its timestamp says, counted from the first.
-
-    Args:
-        rate: frames a second of a source without times.
-
-    Raises:
-        InputError: frames without times, and no rate.
-    """
+def in_real_time(frames: Iterable[Frame], name: str, rate: float | None = None) -> Iterator[Frame]:
+    """Each frame no earlier than its timestamp says, from the first on, or `rate` frames a second."""
     began: float | None = None
-    for shot in shots:
-        seconds = shot.number / rate if rate and math.isnan(shot.seconds) else shot.seconds
+    for frame in frames:
+        seconds = frame.number / rate if rate and math.isnan(frame.seconds) else frame.seconds
         if math.isnan(seconds):
             raise InputError(f"{name} has no times; expected a video for --realtime")
         began = time.monotonic() - seconds if began is None else began
         time.sleep(max(0.0, began + seconds - time.monotonic()))
-        yield shot
+        yield frame

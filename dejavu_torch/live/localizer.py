@@ -1,4 +1,4 @@
-"""One frame at a time on a map, with what the frames before it told."""
+"""One frame at a time on a map, with what the frames before it showed."""
 
 from __future__ import annotations
 
@@ -21,28 +21,22 @@ EXPECTED = (
     "float (D,)"
 )
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
-FURTHEST = 100  # frames left out that count; after more, a jump finds the place again
-ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
+FURTHEST = 100  # skipped frames that count; after more, a jump finds the place again
+ROUNDING = 1e-3  # by which a value may miss the range from 0 to 1
 
 
 class LiveMatch(NamedTuple):
-    """Where a frame was found.
-
-    place, score, accepted: as of `Match`. frame: the reference frame that the place shows, -1 for none. name:
-    of that frame, if it has one. posterior: the probability that a filter gives the place; NaN without one.
-    probability: of being right; NaN where the map is not calibrated. milliseconds: from the frame to this
-    answer. route: of a merged map, the name of the route whose frame it is.
-    """
+    """Where a frame was found; place, score, probability and accepted as of `Match`, NaN for none."""
 
     place: int
-    frame: int
-    name: str
+    frame: int  # the reference frame that the place shows, -1 for none
+    name: str  # of that frame, if it has one
     score: float
-    posterior: float
+    posterior: float  # the probability that a filter gives the place
     probability: float
     accepted: bool
-    milliseconds: float
-    route: str = ""
+    milliseconds: float  # from the frame to this answer
+    route: str = ""  # of a merged map, the one that the frame is on
 
 
 class LiveLocalizer:
@@ -58,13 +52,11 @@ class LiveLocalizer:
         scores: (N,) of the latest frame, on the model's device; None before the first.
 
     Convention: the answers are those of `DejaVu.localize`, but for rounding. A frame that is refused changes
-        nothing. `localizer(frame, left_out)` says how many frames were left out since the one before: a
-        `PlaceFilter` moves once more for each of them.
+        nothing. `localizer(frame, left_out)` says how many frames were skipped since the one before: a
+        `PlaceFilter` moves once more for each.
 
     Raises:
-        InputError: a model without a map, or whose places are at even steps along the ground; calling it: an
-            array of another type or shape, frames of a size that do not fit the map, or numbers outside
-            [0, 1].
+        InputError: no map, or one of even steps along the ground; a frame of another type, shape or range.
 
     Example:
         >>> route = torch.rand(60, 1, 32, 32)
@@ -74,8 +66,6 @@ class LiveLocalizer:
     """
 
     def __init__(self, model: DejaVu, sequence: SequenceModel | Literal["filter"] | None = "filter") -> None:
-        if not model.map.places:
-            raise InputError("there is no map yet; expected a model that learned or loaded one")
         if model.step is not None and model.velocity is not None:
             raise InputError(
                 "the map's places are even steps along the ground, which are measured on a whole traverse; "
@@ -86,8 +76,6 @@ class LiveLocalizer:
                 f"the sequence is {sequence!r}; expected a SequenceModel such as PlaceFilter, 'filter', None"
             )
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
-        self.device = model.map.positions.device
-        model.matching(self.sequence)
         self._pipeline = model.describer.pipeline
         self._shape: tuple[int, ...] | None = None  # of the latest frame that fitted
         whitening = model.whitening
@@ -105,33 +93,32 @@ class LiveLocalizer:
 
     @torch.no_grad()
     def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
-        began = time.perf_counter()
-        descriptor = self._describe(as_batch(frame, self.device))
+        began, model = time.perf_counter(), self.model
+        descriptor = self._describe(as_batch(frame, model.map.positions.device))
         self._localizer.skip(min(left_out, FURTHEST))
         match = self._localizer(descriptor)
-        place, score = int(match.index), float(match.score)
-        found = self.model.map
-        shown, routes = int(found.frame_of(match.index)), found.routes
+        place, score, table = int(match.index), float(match.score), model.map.table
+        shown, routes = int(table.frame_of(match.index)), model.map.routes
         return LiveMatch(
             place=place,
-            frame=int(found.table.own_frame_of(match.index)) if routes else shown,
-            name=self.model.frame_name(shown) if shown >= 0 else "",
+            frame=int(table.own_frame_of(match.index)) if routes else shown,
+            name=model.frame_name(shown) if shown >= 0 else "",
             score=score,
             posterior=math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
             probability=math.nan if match.probability is None else float(match.probability),
             accepted=bool(match.accepted),
             milliseconds=1e3 * (time.perf_counter() - began),
-            route=routes[int(found.table.route_of(match.index))].name if routes and place >= 0 else "",
+            route=routes[int(table.route_of(match.index))].name if routes and place >= 0 else "",
         )
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) probabilities of each place, and of being off the map, after the latest frame; None without
-        a filter, or before the first frame."""
+        """(N+1,) of a filter after the latest frame; None without one, or before the first frame."""
         return self._localizer.posterior
 
     def _describe(self, batch: Tensor) -> Tensor:
         """The descriptor of a frame that fits the map, (1,K)."""
+        whitening, dimension = self.model.whitening, self.model.map.dimension
         batch = resize_like(batch, self.model.frame_shape)
         with in_mode(self._pipeline, False):
             features = features_of(batch, self._pipeline, "the frame")
@@ -139,39 +126,26 @@ class LiveLocalizer:
             self.model.check_queries(tuple(batch.shape[1:]), features.shape[1], "the frame")
             self._shape = batch.shape[1:]
         features = features.to(torch.promote_types(features.dtype, torch.float32))
-        whitening, places = self.model.whitening, self.model.map
         descriptor = features if whitening is None else whitening(features, self._projection)
-        if descriptor.shape[1] != places.dimension:
-            raise InputError(
-                f"the frame gives {descriptor.shape[1]} features; the map expects {places.dimension}"
-            )
+        if descriptor.shape[1] != dimension:
+            raise InputError(f"the frame gives {descriptor.shape[1]} features; the map expects {dimension}")
         if not descriptor.isfinite().all():
             raise InputError("the frame gives NaN or infinite features; expected finite numbers")
         return descriptor
 
 
 def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> Tensor:
-    """One frame as a batch (1,C,H,W) of floats in [0, 1], or one frame's ready features (D,) as (1,D).
-
-    Raises:
-        InputError: another type or shape, no pixels, or numbers outside [0, 1].
-
-    Example:
-        >>> as_batch(np.zeros((480, 640, 3), np.uint8)).shape
-        torch.Size([1, 3, 480, 640])
-    """
+    """One frame as a batch (1,C,H,W) of floats in [0, 1], or one frame's ready features (D,) as (1,D)."""
     if isinstance(frame, np.ndarray) and frame.dtype.name in DTYPES:
         frame = torch.from_numpy(np.require(frame, frame.dtype.newbyteorder("="), ["C", "W"]))
     shape = tuple(getattr(frame, "shape", ()))
     kind = str(getattr(frame, "dtype", type(frame).__name__)).removeprefix("torch.")
     last, first = shape[-1:] in ((1,), (3,)), shape[:1] in ((1,), (3,))
     image = len(shape) == 2 or (len(shape) == 3 and (last or first))
-    known = isinstance(frame, Tensor) and kind in DTYPES
-    if not known or not (image or (len(shape) == 1 and kind != "uint8")):
-        raise InputError(f"the frame is {f'{shape} {kind}' if shape else f'a {kind}'}; expected {EXPECTED}")
-    if 0 in shape:
-        raise InputError(f"the frame is {shape}, which holds nothing; expected {EXPECTED}")
-    assert isinstance(frame, Tensor)
+    fits = image or (len(shape) == 1 and kind != "uint8")
+    if not isinstance(frame, Tensor) or kind not in DTYPES or not fits or 0 in shape:
+        seen = f"{shape} {kind}{', which holds nothing' if 0 in shape else ''}" if shape else f"a {kind}"
+        raise InputError(f"the frame is {seen}; expected {EXPECTED}")
     values = frame.detach().to(device)
     if len(shape) == 1:
         return values.float()[None]

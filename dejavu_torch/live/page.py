@@ -8,6 +8,7 @@ import json
 import math
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -19,24 +20,23 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from dejavu_torch.data.camera import Shot
+from dejavu_torch.data.camera import Frame
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.types import InputError, Traverse
 
 HOST = "127.0.0.1"
-PORT = 8765  # where none is given
+PORT = 8765  # by default
 COLUMNS = 512  # of the curve
-WIDTH = 640  # pixels of the pictures at most
-KEPT = 20_000  # small pictures of a reference that can only be read in order
-SMALL = 160  # pixels of their width
+WIDTH = 640  # of pictures, pixels at most
+KEPT, SMALL = 20_000, 160  # pictures of a reference that is only read in order, and their width
 PAGE = Path(__file__).with_name("page.html")
 
 
-class Moment(NamedTuple):
+class Snapshot(NamedTuple):
     """What the page shows of one frame: `scores` (N,), or a `posterior` (N+1,); p50, p99 in milliseconds."""
 
-    shot: Shot
+    shot: Frame
     match: LiveMatch
     scores: Tensor
     posterior: bool
@@ -47,18 +47,15 @@ class Moment(NamedTuple):
 
 
 class Page:
-    """Serves the page at http://127.0.0.1:PORT/ from threads of its own; `show` is all it costs the frames.
+    """Serves the page at http://127.0.0.1:PORT/ from threads of its own, as a context manager.
 
     Args:
-        port: 0 is any that is free; `url` says which.
+        port: 0 is any that is free; `url` says which. One in use is refused.
         title: a line below the heading.
         reference: gives pictures of the reference's frames.
 
-    Convention: a context manager. It answers requests for 127.0.0.1 and localhost only, so that no other site
-        can ask for it by a name of its own.
-
-    Raises:
-        InputError: a port that is in use, or none.
+    Convention: only requests for 127.0.0.1 and localhost are answered, so that no other site can ask for it
+        by a name of its own.
     """
 
     def __init__(
@@ -67,7 +64,7 @@ class Page:
         if not 0 <= port < 2**16:
             raise InputError(f"port {port}; expected one from 0 to 65535, 0 being any that is free")
         self.title, self.reference = title, reference
-        self.moment: Moment | None = None
+        self.snapshot: Snapshot | None = None
         page = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -80,27 +77,24 @@ class Page:
         try:
             self._server = ThreadingHTTPServer((HOST, port), Handler)
         except OSError as error:
-            raise InputError(
-                f"port {port} of {HOST} cannot be had: {error.strerror}; expected a free one, such as 0 finds"
-            ) from error
+            seen = f"port {port} of {HOST} cannot be had: {error.strerror}"
+            raise InputError(f"{seen}; expected a free one, such as 0 finds") from error
         self._server.daemon_threads = True
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
     def __enter__(self) -> Page:
-        self._thread.start()
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._server.shutdown()
         self._server.server_close()
 
-    def show(self, moment: Moment) -> None:
+    def show(self, snapshot: Snapshot) -> None:
         """Show this frame from the next request on."""
-        self.moment = moment
+        self.snapshot = snapshot
 
     def answer(self, request: BaseHTTPRequestHandler) -> None:
-        """Answer one request."""
         host = request.headers.get("Host", "").partition(":")[0]
         address = urlsplit(request.path)
         body, kind, status = b"", "text/plain", HTTPStatus.OK
@@ -113,34 +107,30 @@ class Page:
             body, kind = json.dumps(self.state(seen)).encode(), "application/json"
         else:
             status = HTTPStatus.NOT_FOUND
-        try:
+        with suppress(OSError):  # who asked has left
             request.send_response(status)
             request.send_header("Content-Type", kind)
             request.send_header("Content-Length", str(len(body)))
             request.send_header("Cache-Control", "no-store")
             request.end_headers()
             request.wfile.write(body)
-        except OSError:  # who asked has left
-            pass
 
     def state(self, seen: str = "") -> dict[str, Any]:
-        """What the page asks for again and again; no more than the number of a frame that it has `seen`."""
-        moment = self.moment
-        if moment is None or seen == str(moment.shot.number):
-            return {"title": self.title, "number": -1 if moment is None else moment.shot.number}
-        shot, match = moment.shot, moment.match
-        known = match._asdict() | {"time": shot.seconds, "p50": moment.p50, "p99": moment.p99}
-        return {name: _number(value) for name, value in known.items()} | {
-            "title": self.title,
-            "number": shot.number,
-            "frames": moment.frames,
-            "dropped": moment.dropped,
-            "places": len(moment.scores) - moment.posterior,
-            "off": round(float(moment.scores[-1]), 6) if moment.posterior else None,
-            "kind": "Posterior over the route"
-            if moment.posterior
-            else "Match over the route, the best place 1",
-            "curve": curve(moment.scores, moment.posterior),
+        """What the page asks for again and again; little of a frame whose number it has `seen`."""
+        if self.snapshot is None:
+            return {"title": self.title, "number": -1}
+        shot, match, scores, posterior, *counts = self.snapshot
+        facts: dict[str, Any] = {"title": self.title, "number": shot.number}
+        if seen == str(shot.number):
+            return facts
+        facts |= match._asdict() | {"time": shot.seconds}
+        facts |= zip(("frames", "dropped", "p50", "p99"), counts, strict=True)
+        facts = {name: _number(value) for name, value in facts.items()}
+        return facts | {
+            "places": len(scores) - posterior,
+            "off": round(float(scores[-1]), 6) if posterior else None,
+            "kind": "Posterior over the route" if posterior else "Match over the route, the best place 1",
+            "curve": curve(scores, posterior),
             "query": as_picture(shot.pixels),
             "reference": self.reference(match.frame) if self.reference and match.frame >= 0 else None,
         }
@@ -152,32 +142,19 @@ def _number(value: Any) -> Any:
 
 
 def curve(scores: Tensor, posterior: bool) -> list[float]:
-    """What the page draws of all places, as at most `COLUMNS` heights in [0, 1].
-
-    Args:
-        scores: (N,): the height of a column is that of its best place; the best of all has 1, the worst 0.
-        posterior: they are probabilities (N+1,), the last of being off the map: a column is a sum of places.
-
-    Example:
-        >>> curve(torch.tensor([3.0, 1.0, 2.0, torch.inf]), posterior=False)
-        [0.0, 1.0, 0.5, 0.0]
-        >>> curve(torch.tensor([0.25, 0.5, 0.0, 0.25]), posterior=True)
-        [0.25, 0.5, 0.0]
-    """
+    """What the page draws of all places, as at most `COLUMNS` heights in [0, 1]: of scores (N,) that of the
+    best place in a column, 1 for the best of all and 0 for the worst; of a posterior (N+1,) the sum."""
     scores = scores.detach().float().cpu()
     places = len(scores) - posterior
     columns = min(COLUMNS, places)
     if posterior:
-        column = torch.arange(places) * columns // places
-        heights: list[float] = torch.zeros(columns).index_add_(0, column, scores[:-1]).tolist()
-        return [round(value, 6) for value in heights]
-    height = torch.zeros_like(scores)
-    valid = scores.isfinite()
-    if valid.any():
-        best, worst = scores[valid].aminmax()
-        height = torch.where(valid, (worst - scores) / (worst - best).clamp(min=1e-12), 0).clamp(0, 1)
-    heights = torch.nn.functional.adaptive_max_pool1d(height[None], columns)[0].tolist()
-    return [round(value, 4) for value in heights]
+        heights = torch.zeros(columns).index_add_(0, torch.arange(places) * columns // places, scores[:-1])
+    else:
+        valid = scores.isfinite()
+        worst, best = scores[valid].amax() if valid.any() else 0, scores.amin()
+        heights = torch.where(valid, (worst - scores) / (worst - best).clamp(min=1e-12), 0).clamp(0, 1)
+        heights = torch.nn.functional.adaptive_max_pool1d(heights[None], columns)[0]
+    return [round(value, 6) for value in heights.tolist()]
 
 
 def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
@@ -187,30 +164,23 @@ def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
             return None
         pixels = (pixels.permute(1, 2, 0).clamp(0, 1) * 255).round().byte().cpu().numpy()
     image = Image.fromarray(np.ascontiguousarray(pixels if pixels.shape[2] == 3 else pixels[..., 0]))
-    if image.width > width:
-        image = image.resize((width, max(1, round(image.height * width / image.width))))
+    image.thumbnail((width, image.height))
     file = io.BytesIO()
     image.save(file, "JPEG", quality=85)
     return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
 class ReferencePictures:
-    """Pictures of the frames of a reference, for `Page`.
+    """Pictures of the frames of the map's reference, which has so many, for `Page`.
 
-    Args:
-        reference: the traverse that the map was learned from. If it can only be read in order, as a video, a
-            thread makes small pictures of at most `KEPT` frames, of which the nearest is shown.
-        frames: how many the map's reference has.
-
-    Raises:
-        InputError: a traverse of another number of frames.
+    Of a traverse that can only be read in order, as a video, a thread makes small pictures of at most `KEPT`
+    frames, of which the nearest is shown.
     """
 
     def __init__(self, reference: Traverse, frames: int) -> None:
         if reference.length not in (None, frames):
-            raise InputError(
-                f"{reference.name} has {reference.length} frames; the map's reference has {frames}"
-            )
+            seen = f"{reference.name} has {reference.length} frames"
+            raise InputError(f"{seen}; the map's reference has {frames}")
         self.reference, self.step = reference, max(1, math.ceil(frames / KEPT))
         self._small: list[str | None] = []
         if not isinstance(reference, IndexedTraverse):
@@ -226,9 +196,7 @@ class ReferencePictures:
         return self._small[near] if near < len(self._small) else None
 
     def _read(self) -> None:
-        try:
+        with suppress(InputError):  # the pictures so far stay
             for i, batch in enumerate(self.reference.batches(1)):
                 if i % self.step == 0:
                     self._small.append(as_picture(batch[0], SMALL))
-        except InputError:  # those there are stay
-            pass

@@ -8,11 +8,11 @@ from hashlib import blake2b
 
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import find_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, find_ground_truth
 from dejavu_torch.data.positions import NEAR, shown_frames
 from dejavu_torch.data.selection import Selection, picked
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.types import GroundTruth, InputError, Traverse
+from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 

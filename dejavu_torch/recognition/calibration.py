@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
@@ -20,7 +21,7 @@ SPREADS = 3.0  # nats of a filter's confidence for each standard deviation that 
 MISSED = 20  # wrong answers that a visit may have been spared: they come in stretches of like places
 MEMORY = 0.9  # of a track, from one query to the next
 NEAR = 2  # places around an answer whose best score counts for a track
-SURE = 1e-6  # least distance of a filter's probability from 0 and 1
+SURE = 1e-6  # smallest distance of a filter's probability from 0 and 1
 STEPS = 100  # of Newton's method at most
 
 
@@ -38,16 +39,13 @@ class Platt(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """What makes probabilities of confidences, None where nothing does.
+    """What makes probabilities of confidences, None if nothing does."""
 
-    single: of queries by themselves. filter: of a `PlaceFilter` with its defaults.
-    """
-
-    single: Platt | None
-    filter: Platt | None
+    single: Platt | None  # of queries by themselves
+    filter: Platt | None  # of a `PlaceFilter` that searches for every query
 
     def of(self, sequence: SequenceModel | None) -> Platt | None:
-        """The one for a way of matching; a filter that does not score all places has none."""
+        """The one for a way of matching."""
         if sequence is None:
             return self.single
         return self.filter if isinstance(sequence, PlaceFilter) and sequence.search_every == 1 else None
@@ -67,25 +65,14 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
     """The slope and offset under which the answers that were seen are most likely.
 
     Args:
+        confidence: (n,) float; -inf is left out. right: (n,) bool.
         weight: (n,) how often each answer counts; None is once.
 
-    Shape: confidence (n,) float and right (n,) bool -> Platt.
-
-    Convention: the targets are not 1 and 0, but (r + 1) / (r + 2) and 1 / (w + 2) of r right and w wrong
-        answers, so that the fit is finite if confidence separates them, or no answer was wrong. Confidence of
-        -inf is left out. A slope is never negative: if right answers had less confidence, the share of right
-        ones is the probability of each.
+    Convention: the targets are not 1 and 0, but (r + 1) / (r + 2) and 1 / (w + 2) for r right and w wrong
+        answers, so that the fit is finite. If right answers had less confidence, the slope is 0.
 
     Source: Platt, Advances in Large Margin Classifiers (1999); by Newton's method, as of Lin, Lin and Weng,
         Machine Learning 68 (2007).
-
-    Raises:
-        InputError: no right answer.
-
-    Example:
-        >>> platt = fit(torch.tensor([0.0, 1, 2, 3]), torch.tensor([False, False, True, True]))
-        >>> platt.probability(torch.tensor([0.0, 1.5, 3])).round(decimals=1)
-        tensor([0.2000, 0.5000, 0.8000], dtype=torch.float64)
     """
     known = ~confidence.isneginf()
     if not bool((right & known).any()):
@@ -97,35 +84,30 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
     hits, misses = float(weight[y].sum()), float(weight[~y].sum())
     target = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
     found = torch.tensor([0.0, math.log((hits + 1) / (misses + 1))], dtype=torch.float64)
-    ridge = 1e-9 * torch.eye(2, dtype=torch.float64)
 
-    def loss(at: Tensor) -> float:
-        logits = columns @ at
-        return float((weight * (torch.nn.functional.softplus(logits) - target * logits)).sum())
+    def loss(at: Tensor) -> Tensor:
+        return F.binary_cross_entropy_with_logits(columns @ at, target, weight, reduction="sum")
 
     for _ in range(STEPS):
         p = torch.sigmoid(columns @ found)
-        gradient = columns.T @ (weight * (p - target))
-        curvature = (columns * (weight * p * (1 - p))[:, None]).T @ columns + ridge
-        step = torch.linalg.solve(curvature, gradient)
-        before, size = loss(found), 1.0
-        while loss(found - size * step) > before and size > 1e-8:
-            size /= 2
-        found = found - size * step
-        if float((size * step).abs().max()) < 1e-9:
+        curvature = (columns * (weight * p * (1 - p))[:, None]).T @ columns
+        curvature += 1e-9 * torch.eye(2, dtype=torch.float64)
+        step = torch.linalg.solve(curvature, columns.T @ (weight * (p - target)))
+        while loss(found - step) > loss(found) and float(step.abs().max()) > 1e-9:
+            step = step / 2
+        found = found - step
+        if float(step.abs().max()) < 1e-9:
             break
-    slope = float(found[0]) / spread
+    slope, offset = found.tolist()
     if slope < 0:
         share = (hits + 1) / (hits + misses + 2)
         return Platt(0.0, math.log(share / (1 - share)))
-    return Platt(slope, float(found[1]) - slope * mean)
+    return Platt(slope / spread, offset - slope / spread * mean)
 
 
 def confidence_of(scores: Tensor) -> Tensor:
-    """How much the best place of each query stands out, (Q,N) -> (Q,); -inf where none is found.
-
-    Minus its score, and `MARGIN` times how much lower it is than the best beyond `TOLERANCE` places.
-    """
+    """Confidence in the best place of each query, (Q,N) -> (Q,); -inf if none is found: minus its score, plus
+    `MARGIN` times how much lower it is than the best beyond `TOLERANCE` places."""
     return confidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE))
 
 
@@ -137,12 +119,9 @@ def confidence(candidates: Match) -> Tensor:
 
 
 class Track:
-    """Confidence of a filter's answers, which one posterior cannot give: off the map it follows the best of
-    places that are all wrong.
+    """Confidence in a filter's answers: their log odds, and how much single queries stood out there lately.
 
-    The log odds of the answer, and `SPREADS` times how much single queries stood out there lately: how
-    many standard deviations they scored below their mean, and `MARGIN` times how many below the best place
-    beyond `TOLERANCE`.
+    The posterior alone does not do: off the map it follows the best of wrong places.
     """
 
     def __init__(self) -> None:
@@ -151,7 +130,7 @@ class Track:
     def __call__(self, found: Tensor, scores: Tensor) -> Tensor:
         """Of the filter's scores and those of single queries, each (B,N) -> (B,) float64 on the CPU."""
         match = best_match(found)
-        mean, spread, _ = moments_of(scores)
+        mean, spread, *_ = moments_of(scores)
         own = scores.gather(1, _around(match.index, NEAR, scores)).amin(1)
         rival = scores.scatter(1, _around(match.index, TOLERANCE, scores), math.inf).amin(1)
         margin = torch.where(rival.isfinite(), rival - own, 0)
@@ -163,73 +142,45 @@ class Track:
             lately.append(self.sum / self.weight)
         score = match.score.cpu().double()
         odds = (-score).exp().clamp(SURE, 1 - SURE).logit()
-        return torch.where(
-            score.isfinite(), odds + SPREADS * torch.tensor(lately, dtype=torch.float64), -math.inf
-        )
+        return torch.where(score.isfinite(), odds + SPREADS * odds.new_tensor(lately), -math.inf)
 
 
-def _around(index: Tensor, far: int, scores: Tensor) -> Tensor:
-    """The places up to so far from each of (B,), of those that there are, (B, 2 far + 1)."""
-    near = index.clamp(min=0)[:, None] + torch.arange(-far, far + 1, device=index.device)
+def _around(index: Tensor, radius: int, scores: Tensor) -> Tensor:
+    """The places within a radius of each of (B,), as far as there are, (B, 2 radius + 1)."""
+    near = index.clamp(min=0)[:, None] + torch.arange(-radius, radius + 1, device=index.device)
     return near.clamp(0, scores.shape[1] - 1)
 
 
 @torch.no_grad()
 def calibrated(route: PlaceMap, trials: Iterable[Trial], another_visit: bool = False) -> Calibration:
-    """Fit on queries whose places are known, and on the same with the place and its surroundings, twice the
-    tolerance to each side, left out: answers off the map, of which none is right.
+    """Fit on queries whose places are known, and on the same without the scores near these places: answers
+    off the map, of which none is right.
 
     Args:
         another_visit: the queries are of another visit, whose own wrong answers show how often to expect one.
             Those off the map then count, together, for as many as lack to `MISSED`.
-
-    Raises:
-        InputError: no right answer of single queries, or none whose place is known.
     """
-    kinds: list[list[tuple[Tensor, ...]]] = [[], []]  # single queries, and a filter's
+    answers: tuple[list[Tensor], list[Tensor]] = [], []  # of single queries, and of a filter
     for descriptors, places in trials:
         scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
-        known = places >= 0
         away = scores.scatter(1, _around(places, 2 * TOLERANCE, scores), math.inf)
         for one, on_map in ((scores, True), (away, False)):
             filtered = PlaceFilter()(one)
             pairs = (one, confidence_of(one)), (filtered, Track()(filtered, one))
-            for answers, (found, own) in zip(kinds, pairs, strict=True):
+            for rows, (found, own) in zip(answers, pairs, strict=True):
                 index = best_match(found).index
                 right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & on_map
                 columns = own.cpu(), right.cpu(), torch.full(right.shape, on_map)
-                answers.append(tuple(column[known.cpu()] for column in columns))
-    if not kinds[0]:
+                rows.append(torch.stack([*map(Tensor.double, columns)], 1)[places.cpu() >= 0])
+    if not answers[0]:
         raise InputError("there are no queries to calibrate by; expected some")
     platts: list[Platt | None] = []
-    for answers in kinds:
-        own, right, on_the_map = map(torch.cat, zip(*answers, strict=True))
+    for rows in answers:
+        own, right, on_the_map = torch.cat(rows).unbind(1)
+        right, on_the_map = right > 0, on_the_map > 0
         wrong = int((on_the_map & ~right).sum())
         away_weight = max(0, MISSED - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
         weight = torch.where(on_the_map, 1.0, away_weight)
         platts.append(fit(own, right, weight) if not platts or bool(right.any()) else None)
     return Calibration(*platts)
-
-
-def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> float:
-    """Expected calibration error: how far probabilities lie from the shares of right answers, on average.
-
-    Args:
-        bins: of equal width, in which queries of like probability are compared.
-
-    Shape: probability (n,) and right (n,) bool -> a number from 0 to 1; NaN without answers.
-
-    Source: Naeini, Cooper and Hauskrecht, AAAI 2015.
-
-    Example:
-        >>> calibration_error(torch.full((4,), 0.875), torch.tensor([True, True, True, False]))
-        0.125
-    """
-    if not len(right):
-        return math.nan
-    probability = probability.double()
-    bin_of = (probability * bins).long().clamp(0, bins - 1)
-    both = torch.stack([probability, right.double()], 1)
-    sums = torch.zeros(bins, 2, dtype=torch.float64).index_add_(0, bin_of, both)
-    return float((sums[:, 0] - sums[:, 1]).abs().sum()) / len(right)

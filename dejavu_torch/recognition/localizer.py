@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -19,112 +20,38 @@ from dejavu_torch.recognition.select import Acceptance, accept, best_candidates,
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
 
-LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
 ROWS = 4096  # descriptors on the device at a time
 CACHED = 2**20  # scores summed at a time: they stay in the processor's cache
-FEW = 1 / 16  # of the places of a block: of more, to keep the best takes longer than all scores
+FEW = 1 / 16  # of the places of a block: to keep more of the best takes longer than all scores
 LISTED = 16  # numbers held for each of the best of a query, while two lists are merged
 
 
 class Matching(NamedTuple):
-    """How queries are matched.
+    """How queries are matched."""
 
-    sequence: scores consecutive queries together; None matches each by itself.
-    lengths: T of further sequences beside it, at the speeds of a `SequenceMatcher`.
-    k: candidates of a query; None gives matches (Q,). radius: places, any two of them differ by more.
-    rule: which are accepted. platt: makes probabilities; None makes none.
-    on_scores: is given the scores (B,N) that places are found by. search: of single queries.
-    """
-
-    sequence: SequenceModel | None = None
-    lengths: tuple[int, ...] = ()
-    k: int | None = None
-    radius: int = 0
+    sequence: SequenceModel | None = None  # None matches each query by itself
+    lengths: tuple[int, ...] = ()  # T of further sequences beside it, at the speeds of a `SequenceMatcher`
+    k: int | None = None  # candidates of a query; None gives matches (Q,)
+    radius: int = 0  # places, any two candidates differ by more
     rule: Acceptance = Acceptance()
-    platt: Platt | None = None
-    on_scores: Callable[[Tensor], None] | None = None
-    search: Search = "auto"
+    platt: Platt | None = None  # makes probabilities
+    on_scores: Callable[[Tensor], None] | None = None  # is given the scores (B,N) that places are found by
+    search: Search = "auto"  # of single queries
 
 
 SINGLE = Matching()  # each query by itself
 
 
-def lengths_beside(sequence: SequenceModel | None, queries: int, places: int) -> tuple[int, ...]:
-    """The T to set beside a sequence, its own among them, that so many queries and places have room for.
-
-    Example:
-        >>> lengths_beside(SequenceMatcher(7), queries=100, places=12)
-        (1, 5, 7, 11)
-    """
-    if sequence is None:
-        return ()
-    own = {sequence.length} if isinstance(sequence, SequenceMatcher) else set()
-    return tuple(length for length in sorted({*LENGTHS, *own}) if length <= min(queries, places))
-
-
-class Matcher:
-    """Scores of consecutive queries -> matches; keeps the state of a sequence or a filter between batches.
+class Localizer:
+    """Consecutive queries -> matches; keeps the state of a sequence or a filter between batches.
 
     Args:
-        firsts: the first place of each route of the map.
-
-    Convention: memory does not grow with the queries. A call that raises leaves the state as it was.
-    """
-
-    def __init__(self, matching: Matching = SINGLE, firsts: Sequence[int] = (0,)) -> None:
-        self.matching, self.firsts, self.track = matching, firsts, Track()
-        self.own = 0  # key of the model that places are found by
-        speeds: tuple[float, ...] = (1.0,)
-        if isinstance(matching.sequence, SequenceMatcher):
-            self.own, speeds = matching.sequence.length, matching.sequence.speeds
-        self.models: dict[int, SequenceModel] = {}  # by T, 0 of a filter
-        if matching.sequence is not None:
-            beside = {T: SequenceMatcher(T, speeds) for T in matching.lengths}
-            self.models = beside | {self.own: matching.sequence}
-        self.states: dict[int, Tensor] = {}  # of the models; none before the first query
-
-    @torch.no_grad()
-    def match(self, scores: Tensor) -> Match:
-        """Match the next queries: (B,N) -> (B,), or (B,k), on the CPU."""
-        if not self.models:
-            return self.matched(scores, None if self.matching.platt is None else confidence_of(scores))
-        return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
-
-    def _in_sequence(self, scores: Tensor) -> Match:
-        states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
-        steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
-        together = steps[self.own][0]
-        match = self.matched(together, None if self.matching.platt is None else self.track(together, scores))
-        self.states = {T: state for T, (_, state) in steps.items()}
-        beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.lengths}
-        return match.with_probability(match.probability, beside)
-
-    def matched(self, scores: Tensor, confidence: Tensor | None = None) -> Match:
-        """The best places by the scores that they are found by."""
-        if self.matching.on_scores is not None:
-            self.matching.on_scores(scores)
-        return self.answer(best_candidates(scores, self.matching.k or 1, self.matching.radius), confidence)
-
-    def answer(self, match: Match, confidence: Tensor | None = None) -> Match:
-        """Candidates (B,k) as they are handed out, with the probability that the first is right."""
-        matching, match = self.matching, match.map(Tensor.cpu)
-        match = match._replace(accepted=accept(match.score, matching.rule.threshold))
-        if matching.platt is not None and confidence is not None:
-            others = match.index.shape[1] - 1
-            probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)
-            if matching.rule.precision is not None:
-                match = match._replace(accepted=probability >= matching.rule.precision)
-            match = match.with_probability(probability)
-        return match if matching.k is not None else match.map(lambda column: column[:, 0])
-
-
-class Localizer(Matcher):
-    """Descriptors of consecutive queries -> matches on a map; keeps the state as `Matcher` does.
-
-    Args:
+        route: the map; None for scores that are made elsewhere, which only `match` takes.
         find: finds the n lowest scores of queries in place of `search`, as the workers of a cluster do.
 
     Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
+
+    Convention: memory does not grow with the queries. A call that raises leaves the state as it was.
 
     Example:
         >>> from dejavu_torch import SpectralMapper
@@ -136,52 +63,97 @@ class Localizer(Matcher):
 
     def __init__(
         self,
-        route: PlaceMap,
+        route: PlaceMap | None = None,
         matching: Matching = SINGLE,
         find: Callable[[Tensor, int], Best] | None = None,
     ) -> None:
-        starts = (sum(one.places for one in route.routes[:i]) for i in range(1, len(route.routes)))
-        super().__init__(matching, (0, *starts))
-        self.route, self.find, sequence = route, find, matching.sequence
+        self.route, self.matching, self.find, self.track = route, matching, find, Track()
+        sequence, routes = matching.sequence, () if route is None else route.routes
+        speeds = sequence.speeds if isinstance(sequence, SequenceMatcher) else (1.0,)
+        self.own = sequence.length if isinstance(sequence, SequenceMatcher) else 0
+        self.models: dict[int, SequenceModel] = {}  # by T, 0 of a filter; places are found by `own`
+        if sequence is not None:
+            self.models = {T: SequenceMatcher(T, speeds) for T in matching.lengths} | {self.own: sequence}
+        self.states: dict[int, Tensor] = {}  # of the models; none before the first query
+        self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
         self.local: LocalSearch | None = None
-        if isinstance(sequence, PlaceFilter) and sequence.search_every > 1 and not matching.lengths:
-            self.local = LocalSearch(sequence, route)
+        if route is not None and isinstance(sequence, PlaceFilter) and not matching.lengths:
+            self.local = LocalSearch(sequence, route) if sequence.search_every > 1 else None
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor) -> Match:
+        route, matching = self.route, self.matching
+        assert route is not None
         if not len(descriptors):
-            return self.match(descriptors.new_zeros(0, self.route.places))
-        single = self.matching.sequence is None and self.matching.on_scores is None
-        way, device = self._by_search if single else self._by_scores, self.route.positions.device
-        return Match.joined(way(part.to(device)) for part in descriptors.split(ROWS))
+            return self.match(descriptors.new_zeros(0, route.places))
+        single = matching.sequence is None and matching.on_scores is None
+        way, device = self._by_search if single else self._by_scores, route.positions.device
+        return Match.joined(way(part.to(device), route) for part in descriptors.split(ROWS))
+
+    @torch.no_grad()
+    def match(self, scores: Tensor) -> Match:
+        """Match the next queries by their scores: (B,N) -> (B,), or (B,k)."""
+        if not self.models:
+            return self._matched(scores, None if self.matching.platt is None else confidence_of(scores))
+        return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
-        """So many queries were left out: a `PlaceFilter` moves once more for each."""
+        """So many queries were skipped: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
         if self.local is not None:
             self.local.skipped += queries
         elif isinstance(filter, PlaceFilter) and self.states:
             for _ in range(queries):
-                self.states = self.states | {0: filter.predicted(self.states[0])}
+                self.states = self.states | {0: filter.moved(self.states[0], len(self.states[0]) - 1)}
 
     @property
     def posterior(self) -> Tensor | None:
         """(N+1,) of a filter after the latest query; None without one, or before the first query."""
         return self.states.get(0) if self.local is None else self.local.posterior
 
-    def _by_scores(self, descriptors: Tensor) -> Match:
-        if self.local is not None:
-            near = map(self.local, descriptors.split(1))
-            if self.matching.k is None and self.matching.on_scores is None:
-                return self.answer(Match.joined(one.best() for one in near))
-            return Match.joined(self.matched(one.row()) for one in near)
-        parts = descriptors.split(max(1, SCORES_AT_ONCE // self.route.places))
-        return Match.joined(self.match(self.route.scores(part)) for part in parts)
+    def _in_sequence(self, scores: Tensor) -> Match:
+        states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
+        steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
+        together = steps[self.own][0]
+        match = self._matched(together, None if self.matching.platt is None else self.track(together, scores))
+        self.states = {T: state for T, (_, state) in steps.items()}
+        beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.lengths}
+        return match._replace(sequences=beside)
 
-    def _by_search(self, descriptors: Tensor) -> Match:
+    def _locally(self, descriptor: Tensor) -> Match:
+        assert self.local is not None
+        whole = self.matching.k is not None or self.matching.on_scores is not None
+        scores, start = self.local(descriptor, whole)
+        match = self._matched(scores)
+        return match._replace(index=match.index + start)
+
+    def _matched(self, scores: Tensor, confidence: Tensor | None = None) -> Match:
+        if self.matching.on_scores is not None:
+            self.matching.on_scores(scores)
+        return self._answer(best_candidates(scores, self.matching.k or 1, self.matching.radius), confidence)
+
+    def _answer(self, match: Match, confidence: Tensor | None = None) -> Match:
+        """Candidates (B,k) as they are handed out, with the probability that the first is right."""
+        matching, match = self.matching, match.map(Tensor.cpu)
+        match = match._replace(accepted=accept(match.score, matching.rule.threshold))
+        if matching.platt is not None and confidence is not None:
+            others = match.index.shape[1] - 1
+            probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)
+            if matching.rule.precision is not None:
+                match = match._replace(accepted=probability >= matching.rule.precision)
+            match = match._replace(probability=probability)
+        return match if matching.k is not None else match.map(lambda column: column[:, 0])
+
+    def _by_scores(self, descriptors: Tensor, route: PlaceMap) -> Match:
+        if self.local is not None:
+            return Match.joined(map(self._locally, descriptors.split(1)))
+        parts = descriptors.split(max(1, SCORES_AT_ONCE // route.places))
+        return Match.joined(self.match(route.scores(part)) for part in parts)
+
+    def _by_search(self, descriptors: Tensor, route: PlaceMap) -> Match:
         """By the lowest scores alone, unless they are too many."""
-        route, matching = self.route, self.matching
+        matching = self.matching
         wanted = [(matching.k or 1, matching.radius)]
         if matching.platt is not None:
             wanted.append((min(2, route.places), TOLERANCE))
@@ -189,10 +161,10 @@ class Localizer(Matcher):
         n = min(route.places, max((k - 1) * (2 * radius + 1) + 1 for k, radius in wanted))
         few = max(1, FEW * min(route.places, route.block_places))
         if self.find is None and n > few and route.places <= SCORES_AT_ONCE:
-            return self._by_scores(descriptors)
+            return self._by_scores(descriptors, route)
         find, parts = self.find or partial(search, route, method=matching.search), []
         for part in descriptors.split(max(1, SCORES_AT_ONCE // (LISTED * n))):
             score, place = find(part, n)
             match, *second = (best_candidates(score, *one, places=place) for one in wanted)
-            parts.append(self.answer(match, *map(confidence, second)))
+            parts.append(self._answer(match, *map(confidence, second)))
         return Match.joined(parts)

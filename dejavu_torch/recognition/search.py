@@ -12,76 +12,52 @@ from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.types import InputError
 
 Search = Literal["auto", "scan"]
-Best = tuple[
-    Tensor, Tensor
-]  # (Q,n) scores and places, the lowest score first, of equal ones the lowest place
+Best = tuple[Tensor, Tensor]  # (Q,n) scores, the lowest first, and places, of equal scores the lowest first
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x n held at a time
 
 
 def check_search(method: str) -> None:
-    """Refuse a way to search that does not exist.
-
-    Raises:
-        InputError: naming those that do.
-    """
-    if method in ("bound", "ivf"):
-        raise InputError(f"search {method!r} was removed; expected auto or scan")
+    """Refuse a way to search that does not exist."""
     if method not in get_args(Search):
-        raise InputError(f"search {method!r}; expected auto or scan")
+        removed = " was removed" if method in ("bound", "ivf") else ""
+        raise InputError(f"search {method!r}{removed}; expected auto or scan")
 
 
 @torch.no_grad()
 def search(route: PlaceMap, queries: Tensor, n: int, method: Search = "auto") -> Best:
-    """The n lowest scores of queries on a map; memory holds the scores of a block of places.
+    """The n lowest scores of queries (Q,K) on a map; memory holds the scores of a block of places.
 
     Args:
-        method: "scan" scores all places; "auto" asks the map first, which may have a shorter way to the one
-            lowest score (`PlaceMap.lowest`).
-
-    Shape: (Q,K) -> (Q,n) scores, +inf where there is no place, and (Q,n) int64 places.
+        method: "scan" scores all places; "auto" uses `PlaceMap.lowest` for n = 1 if the map has it.
     """
     queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
     own = route.lowest(queries) if n == 1 and method == "auto" else None
     if own is not None:
         return own[0][:, None], own[1][:, None]
-    found = []
-    for part in queries.split(max(1, SCORES_AT_ONCE // max(1, route.block_places))):
-        best = empty_topk(part, n)
+    score, place = empty_topk(queries, n)
+    at_once, first = max(1, SCORES_AT_ONCE // max(1, route.block_places)), 0
+    for part in queries.split(at_once):
         for start, scores in route.score_blocks(part):
-            best = with_block(best, scores, start)
-        found.append(best)
-    score, place = (torch.cat(column) for column in zip(*found, strict=True))
+            better = (scores.amin(1) < score[first : first + len(part), -1]).nonzero()[:, 0]
+            if len(better):
+                scores = scores[better] if len(better) < len(scores) else scores
+                block, better = topk(scores, min(n, scores.shape[1]), start), better + first
+                score[better], place[better] = merge_topk((score[better], place[better]), block)
+        first += len(part)
     return score, place
 
 
 def empty_topk(queries: Tensor, n: int) -> Best:
-    """Of queries (Q,K) for which nothing is found so far: places beyond all there are."""
-    shape = len(queries), n
-    return (
-        queries.new_full(shape, math.inf, dtype=torch.promote_types(queries.dtype, torch.float32)),
-        torch.full(shape, torch.iinfo(torch.int64).max, device=queries.device),
+    """Before anything is found for queries (Q,K): +inf, at places beyond all there are."""
+    score = queries.new_full(
+        (len(queries), n), math.inf, dtype=torch.promote_types(queries.dtype, torch.float32)
     )
-
-
-def with_block(best: Best, scores: Tensor, start: int) -> Best:
-    """The best of these and of the scores (Q,W) of the places from `start` on, after all others."""
-    n = best[0].shape[1]
-    (better,) = (scores.amin(1) < best[0][:, -1]).nonzero(as_tuple=True)
-    if not len(better):
-        return best
-    block = topk(scores[better] if len(better) < len(scores) else scores, min(n, scores.shape[1]), start)
-    score, place = merge_topk((best[0][better], best[1][better]), block)
-    return best[0].to(score).index_copy(0, better, score), best[1].index_copy(0, better, place)
+    return score, torch.full_like(score, torch.iinfo(torch.int64).max, dtype=torch.int64)
 
 
 def topk(scores: Tensor, n: int, start: int = 0) -> Best:
-    """The n lowest of each row, (Q,W) -> (Q,n); `start` is the place of the first column.
-
-    Example:
-        >>> topk(torch.tensor([[3.0, 1.0, 1.0, 0.0]]), 2)[1]
-        tensor([[3, 1]])
-    """
+    """The n lowest of each row, (Q,W) -> (Q,n); `start` is the place of the first column."""
     if n == 1:
         score, index = scores.min(1, keepdim=True)
         return score, index + start

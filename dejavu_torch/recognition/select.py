@@ -15,34 +15,26 @@ PROBABLE = 0.5  # what a calibrated map accepts from by default
 
 
 class Acceptance(NamedTuple):
-    """Which answers are accepted; `DejaVu.acceptance` chooses it.
+    """Which answers are accepted; `DejaVu.acceptance` chooses it."""
 
-    threshold: those whose score is below; None accepts every finite score. precision: instead, those that are
-    at least so probably right. given: whether one of the two was asked for, or is stored in the map.
-    """
-
-    threshold: float | None = None
-    precision: float | None = None
-    given: bool = True
+    threshold: float | None = None  # those whose score is below; None accepts every finite score
+    precision: float | None = None  # instead, those that are at least so probably right
+    given: bool = True  # whether one of the two was asked for, or is stored in the map
 
     def __str__(self) -> str:
         if self.precision is not None:
-            told = f"accepted where the probability is at least {self.precision:.9g}"
+            rule = f"accepted where the probability is at least {self.precision:.9g}"
         elif self.threshold is None or self.threshold >= HIGHEST:
-            told = "every query with a finite score is accepted"
+            rule = "every query with a finite score is accepted"
         elif self.given:
-            told = f"accepted where the score is below {self.threshold:.9g}"
+            rule = f"accepted where the score is below {self.threshold:.9g}"
         else:
-            told = f"accepted where the filter itself gives more than {math.exp(-self.threshold):.9g}"
-        return told if self.given else f"no threshold given or stored for this way of matching: {told}"
+            rule = f"accepted where the filter itself gives more than {math.exp(-self.threshold):.9g}"
+        return rule if self.given else f"no threshold given or stored for this way of matching: {rule}"
 
 
 def best_match(scores: Tensor, threshold: float | None = None) -> Match:
-    """b = argmin_i S(i) (eq. 5), accepted where S(b) < threshold (eq. 6).
-
-    Args:
-        scores: S, lower is better.
-        threshold: None accepts every query with a finite score.
+    """b = argmin_i S(i) (eq. 5), accepted if S(b) < threshold (eq. 6); None accepts every finite score.
 
     Shape: (Q,N) -> Match of (Q,).
 
@@ -62,25 +54,15 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
 
 
 def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None = None) -> Match:
-    """The best place, then again and again the best of those further than `radius` from all before.
+    """The best place, then again and again the best of those further than `radius` places from all before.
 
     Args:
-        scores: S, lower is better.
-        k: how many, from 1 to N.
-        radius: places, at least 0: any two candidates differ by more.
         places: (Q,N) of the scores, if these are not all places in order.
 
     Shape: (Q,N) -> Match of (Q,k).
 
     Convention: of equal scores the first wins. If no place with a finite score is left, the place is -1 and
         the score +inf; all others are accepted.
-
-    Raises:
-        InputError: not (Q,N), or k or radius out of range.
-
-    Example:
-        >>> best_candidates(torch.tensor([[5.0, 1.0, 2.0, 4.0, 3.0]]), k=3, radius=1)[:2]
-        (tensor([[ 1,  4, -1]]), tensor([[1., 3., inf]]))
     """
     if not isinstance(scores, Tensor):
         raise InputError(f"scores are a {type(scores).__name__}; expected a tensor (Q,N)")
@@ -89,31 +71,25 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
     columns = scores.shape[1]
     check_candidates(k, radius, columns)
     window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)
-    found, left = [], scores.clone() if k > 1 and places is None else scores
+    found = []
     for rank in range(k):
-        score, at = left.min(1)
+        score, at = scores.min(1)
         index = at if places is None else places.gather(1, at[:, None])[:, 0]
-        found.append((torch.where(score.isfinite(), index, -1), score))
+        found.append((index, score))
         if rank + 1 == k:
             break
         if places is None:  # a window cut off at an end of the map repeats that end, which is in it
-            left.scatter_(1, (at[:, None] + window).clamp(0, columns - 1), torch.inf)
+            scores = scores.scatter(1, (at[:, None] + window).clamp(0, columns - 1), torch.inf)
         else:
-            left = left.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
-        left = left.masked_fill(~score.isfinite()[:, None], torch.inf)
+            scores = scores.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
     index, score = (torch.stack(column, 1) for column in zip(*found, strict=True))
-    return Match(index, score, score.isfinite())
+    finite = score.isfinite() & score[:, :1].isfinite()  # a query with a NaN has no candidates
+    index = torch.where(finite, index, -1)
+    return Match(index, torch.where(finite | score.isnan(), score, torch.inf), finite)
 
 
 def check_candidates(k: int, radius: int, places: int | None = None) -> None:
-    """Refuse early how many candidates there cannot be.
-
-    Args:
-        places: of the map, None where unknown.
-
-    Raises:
-        InputError: k below 1 or above the number of places, or radius below 0.
-    """
+    """Refuse k or a radius out of range; `places` is None if their number is unknown."""
     if k < 1:
         raise InputError(f"{k} candidates a query; expected at least 1")
     if places is not None and k > places:

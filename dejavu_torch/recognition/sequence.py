@@ -25,7 +25,7 @@ class SequenceMatcher(SequenceModel):
     latest, the score of place i - v k, rounded; of several speeds v the best counts.
 
     Args:
-        length: T, queries of a sequence; where steps are resampled, steps.
+        length: T, queries of a sequence.
         speeds: each v in places a query: 1 where both traverses went equally fast, negative for the way back.
 
     Shape: scores (Q,N), state (R,N) or None -> (Q,N), lower is better.
@@ -33,14 +33,14 @@ class SequenceMatcher(SequenceModel):
     Convention: causal. The state holds the scores of the last queries, R < T; rows of NaN are no queries. A
         trajectory ends at the ends of its route, and places that nothing covers are left out of the mean;
         less than half of it on the map scores +inf, and so does a place that nothing covers for the latest
-        query. Half a place is rounded up. Gradients reach scores and state.
+        query. Half a place is rounded up.
 
     Source: constant-speed search of SeqSLAM (Milford and Wyeth, ICRA 2012), causal and without its
         normalisation.
 
     Raises:
         InputError: a length below 1 or above 65536, no speeds, or speeds that are not finite; forward: scores
-            that are no (Q,N), or a state of another number of places or of T rows or more.
+            or a state of another shape.
 
     Example:
         >>> scores = torch.tensor([[0.0, 5, 5, 0], [5, 0.0, 0, 5], [0, 5, 0.0, 5]])
@@ -51,14 +51,12 @@ class SequenceMatcher(SequenceModel):
     def __init__(self, length: int = 11, speeds: Sequence[float] = (1.0,)) -> None:
         super().__init__()
         if not isinstance(length, int) or not 1 <= length <= LONGEST:
-            raise InputError(
-                f"a sequence of {length} queries; expected a whole number, at least 1, at most {LONGEST}"
-            )
+            seen = f"a sequence of {length} queries"
+            raise InputError(f"{seen}; expected a whole number, at least 1, at most {LONGEST}")
         given = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
         if not given or not all(map(math.isfinite, given)):
-            raise InputError(
-                f"the speeds are {speeds}; expected finite numbers of places a query, at least one"
-            )
+            seen = f"the speeds are {speeds}"
+            raise InputError(f"{seen}; expected finite numbers of places a query, at least one")
         self.length, self.speeds = length, given
 
     def _shifts(self, speed: float) -> list[int]:
@@ -66,7 +64,6 @@ class SequenceMatcher(SequenceModel):
         return [math.floor(speed * k + 0.5) for k in range(self.length)]
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        """See `SequenceModel`: no rows, or T - 1 of NaN."""
         return torch.full((self.length - 1 if fixed else 0, places), math.nan)
 
     def forward(self, scores: Tensor, state: Tensor | None = None) -> Tensor:
@@ -82,28 +79,23 @@ class SequenceMatcher(SequenceModel):
         if self.length == 1 or not len(scores):
             return scores, state
         rows = torch.cat([state.to(scores), scores])
+        before = (~state[:, :1].isnan()).sum()
+        used = (torch.arange(1, len(scores) + 1, device=rows.device) + before).clamp(max=self.length)
+        routes = [self._best(part, used) for part in rows.tensor_split([*firsts[1:]], 1)]
+        best = routes[0] if len(routes) == 1 else torch.cat(routes, 1)
+        return best, rows[max(0, len(rows) - self.length + 1) :]
+
+    def _best(self, rows: Tensor, used: Tensor) -> Tensor:
+        """Scores on one route, (R,N) -> (Q,N), by as many rows as are `used` by each query."""
         valid = rows.isfinite()
         gaps = torch.compiler.is_exporting() or not bool(valid.all())
         known, counted = (torch.where(valid, rows, 0), valid.to(rows)) if gaps else (rows, None)
-        before = (~state[:, :1].isnan()).sum() if gaps else len(state)
-        used = (torch.arange(1, len(scores) + 1, device=rows.device) + before).clamp(max=self.length)
-        cuts, ways = [*firsts[1:]], []
-        for speed in self.speeds:
-            columns = known.tensor_split(cuts, 1)
-            counts = [None] * len(columns) if counted is None else counted.tensor_split(cuts, 1)
-            means = (self._means(*pair, used, speed) for pair in zip(columns, counts, strict=True))
-            ways.append(torch.cat([*means], 1) if cuts else next(means))
-        best = functools.reduce(torch.minimum, ways)
-        if gaps:
-            best = best.masked_fill(~valid[len(state) :], math.inf)
-        return best, rows[max(0, len(rows) - self.length + 1) :]
+        means = (self._means(known, counted, used, speed) for speed in self.speeds)
+        best = functools.reduce(torch.minimum, means)
+        return best.masked_fill(~valid[-len(used) :], math.inf) if gaps else best
 
     def _means(self, rows: Tensor, counted: Tensor | None, used: Tensor, speed: float) -> Tensor:
-        """Mean scores along the trajectories of a route's rows (R,N) -> (Q,N).
-
-        Args:
-            counted: 1 where a row has a score, else 0; None where all have. used: (Q,) rows of each query.
-        """
+        """Mean scores along trajectories; `counted` is 1 for a finite score, else 0; None if all are."""
         shifts = self._shifts(speed)[: len(rows)]
         total = _along(rows, shifts, len(used))
         if counted is not None:
@@ -115,10 +107,7 @@ class SequenceMatcher(SequenceModel):
         return torch.where(2 * count >= used[:, None], total / count.clamp(min=1), math.inf)
 
     def trajectory(self, scores: Tensor, place: int) -> Tensor:
-        """The cells of which the last query's score of a place is the mean.
-
-        Args:
-            place: one whose score is finite.
+        """The cells of which the last query's score of a place, which is finite, is the mean.
 
         Shape: (Q,N) -> (C,2) query and place of each of at most T cells, the latest query first.
         """
@@ -129,13 +118,11 @@ class SequenceMatcher(SequenceModel):
         return cells[scores.cpu()[cells[:, 0], cells[:, 1]].isfinite()]
 
     def check(self, queries: int | None, places: int) -> None:
-        """See `SequenceModel`: warn of fewer queries than T; refuse trajectories longer than the map."""
         for speed in self.speeds:
             if abs(self._shifts(speed)[-1]) >= places:
-                raise InputError(
-                    f"a sequence of {self.length} queries at {speed:g} places a query on a map of {places} "
-                    "places; expected a shorter one, or speeds that do not leave the map"
-                )
+                seen = f"a sequence of {self.length} queries at {speed:g} places a query"
+                problem = f"{seen} on a map of {places} places"
+                raise InputError(f"{problem}; expected a shorter one, or speeds that do not leave the map")
         if queries is not None and self.length > queries:
             log.warning("a sequence of %d queries, but there are %d: all of them count", self.length, queries)
 

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.fitted import fitted
-from dejavu_torch.data.ground_truth import as_ground_truth, ground_truth_in_places
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.selection import runs as runs_of
 from dejavu_torch.data.source import open_source, routes_of
@@ -26,7 +26,7 @@ from dejavu_torch.memory import check_room, concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import GroundTruth, InputError, Traverse
+from dejavu_torch.types import InputError, Traverse
 
 READ_AT_ONCE = 64  # frames
 FEW = 300  # frames, below which a network learns less than a map has untrained

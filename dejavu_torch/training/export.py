@@ -10,7 +10,7 @@ import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
 
 from dejavu_torch.data.fitted import fitted
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import STRENGTHS
@@ -20,7 +20,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.training.datamodule import FEW, RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
 from dejavu_torch.training.worth import beside_untrained
-from dejavu_torch.types import GroundTruth, InputError, Traverse
+from dejavu_torch.types import InputError, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
 

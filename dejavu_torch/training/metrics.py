@@ -9,9 +9,9 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
-from dejavu_torch.data.ground_truth import as_ground_truth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted, is_right
 from dejavu_torch.evaluation.curves import Scores, check_truth, evaluate
-from dejavu_torch.types import GroundTruth, InputError, Match
+from dejavu_torch.types import InputError, Match
 
 
 class PlaceRecognition(Metric):

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Mapping
 
 from dejavu_torch.data.fitted import fitted
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
@@ -14,7 +15,7 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.localizer import SINGLE
-from dejavu_torch.types import GroundTruth, InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 log = logging.getLogger("dejavu_torch")
 

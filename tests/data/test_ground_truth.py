@@ -23,6 +23,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.ground_truth import (
+    GroundTruth,
     as_ground_truth,
     check_ground_truth,
     counted,
@@ -37,7 +38,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.data.strip import SlidingWindow
-from dejavu_torch.types import GroundTruth, InputError, Traverse
+from dejavu_torch.types import InputError, Traverse
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
 

@@ -7,9 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.activation import Rate, activation_rates, in_phase
-from dejavu_torch.types import FrequencyLayer, GroundTruth
+from dejavu_torch.types import FrequencyLayer
 
 
 def layer(period: Fraction | int, phases: int, start: int = 0, stop: int = 40) -> FrequencyLayer:

@@ -14,7 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.curves import (
+    PRCurve,
     Scores,
     area,
     count_queries,
@@ -25,7 +27,7 @@ from dejavu_torch.evaluation.curves import (
     recall_at_full_precision,
     threshold_of_full_precision,
 )
-from dejavu_torch.types import GroundTruth, InputError, Match, PRCurve
+from dejavu_torch.types import InputError, Match
 
 INF = float("inf")
 Recall = Literal["all", "reported"]

@@ -7,7 +7,7 @@ import torch
 from drawn import matched, render, texts
 
 from dejavu_torch import PlaceFilter, SequenceMatcher
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
     PosteriorImage,
     Row,
@@ -20,7 +20,7 @@ from dejavu_torch.evaluation.match_plots import (
     posterior_image,
     score_matrix,
 )
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 
 def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
@@ -45,7 +45,7 @@ def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
 
 def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
-    match = matched(4, 9, -1, 2).with_probability(sure)
+    match = matched(4, 9, -1, 2)._replace(probability=sure)
     figure, axis = plot_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")
     (points,) = axis.collections
     shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))

@@ -20,7 +20,7 @@ from dejavu_torch import (
     SpectrogramAnalysis,
 )
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.evaluation.activation import best_phases
@@ -38,7 +38,7 @@ from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import PICTURES
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceModel
-from dejavu_torch.types import FrequencyLayer, GroundTruth
+from dejavu_torch.types import FrequencyLayer
 
 ALL = [
     *("pairs", "coverage", "scores", "pr", "auc", "chunks"),

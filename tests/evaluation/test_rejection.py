@@ -22,7 +22,7 @@ MATCH = Match(
     torch.tensor([0, 1, 9, 3, 4]),
     torch.tensor([0.3, 0.2, 0.1, 0.4, 0.5]),  # the wrong one has the best score
     torch.ones(5, dtype=torch.bool),
-).with_probability(torch.tensor([0.99, 0.995, 0.3, 0.9, 0.2], dtype=torch.float64))
+)._replace(probability=torch.tensor([0.99, 0.995, 0.3, 0.9, 0.2], dtype=torch.float64))
 
 
 def test_the_figures_of_a_rejection() -> None:
@@ -49,12 +49,12 @@ def test_the_figures_of_a_rejection() -> None:
 def test_nothing_is_accepted_where_nothing_is_sure() -> None:
     none = accepted_at(0.99, torch.tensor([0.5]), torch.tensor([True]))
     assert (none.precision, none.kept) == (None, 0.0)
-    facts = rejection_facts(MATCH.with_probability(MATCH.score / 2), TRUTH, 0, {})["rejection"]
+    facts = rejection_facts(MATCH._replace(probability=MATCH.score / 2), TRUTH, 0, {})["rejection"]
     assert rejection_table(facts)[1] == ["precision reached", *[""] * 5]
 
 
 def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
-    plain = MATCH.with_probability(None)
+    plain = MATCH._replace(probability=None)
     assert rejection_facts(plain, TRUTH, 0, {}) == draw_reliability(plain, TRUTH, 0) == {}
     assert rejection_facts(MATCH, None, 0, {}) == {"rejection": {"off_map": {}}}
     assert draw_reliability(MATCH, None, 0) == {}

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import Picture, canvas
@@ -26,7 +26,7 @@ from dejavu_torch.evaluation.report import (
     write_index,
     write_report,
 )
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75)
 FACTS = {

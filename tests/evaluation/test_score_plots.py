@@ -9,7 +9,7 @@ import torch
 from drawn import render, texts
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender
-from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.evaluation.curves import PRCurve, Scores
 from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, RIGHT, WRONG
 from dejavu_torch.evaluation.score_plots import (
     Length,
@@ -19,7 +19,6 @@ from dejavu_torch.evaluation.score_plots import (
     plot_lengths,
     plot_ratios,
 )
-from dejavu_torch.types import PRCurve
 
 
 def contender(name: str, auc: float, points: int = 4) -> Contender:

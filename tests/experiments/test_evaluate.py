@@ -16,12 +16,13 @@ from PIL import Image
 from dejavu_torch import FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.evaluation.report import score_table, text_table, write_report
 from dejavu_torch.experiments.evaluate import Evaluation, evaluate_file
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 HEADER = "query,place,score,accepted\n"
 # right, right but far, wrong, silent, accepted though wrong

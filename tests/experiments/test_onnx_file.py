@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from command_line import fails, run
-from helpers import Fixed, refused
+from helpers import Fixed, refused, streamed
 from PIL import Image
 from torch import Tensor, nn
 
@@ -134,7 +134,7 @@ def assert_streams(
     assert facts["inputs"] == {**given, "state": state}
     assert facts["outputs"] == {"scores": [1, route.map.places], "next_state": state}
     with torch.no_grad():
-        (expected,) = model.stream([route(queries)])
+        (expected,) = streamed(model, [route(queries)])
     torch.testing.assert_close(run_session(session, queries), expected, rtol=0, atol=1e-4)
     return facts
 

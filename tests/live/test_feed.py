@@ -11,26 +11,26 @@ import numpy as np
 import pytest
 from helpers import refused
 
-from dejavu_torch.data.camera import Shot
-from dejavu_torch.live.feed import WAITING, Feed, in_real_time
+from dejavu_torch.data.camera import Frame
+from dejavu_torch.live.feed import WAITING, FrameReader, in_real_time
 from dejavu_torch.types import InputError
 
 PIXELS = np.zeros((2, 2, 3), np.uint8)
 
 
-def shots(count: int, rate: float = 25.0) -> Iterator[Shot]:
-    return (Shot(i, i / rate, PIXELS) for i in range(count))
+def shots(count: int, rate: float = 25.0) -> Iterator[Frame]:
+    return (Frame(i, i / rate, PIXELS) for i in range(count))
 
 
 def test_no_frame_of_a_file_is_dropped_nor_read_far_ahead() -> None:
     read = []
 
-    def counted() -> Iterator[Shot]:
+    def counted() -> Iterator[Frame]:
         for shot in shots(30):
             read.append(shot.number)
             yield shot
 
-    with Feed(counted()) as feed:
+    with FrameReader(counted()) as feed:
         for i, shot in enumerate(feed):
             assert shot.number == i
             assert len(read) <= i + WAITING + 2
@@ -40,13 +40,13 @@ def test_no_frame_of_a_file_is_dropped_nor_read_far_ahead() -> None:
 def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted() -> None:
     steps = [threading.Event() for _ in range(2)]
 
-    def bursts() -> Iterator[Shot]:
+    def bursts() -> Iterator[Frame]:
         yield from shots(5)
         steps[0].set()
         assert steps[1].wait(5)
-        yield from (Shot(i, 0.0, PIXELS) for i in range(5, 9))
+        yield from (Frame(i, 0.0, PIXELS) for i in range(5, 9))
 
-    with Feed(bursts(), newest=True) as feed:
+    with FrameReader(bursts(), newest=True) as feed:
         assert steps[0].wait(5)
         frames = iter(feed)
         first = next(frames).number
@@ -60,12 +60,15 @@ def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted()
 def test_a_source_that_stalls_is_told_behind_what_came() -> None:
     never = threading.Event()
 
-    def stalls() -> Iterator[Shot]:
+    def stalls() -> Iterator[Frame]:
         yield from shots(3)
         never.wait(10)
 
     seen = []
-    with refused("/dev/video0", "stalled", "0.05"), Feed(stalls(), timeout=0.05, name="/dev/video0") as feed:
+    with (
+        refused("/dev/video0", "stalled", "0.05"),
+        FrameReader(stalls(), timeout=0.05, name="/dev/video0") as feed,
+    ):
         for shot in feed:
             seen.append(shot.number)
     never.set()
@@ -74,19 +77,19 @@ def test_a_source_that_stalls_is_told_behind_what_came() -> None:
 
 @pytest.mark.parametrize("newest", [False, True])
 def test_what_reading_raises_comes_behind_the_frames(newest: bool) -> None:
-    def breaks() -> Iterator[Shot]:
+    def breaks() -> Iterator[Frame]:
         yield from shots(1)
         raise InputError("it broke off")
 
     seen = []
-    with refused("broke off"), Feed(breaks(), newest) as feed:
+    with refused("broke off"), FrameReader(breaks(), newest) as feed:
         for shot in feed:
             seen.append(shot.number)
     assert seen == [0]
 
 
 def test_the_thread_ends_with_the_feed() -> None:
-    with Feed(shots(10**9)) as feed:
+    with FrameReader(shots(10**9)) as feed:
         next(iter(feed))
     assert not feed._thread.is_alive()
 
@@ -96,7 +99,7 @@ def test_real_time() -> None:
     assert len(list(in_real_time(shots(6, rate=50), "clip"))) == 6
     assert time.monotonic() - began >= 0.1
     with refused("no times"):
-        list(in_real_time([Shot(0, math.nan, PIXELS)], "folder"))
+        list(in_real_time([Frame(0, math.nan, PIXELS)], "folder"))
     began = time.monotonic()
-    assert len(list(in_real_time((Shot(i, math.nan, PIXELS) for i in range(6)), "folder", rate=50))) == 6
+    assert len(list(in_real_time((Frame(i, math.nan, PIXELS) for i in range(6)), "folder", rate=50))) == 6
     assert time.monotonic() - began >= 0.1

@@ -19,21 +19,21 @@ from helpers import refused
 from videos import clip, pictures
 
 from dejavu_torch import open_source
-from dejavu_torch.data.camera import Shot
+from dejavu_torch.data.camera import Frame
 from dejavu_torch.live.localizer import LiveMatch
-from dejavu_torch.live.page import PAGE, Moment, Page, ReferencePictures, as_picture, curve
+from dejavu_torch.live.page import PAGE, Page, ReferencePictures, Snapshot, as_picture, curve
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-def moment(number: int = 7, name: str = "left<b>.png", accepted: bool = True, time: float = 0.28) -> Moment:
+def moment(number: int = 7, name: str = "left<b>.png", accepted: bool = True, time: float = 0.28) -> Snapshot:
     pixels = np.zeros((24, 32, 3), np.uint8)
     pixels[:, :16] = (200, 40, 40)
     scores = torch.full((3001,), 1e-5)
     scores[1200:1204] = torch.tensor([0.1, 0.3, 0.3, 0.2])
     scores[-1] = 1 - scores[:-1].sum()
     match = LiveMatch(1204, 1204, name, 0.1, math.exp(-0.1), 0.99, accepted, 12.5)
-    return Moment(Shot(number, time, pixels), match, scores, True, 8, 2, 11.0, 19.0)
+    return Snapshot(Frame(number, time, pixels), match, scores, True, 8, 2, 11.0, 19.0)
 
 
 @pytest.fixture
@@ -101,6 +101,7 @@ def test_curve_keeps_the_highest_of_many_places() -> None:
     heights = curve(scores, posterior=False)
     assert (len(heights), max(heights), heights.index(max(heights))) == (512, 1.0, 512 * 70_001 // 100_000)
     assert curve(torch.full((4,), math.inf), posterior=False) == [0.0] * 4
+    assert curve(torch.tensor([3.0, 1.0, 2.0, math.inf]), posterior=False) == [0.0, 1.0, 0.5, 0.0]
 
 
 @pytest.mark.parametrize("places", [1, 7, 512, 700, 100_000])

@@ -143,8 +143,8 @@ MUTANTS = [
         "In a PlaceFilter what drives off the end of the map is off the map afterwards: the prediction "
         "adds up to 1.",
         "dejavu_torch/recognition/filter.py",
-        "off = stay * (on.sum() - moved.sum()) + leave * total + (1 - enter) * off",
-        "off = leave * total + (1 - enter) * off",
+        "off = stay * (on.sum() - moved.sum()) + leave * (1 - off) + (1 - enter) * off",
+        "off = leave * (1 - off) + (1 - enter) * off",
         ("tests/recognition/test_filter.py::-k literal_loop or drives_off",),
     ),
     Mutant(
@@ -306,8 +306,8 @@ MUTANTS = [
     Mutant(
         "A match on a map of shuffled frames (the null) tells the frame that is stored at the place.",
         "dejavu_torch/model.py",
-        "matcher, place = Matcher(matching), order.argsort()",
-        "matcher, place = Matcher(matching), order",
+        "matcher, place = Localizer(None, matching), order.argsort()",
+        "matcher, place = Localizer(None, matching), order",
         (
             "tests/evaluation/test_controls.py::test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored",
         ),
@@ -366,7 +366,7 @@ MUTANTS = [
     Mutant(
         "A live answer on a merged map gives the frame as counted on its own route.",
         "dejavu_torch/live/localizer.py",
-        "frame=int(found.table.own_frame_of(match.index)) if routes else shown,",
+        "frame=int(table.own_frame_of(match.index)) if routes else shown,",
         "frame=shown,",
         ("tests/test_cli_growth.py::test_live_names_the_route",),
     ),

@@ -123,22 +123,22 @@ MUTANTS = [
     Mutant(
         "A query that nothing covers reports the place -1.",
         "dejavu_torch/recognition/select.py",
-        "found.append((torch.where(score.isfinite(), index, -1), score))",
-        "found.append((index, score))",
+        "index = torch.where(finite, index, -1)",
+        "pass",
         ("tests/recognition/test_select.py::test_convention_2_a_query_that_nothing_covers_reports_nothing",),
     ),
     Mutant(
         "Behind the last candidate with a finite score the place is -1.",
         "dejavu_torch/recognition/select.py",
-        "torch.where(score.isfinite(), index, -1)",
-        "torch.where(score.isfinite() | (rank > 0), index, -1)",
+        "torch.where(finite, index, -1)",
+        "torch.where(finite | (torch.arange(k) > 0), index, -1)",
         ("tests/recognition/test_candidates.py::test_equals_reference",),
     ),
     Mutant(
         "Of a sequence, a place that nothing covers for the latest query is not reported.",
         "dejavu_torch/recognition/sequence.py",
-        "best = best.masked_fill(~valid[len(state) :], math.inf)",
-        "pass",
+        ".masked_fill(~valid[-len(used) :], math.inf)",
+        "",
         (
             "tests/recognition/test_sequence.py::test_convention_2_a_place_that_nothing_covers_is_not_reported",
         ),
@@ -160,8 +160,8 @@ MUTANTS = [
     Mutant(
         "A filter's search that tells nothing is made again for the next query.",
         "dejavu_torch/recognition/filter.py",
-        "if moments.varied:  # a query",
-        "if True:  # a query",
+        "if near is None and moments.varied:  # a query",
+        "if near is None:  # a query",
         (
             "tests/test_behaviour.py::test_a_search_that_tells_nothing_is_made_again",
             "tests/recognition/test_filter.py::test_a_search_that_says_nothing_is_made_again",
@@ -192,7 +192,7 @@ MUTANTS = [
     ),
     Mutant(
         "Beside a sequence stand only lengths that the queries and the places have room for.",
-        "dejavu_torch/recognition/localizer.py",
+        "dejavu_torch/evaluation/contenders.py",
         "if length <= min(queries, places))",
         "if length <= queries)",
         ("tests/recognition/test_matcher.py::test_lengths_that_there_is_room_for",),
@@ -381,15 +381,15 @@ MUTANTS = [
     Mutant(
         "A sequence does not run from one route of a merged map into the next.",
         "dejavu_torch/recognition/sequence.py",
-        "cuts, ways = [*firsts[1:]], []",
-        "cuts, ways = [], []",
+        "rows.tensor_split([*firsts[1:]], 1)",
+        "rows.tensor_split([], 1)",
         ("tests/recognition/test_sequence.py::test_trajectories_stay_on_their_route",),
     ),
     Mutant(
         "The borders of routes that a sequence keeps are those of the places, through all routes.",
         "dejavu_torch/recognition/localizer.py",
-        "starts = (sum(one.places for one in route.routes[:i]) for i",
-        "starts = (route.routes[i - 1].places for i",
+        "accumulate(one.places for one in routes[:-1])",
+        "(one.places for one in routes[:-1])",
         ("tests/test_growth.py::test_a_sequence_does_not_run_from_one_route_into_the_next",),
     ),
     Mutant(

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, open_source
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.evaluation.rejection import calibration_error
 from dejavu_torch.features.views import Views, augmented_segments
 from dejavu_torch.model import HIGHEST
 from dejavu_torch.recognition.calibration import (
@@ -25,7 +26,6 @@ from dejavu_torch.recognition.calibration import (
     Track,
     Trial,
     calibrated,
-    calibration_error,
     confidence_of,
     fit,
 )
@@ -368,7 +368,7 @@ def test_an_export_tells_how_to_get_probabilities(model: DejaVu, tmp_path: Path)
 def test_matches_join_and_change_with_and_without_probability() -> None:
     one = Match(torch.tensor([1]), torch.tensor([0.5]), torch.tensor([True]))
     assert Match.joined([one, one]).probability is None
-    sure = one.with_probability(torch.tensor([0.9]))
+    sure = one._replace(probability=torch.tensor([0.9]))
     assert sure._replace(index=torch.tensor([2])).probability is sure.probability
     both = Match.joined([sure, sure]).map(lambda column: column[1:])
     assert (both.probability, len(both)) == (torch.tensor([0.9]), 3)

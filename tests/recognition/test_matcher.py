@@ -8,11 +8,13 @@ from itertools import pairwise
 
 import pytest
 import torch
+from helpers import streamed
 from torch import Tensor
 
+from dejavu_torch.evaluation.contenders import lengths_beside
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import Matcher, Matching, lengths_beside
+from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.select import Acceptance, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
@@ -21,7 +23,7 @@ SCORES = torch.rand(30, 40, generator=torch.Generator().manual_seed(3))
 
 
 def matched(matching: Matching, scores: Tensor = SCORES, size: int = 30) -> Match:
-    matcher = Matcher(matching)
+    matcher = Localizer(None, matching)
     return Match.joined(map(matcher.match, scores.split(size)))
 
 
@@ -39,7 +41,7 @@ def test_a_sequence_and_what_stands_beside_it(
     """A matcher's at its own speeds, a filter's at speed 1, out of the scores of single queries."""
     found = matched(Matching(sequence, (1, 5, 11)), size=size)
     with torch.no_grad():
-        (own,) = sequence.stream([SCORES])
+        (own,) = streamed(sequence, [SCORES])
     assert found.index.tolist() == own.argmin(1).tolist()
     assert torch.allclose(found.score, own.min(1).values)
     assert list(found.sequences) == [1, 5, 11]
@@ -60,7 +62,7 @@ def test_scores_pass_by_once_and_are_not_held(
             yield torch.rand(2, 50)
 
     with largest_tensor() as seen:
-        for number, _ in enumerate(map(Matcher(Matching(sequence, (1, 5, 11))).match, batches())):
+        for number, _ in enumerate(map(Localizer(None, Matching(sequence, (1, 5, 11))).match, batches())):
             assert asked == list(range(number + 1))
     assert len(asked) == 40
     assert seen.numel <= (11 - 1 + 2) * (50 + 2 * 10)  # a trajectory's places to each side
@@ -106,7 +108,7 @@ def test_places_are_renumbered_everywhere() -> None:
     match = Match(torch.tensor([3, -1]), torch.tensor([0.0, math.inf]), torch.tensor([True, False]))
     several = Match(torch.tensor([[1, 2], [3, -1]]), torch.zeros(2, 2), torch.ones(2, 2) > 0)
     probability = torch.rand(2, 2)
-    found = several.with_probability(probability, {5: match})
+    found = several._replace(probability=probability, sequences={5: match})
     moved = found.renumbered(lambda place: torch.where(place >= 0, 10 * place, -1))
     assert moved.index.tolist() == [[10, 20], [30, -1]]
     assert moved.sequences[5].index.tolist() == [30, -1]

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from helpers import Fixed, refused, template_model
+from helpers import Fixed, refused, streamed, template_model
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -54,7 +54,7 @@ def test_equals_a_literal_loop(rows: list[list[float]], length: int, speeds: lis
 @given(TABLE, st.integers(1, 12), SPEEDS, st.integers(1, 4))
 def test_batches_do_not_matter(rows: list[list[float]], length: int, speeds: list[float], size: int) -> None:
     matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows)
-    assert torch.equal(torch.cat(list(matcher.stream(scores.split(size)))), matcher(scores))
+    assert torch.equal(torch.cat(list(streamed(matcher, scores.split(size)))), matcher(scores))
 
 
 @given(TABLE, st.integers(1, 12), SPEEDS)
@@ -107,7 +107,7 @@ def test_gradients_reach_every_score_of_a_trajectory() -> None:
 def test_no_more_rows_than_a_sequence_are_kept(largest_tensor: type) -> None:
     matcher, batches = SequenceMatcher(5), (torch.rand(2, 50) for _ in range(100))
     with largest_tensor() as seen:
-        for _ in matcher.stream(batches):
+        for _ in streamed(matcher, batches):
             pass
     assert seen.numel <= (5 - 1 + 2) * (50 + 2 * 4)  # a trajectory's places to each side
 

@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.training.datamodule import Batch, Clips, RouteData, StoredFrames, as_frames, store
-from dejavu_torch.types import GroundTruth
 
 
 def numbered(frames: int, first: int = 0, side: int = 8) -> ArrayTraverse:

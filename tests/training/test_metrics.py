@@ -17,10 +17,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from torchmetrics import MetricCollection
 
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.curves import Scores, evaluate
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.types import GroundTruth, Match
+from dejavu_torch.types import Match
 
 INF = float("inf")
 # score, reported place, right places, judged, ignored places; few values, so that scores tie
