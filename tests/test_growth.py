@@ -341,7 +341,7 @@ def test_a_merged_map_scores_as_its_parts_do(metric: str, tmp_path: Path) -> Non
         for one in (merged, loaded, fresh):
             assert torch.allclose(one(queries), expected, atol=1e-6)
             for start, stop in ((90, 240), (101, 103)):
-                scores = one.map.scores_between(descriptors, start, stop)
+                scores = torch.cat([part for _, part in one.map.score_blocks(descriptors, start, stop)], 1)
                 assert torch.allclose(scores, expected[:, start:stop], atol=1e-6)
     assert loaded.summary().map_bytes == (tmp_path / "m.safetensors").stat().st_size
     own = [model.summary() for model in models]
@@ -486,14 +486,14 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was(tmp_path: Path)
         ({"routes": [extra["routes"][0], extra["routes"][1] | {"name": "a"}]}, ("names a, a",)),
         ({"routes": extra["routes"][:1]}, ("means (2, ", "(1, ")),
         (
-            {"routes": [extra["routes"][0], extra["routes"][1] | {"chunks": 9}]},
-            ("routes of [2, 9] chunks", "expected 5"),
+            {"routes": [extra["routes"][0], extra["routes"][1] | {"places": 129}]},
+            ("routes of [100, 129] places", "expected whole chunks, 230 places"),
         ),
         (
             {"routes": [extra["routes"][0], extra["routes"][1] | {"frames": 131}]},
             ("routes of [100, 131] frames", "expected 230"),
         ),
-        ({"routes": ["a", "b"]}, ("routes are ['a', 'b']", "name, chunks and frames")),
+        ({"routes": ["a", "b"]}, ("routes[0] is of 'a'", "name, places, frames")),
         ({"kind": "merged"}, ("'merged'", "'spectral'")),
     ):
         with refused(*words):

@@ -21,7 +21,7 @@ from dejavu_torch.data.files import LARGEST, check_regular
 from dejavu_torch.data.output import whole_file
 from dejavu_torch.types import InputError
 
-FORMAT = 10
+FORMAT = 11
 NAME = "dejavu_torch-map"
 ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"

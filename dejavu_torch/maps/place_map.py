@@ -16,7 +16,7 @@ from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
-OPTIONAL = ("visits", "escapes")  # left out of a file if empty
+OPTIONAL = ("visits",)  # left out of a file if empty
 
 
 class PlaceMap(nn.Module, ABC):

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dejavu_torch.maps.codec import encode
 from dejavu_torch.maps.place_map import Mapper
-from dejavu_torch.maps.quantisation import RouteLines, rms
-from dejavu_torch.maps.spectral_map import CHUNK_BYTES, Chunk, SpectralMap, SpectralMetric, check_settings
+from dejavu_torch.maps.quantisation import RouteLines
+from dejavu_torch.maps.spectral_map import CHUNK_BYTES, Chunk, SpectralMap, SpectralMetric
 from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.types import InputError
 
@@ -77,10 +77,10 @@ class SpectralMapper(Mapper):
         for name, value in (("route_bytes_per_place", route_bytes_per_place), ("step", step)):
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name} is {value}; expected a number above 0")
-        check_settings(metric, transform, chunk, resolution)
         self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
         self.transform, self.metric, self.resolution = transform, metric, resolution
         self.overhead, self.ready = 0, False  # see `with_overhead`
+        self.empty()  # checks the settings
 
     @classmethod
     def of_equal_size(cls, route: SpectralMap) -> SpectralMapper:
@@ -99,17 +99,16 @@ class SpectralMapper(Mapper):
 
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
-        lines = self._lines(features, self.chunk)
-        route, held = self._fitted(lines)
-        for small, escapes in lines.levels(route.step):
-            route.extend_levels(small, escapes)
-        route.energy, route.error = lines.energy, lines.energy * (1 - held)
+        route, lines = self._fitted(features, self.chunk)
+        for (start, stop), levels in zip(lines.chunks, lines.levels(route.step), strict=True):
+            route.extend([Chunk(stop - start, route.step, encode(levels))], [levels])
+        route.energy, route.error = lines.energy, lines.error(route.step)
         return route
 
     @torch.no_grad()
     def fit(self, sample: Tensor, stretch: int) -> SpectralMap:
         """A map without places: mean and step for chunks of a route, from descriptors (n,K) of stretches."""
-        return self._fitted(self._lines(sample, stretch))[0]
+        return self._fitted(sample, stretch)[0]
 
     def empty(self) -> SpectralMap:
         """See `Mapper`."""
@@ -125,27 +124,23 @@ class SpectralMapper(Mapper):
         names = ("route_bytes_per_place", "step", "chunk", "transform", "metric", "resolution")
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
-    def _lines(self, features: Tensor, chunk: int) -> RouteLines:
+    def _fitted(self, features: Tensor, chunk: int) -> tuple[SpectralMap, RouteLines]:
+        """The map without places, and the lines to code in its step."""
         check_descriptors(features)
-        lengths = [len(part) for part in torch.empty(len(features)).split(chunk)]
+        places = len(features)
+        lengths = [min(chunk, places - start) for start in range(0, places, chunk)]
         lines = RouteLines(features, lengths, self.transform, self.resolution)
-        if not lines.scale > 1e-6 * rms(features, lines.rows):
-            raise InputError(f"the {len(features)} descriptors are all alike; expected a route that changes")
-        return lines
-
-    def _fitted(self, lines: RouteLines) -> tuple[SpectralMap, float]:
-        """The map without places, and the share of the variance that the lines will hold."""
-        places = len(lines.lines)
+        if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
+            raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
         fixed = lines.mean.nbytes + CHUNK_BYTES * len(lines.chunks)
         fixed += self._counted_overhead(places, fixed)
-        step = float(torch.tensor(self._step(lines, fixed)))  # as the file holds it
-        settings = self.metric, self.transform, self.chunk, self.resolution
-        route = SpectralMap(lines.mean[None], *settings, step)
-        held = lines.held(step)
+        step = float(torch.tensor(self._fitting_step(lines, fixed)))  # as the file holds it
+        route = SpectralMap(lines.mean[None], self.metric, self.transform, self.chunk, self.resolution, step)
+        held = 1 - lines.error(step) / lines.energy
         if held < LITTLE:
-            half = lines.coded_bytes(lines.step_that_holds(0.5), even=True)
-            route.needed = (fixed + half) / places
-        return route, held
+            even = lines.even()
+            route.needed = (fixed + even.coded_bytes(even.step_that_holds(0.5))) / places
+        return route, lines
 
     def _counted_overhead(self, places: int, fixed: int) -> int:
         """The overhead, where it counts: what exceeds half of the lines' room comes on top of the budget."""
@@ -161,13 +156,13 @@ class SpectralMapper(Mapper):
         )
         return 0
 
-    def _step(self, lines: RouteLines, fixed: int) -> float:
+    def _fitting_step(self, lines: RouteLines, fixed: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
         if self.step is not None:
             return self.step
         places, numbers = lines.lines.shape
         given = self.route_bytes_per_place
-        nothing = lines.coded_bytes(lines.coarsest)  # of no lines
+        nothing = lines.coded_bytes(lines.coarsest)
         least = (fixed + nothing) / places
         most = math.floor(least) + 4 * numbers  # all numbers as floats
         if given is not None and not least < given <= most:
@@ -185,7 +180,9 @@ class SpectralMapper(Mapper):
                 *(places, least, budget),
             )
         step = lines.step_of(max(nothing, budget * places - fixed * (not short)))
-        return min(step, lines.step_that_holds(HELD)) if given is None and (self.ready or short) else step
+        if given is None and (self.ready or short):
+            step = min(step, lines.even().step_that_holds(HELD))
+        return step
 
 
 @torch.no_grad()
@@ -204,9 +201,8 @@ def code_chunk(
     """
     check_descriptors(descriptors, len(mean))
     lines = RouteLines(descriptors, [len(descriptors)], transform, resolution, mean)
-    ((small, escapes),) = lines.levels(step)
-    error = lines.energy * (1 - lines.held(step)) if lines.energy else 0.0
-    return Chunk(len(descriptors), step, encode(small), escapes.cpu(), lines.energy, error)
+    (levels,) = lines.levels(step)
+    return Chunk(len(descriptors), step, encode(levels), lines.energy, lines.error(step))
 
 
 def check_descriptors(features: Tensor, dimension: int | None = None) -> None:

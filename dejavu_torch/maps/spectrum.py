@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from dejavu_torch.types import InputError
 
 Transform = Literal["dft", "dct"]
+N = TypeVar("N", int, Tensor)
 
 
 def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
@@ -48,22 +49,22 @@ def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
 def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
     """The series that has these lines: the inverse of `spectrum`. (...,W) -> (...,W)"""
     count = _check(lines, transform)
-    where, factor = slots(count, transform, lines.dtype, lines.device)
-    slotted = lines.new_zeros(*lines.shape[:-1], len(factor)).index_copy(-1, where, lines)
+    slot, factor = slots(count, transform, lines.dtype, lines.device)
+    slotted = lines.new_zeros(*lines.shape[:-1], len(factor)).index_copy(-1, slot, lines)
     return from_slots(slotted * factor, count, transform)
 
 
 def slots(
     count: int, transform: Transform, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Where `from_slots` takes the lines of W numbers from, (W,) int64, and what it expects the S slots to be
-    multiplied with, (S,); slots without a line are 0."""
-    where = torch.arange(count, device=device)
+    """The slot in which `from_slots` expects each of W lines, (W,) int64, and the factor that it expects on
+    each of the S slots, (S,); slots without a line are 0."""
+    slot = torch.arange(count, device=device)
     size = count
     if transform == "dft":  # pairs of a cosine and a sine; the mean has no sine
-        where, size = where + (where > 0), 2 * (count // 2) + 2
+        slot, size = slot + (slot > 0), 2 * (count // 2) + 2
     scale = 1 / _scale(torch.empty(count, dtype=dtype, device=device), transform)
-    return where, scale.new_zeros(size).index_copy(0, where, scale)
+    return slot, scale.new_zeros(size).index_copy(0, slot, scale)
 
 
 def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:
@@ -79,9 +80,14 @@ def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:
     return series
 
 
+def half_cycles(line: N, transform: Transform) -> N:
+    """The half cycles of a line over the series."""
+    return line if transform == "dct" else (line + 1) // 2 * 2
+
+
 def period_of(line: int, count: int, transform: Transform = "dft") -> Fraction:
-    """The period of a line above 0, in steps of the series: W / k of k cycles."""
-    return Fraction(count, (line + 1) // 2) if transform == "dft" else Fraction(2 * count, line)
+    """The period of a line above 0, in steps of a series of `count`: W / k of k cycles."""
+    return Fraction(2 * count, half_cycles(line, transform))
 
 
 def _check(values: Tensor, transform: str) -> int:

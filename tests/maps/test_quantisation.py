@@ -91,8 +91,8 @@ def test_lines_and_their_scale_are_those_of_each_chunk() -> None:
     centred = descriptors - lines.mean.float()
     assert torch.allclose(lines.lines[200:].square().sum(), centred[200:].square().sum())
     assert math.isclose(lines.scale, float(centred.square().mean().sqrt()), rel_tol=1e-5)
-    assert lines.held(lines.scale / 64) > 0.999
-    assert not any(small.any() for small, _ in lines.levels(lines.coarsest))
+    assert lines.error(lines.scale / 64) < 0.001 * lines.energy
+    assert not any(levels.any() for levels in lines.levels(lines.coarsest))
 
 
 class TestRoomInAFile:

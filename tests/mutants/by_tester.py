@@ -57,8 +57,8 @@ MUTANTS = [
     Mutant(
         "Cosine and sine of k cycles both have the period W / k.",
         "dejavu_torch/maps/spectrum.py",
-        "Fraction(count, (line + 1) // 2)",
-        "Fraction(count, line // 2 + 1)",
+        "(line + 1) // 2 * 2",
+        "line // 2 * 2 + 2",
         ("tests/maps/test_spectrum.py::test_periods",),
     ),
     Mutant(
@@ -81,8 +81,8 @@ MUTANTS = [
     Mutant(
         "In the periods of a summary cosine and sine of one frequency count together, once.",
         "dejavu_torch/maps/spectral_map.py",
-        "energy[2::2] = 0",
-        "energy[2::2] += 0",
+        "half_cycles(line, self.transform), value.square()",
+        "line, value.square()",
         ("tests/test_behaviour.py::test_a_frequency_is_one_period_of_a_summary",),
     ),
     Mutant(
@@ -102,8 +102,8 @@ MUTANTS = [
     Mutant(
         "Levels that are altered are noticed by their checksum.",
         "dejavu_torch/maps/codec.py",
-        "or left or checksum != stream.checksum:",
-        "or left:",
+        "if left or checksum != stream.checksum:",
+        "if left:",
         ("tests/maps/test_codec.py::test_damage_is_told",),
     ),
     Mutant(
@@ -374,7 +374,7 @@ MUTANTS = [
     Mutant(
         "Each route of a merged map keeps its own mean.",
         "dejavu_torch/maps/spectral_map.py",
-        "means = means[:, self._route_of_chunk[chunks.start : chunks.stop]]",
+        "means = means[:, self._routes_of(chunks)]",
         "means = means[:, :1]",
         ("tests/test_growth.py::test_a_merged_map_scores_as_its_parts_do",),
     ),
@@ -400,11 +400,10 @@ MUTANTS = [
         ("tests/maps/test_spectral_map.py::test_sparse_products_are_those_of_the_whole_rows",),
     ),
     Mutant(
-        "Some chunks of a map, as a worker holds them, score as in the whole: `min_norm` is that of the "
-        "whole.",
+        "Some chunks of a map, as a worker holds them, score as in the whole: with the mean of their route.",
         "dejavu_torch/maps/spectral_map.py",
-        "made.min_norm = self.min_norm",
-        "pass",
+        "made = SpectralMap(self.means[own], **self.settings())",
+        "made = SpectralMap(self.means[own * 0], **self.settings())",
         ("tests/test_cluster.py::test_a_part_scores_as_in_the_whole_map",),
     ),
     Mutant(

@@ -56,7 +56,7 @@ def test_the_map_is_of_the_network_in_its_file(tmp_path: Path, settings: dict[st
     assert not is_rounded(task.dejavu.features)
     if settings:
         made = SpectralMapper(20.0)(model.extract_all(ArrayTraverse(footage())))
-        assert torch.equal(made.levels, model.map.levels)  # type: ignore[arg-type]
+        assert torch.equal(made.streams, model.map.streams)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("settings", KINDS, ids=["templates", "spectral"])
