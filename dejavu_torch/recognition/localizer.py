@@ -84,11 +84,21 @@ class Localizer:
     def __call__(self, descriptors: Tensor) -> Match:
         route, matching = self.route, self.matching
         assert route is not None
+        places = route.places
         if not len(descriptors):
-            return self.match(descriptors.new_zeros(0, route.places))
-        single = matching.sequence is None and matching.on_scores is None
-        way, device = self._by_search if single else self._by_scores, route.positions.device
-        return Match.joined(way(part.to(device), route) for part in descriptors.split(ROWS))
+            return self.match(descriptors.new_zeros(0, places))
+        wanted = [(matching.k or 1, matching.radius)]
+        if matching.platt is not None:
+            wanted.append((min(2, places), TOLERANCE))
+        # each candidate that is chosen rules out 2 radius + 1
+        n = min(places, max((k - 1) * (2 * radius + 1) + 1 for k, radius in wanted))
+        few = n <= max(1, FEW * min(places, route.block_places)) or places > SCORES_AT_ONCE
+        way, size = self._by_scores, places
+        if matching.sequence is None and matching.on_scores is None and (few or self.find is not None):
+            find = self.find or partial(search, route, method=matching.search)
+            way, size = partial(self._by_search, find, wanted, n), LISTED * n
+        parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
+        return Match.joined(way(part.to(route.positions.device)) for part in parts)
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:
@@ -145,26 +155,16 @@ class Localizer:
             match = match._replace(probability=probability)
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
-    def _by_scores(self, descriptors: Tensor, route: PlaceMap) -> Match:
-        if self.local is not None:
-            return Match.joined(map(self._locally, descriptors.split(1)))
-        parts = descriptors.split(max(1, SCORES_AT_ONCE // route.places))
-        return Match.joined(self.match(route.scores(part)) for part in parts)
+    def _by_scores(self, descriptors: Tensor) -> Match:
+        assert self.route is not None
+        if self.local is None:
+            return self.match(self.route.scores(descriptors))
+        return Match.joined(map(self._locally, descriptors.split(1)))
 
-    def _by_search(self, descriptors: Tensor, route: PlaceMap) -> Match:
-        """By the lowest scores alone, unless they are too many."""
-        matching = self.matching
-        wanted = [(matching.k or 1, matching.radius)]
-        if matching.platt is not None:
-            wanted.append((min(2, route.places), TOLERANCE))
-        # each candidate that is chosen rules out 2 radius + 1
-        n = min(route.places, max((k - 1) * (2 * radius + 1) + 1 for k, radius in wanted))
-        few = max(1, FEW * min(route.places, route.block_places))
-        if self.find is None and n > few and route.places <= SCORES_AT_ONCE:
-            return self._by_scores(descriptors, route)
-        find, parts = self.find or partial(search, route, method=matching.search), []
-        for part in descriptors.split(max(1, SCORES_AT_ONCE // (LISTED * n))):
-            score, place = find(part, n)
-            match, *second = (best_candidates(score, *one, places=place) for one in wanted)
-            parts.append(self._answer(match, *map(confidence, second)))
-        return Match.joined(parts)
+    def _by_search(
+        self, find: Callable[..., Best], wanted: list[tuple[int, int]], n: int, descriptors: Tensor
+    ) -> Match:
+        """By the n lowest scores alone, of which candidates (k, radius) are chosen."""
+        score, place = find(descriptors, n)
+        match, *second = (best_candidates(score, *one, places=place) for one in wanted)
+        return self._answer(match, *map(confidence, second))
