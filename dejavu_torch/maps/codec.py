@@ -59,11 +59,11 @@ def encode(levels: Tensor) -> Stream:
     """
     whole = _numbers(levels)
     coder = _Coder(WRITE, whole.shape)
-    coder.write(whole)
+    filled = coder.write(whole)
     packed, size = coder.packed, int(coder.state[2])
     packed[size:] = bytes(1)
     _put(int(coder.state[0]) + LEAST - 1, size, packed)  # in the interval, its further bytes 0
-    _check_size(len(_filled(whole)), whole.shape[1], len(packed))
+    _check_size(filled, whole.shape[1], len(packed))
     return Stream(torch.frombuffer(packed, dtype=torch.uint8), _checksum(whole))
 
 
@@ -131,12 +131,6 @@ def _checksum(levels: Ints) -> int:
     return zlib.crc32(levels.data, zlib.crc32(repr(levels.shape).encode()))
 
 
-def _filled(levels: Ints) -> Ints:
-    """The rows up to the last that is not 0."""
-    filled = np.flatnonzero(levels.any(1))
-    return levels[: int(filled[-1]) + 1 if len(filled) else 0]
-
-
 class _Coder:
     """Codes rows block by block, and keeps what one block leaves for the next.
 
@@ -156,14 +150,15 @@ class _Coder:
         self.before = np.zeros((2, shape[1]), np.int32)
         self.rows = max(1, BLOCK // shape[1])
 
-    def write(self, levels: Ints) -> None:
-        """Write the levels, or count their bits."""
-        filled = len(_filled(levels))
+    def write(self, levels: Ints) -> int:
+        """Write the levels, or count their bits; the number of rows up to the last that is not 0."""
+        filled = 1 + int(np.flatnonzero(levels.any(1)).max(initial=-1))
         for start in range(0, min(filled + 1, len(levels)), self.rows):
             block = levels[start : start + self.rows]
             if self.mode == WRITE:
                 self.packed.extend(bytes(max(0, int(self.state[2]) + ROOM * block.size - len(self.packed))))
             self._code(block, start, filled)
+        return filled
 
     def read(self, rows: int, size: int) -> Ints:
         """Read so many rows of a stream of `size` bytes."""
@@ -181,7 +176,7 @@ class _Coder:
         block = np.concatenate([self.before, levels], dtype=np.int32)
         packed = self.packed if self.kernel is _code else np.frombuffer(self.packed, np.uint8)
         coding = self.mode, self.state, self.counts, packed, self.sums, _logarithms()
-        row = self.kernel(block, start, filled, *coding)
+        row = self.kernel(block, start, filled, coding)
         self.before = block[-2:]
         return block[2:], row
 
@@ -189,27 +184,16 @@ class _Coder:
 # The functions from here to `_near` run as they are, on lists, and compiled by numba, on arrays.
 
 
-def _code(
-    block: Any,
-    start: int,
-    filled: int,
-    mode: int,
-    state: Any,
-    counts: Any,
-    packed: Any,
-    sums: Any,
-    logarithms: Any,
-) -> int:
-    """Code the rows of a block from row `start` on; the two before them come first.
+def _code(block: Any, start: int, filled: int, coding: Any) -> int:
+    """Code the rows of a block from row `start` on, in which the two before them come first.
 
     Args:
-        filled: rows up to the last that is not 0, unless that is read. sums: see `_near`. The others: see
-            `_Coder`.
+        filled: rows up to the last that is not 0, if they are known. coding: see `_Coder` and `_near`.
 
     Returns:
-        The row before which coding ended, since all further ones are 0.
+        The row at which coding ended; all further ones are 0.
     """
-    columns = block.shape[1]
+    mode, state, counts, packed, sums, logarithms = coding
     low, span, at = state[0], state[1], state[2]
     for r in range(2, len(block)):
         row = start + r - 2
@@ -217,7 +201,7 @@ def _code(
         if bit:
             break
         near = _near(sums, row, logarithms)
-        for f in range(columns):
+        for f in range(block.shape[1]):
             level, around, before = int(block[r, f]), int(near[f]), int(block[r - 2, f])
             if mode == COUNT and not level:  # as below, but faster
                 counts[2 * (LENGTH + around)] += 2
@@ -321,7 +305,7 @@ def _kernel(levels: int) -> Callable[..., int]:
 def _compiled() -> Callable[..., int] | None:
     """`_code` compiled, or None if numba is missing or broken."""
     block, numbers = "int32[:,::1]", "int64[::1]"
-    coding = f"int64, {numbers}, {numbers}, uint8[::1], {block}, {numbers}"
+    coding = f"Tuple((int64, {numbers}, {numbers}, uint8[::1], {block}, {numbers}))"
     try:
         from numba.extending import register_jitable
 

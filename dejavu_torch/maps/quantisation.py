@@ -39,11 +39,7 @@ def dead_zone(
 ) -> Tensor | None:
     """By how much the dead zone of each of (N,K) lines, in chunks of these lengths, is wider than line 0's.
 
-    That of a line of period P is 1 + (resolution / P)^2 times as wide: it costs as many bits as a slow one,
-    but only tells places apart that are within P of each other.
-
-    Returns:
-        (N,1), or None if all lines count alike.
+    Shape: -> (N,1), 1 + (resolution / P)^2 for a line of period P; None if that is 1 for all.
     """
     if not resolution:
         return None
@@ -52,13 +48,10 @@ def dead_zone(
 
 
 class RouteLines:
-    """The lines of a route, chunk by chunk; only their step is still to be chosen.
-
-    Of a long route no more than the lines and the levels of one chunk are held at once; lines beyond a share
-    of the memory are in a temporary file.
+    """The lines of a route, chunk by chunk; those beyond a share of the memory are in a temporary file.
 
     Args:
-        lengths: places of each chunk, one after another. transform, resolution: see `spectrum`, `dead_zone`.
+        lengths: places of each chunk. transform, resolution: see `spectrum`, `dead_zone`.
         mean: (K,) that is subtracted; None is that of the route, in bfloat16 as a map stores it.
 
     Shape: features (N,K), float of any kind.

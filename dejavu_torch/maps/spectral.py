@@ -1,4 +1,4 @@
-"""What makes spectral maps: the transform of each feature over a chunk, in steps of one size."""
+"""The mapper of spectral maps: it finds the step that fits a budget, and codes the lines in it."""
 
 from __future__ import annotations
 
@@ -25,21 +25,19 @@ HELD = 0.85  # of the variance, where that default does not apply
 
 
 class SpectralMapper(Mapper):
-    """Codes descriptors along the route: the transform of each number over a chunk, in steps of one size.
+    """Codes descriptors along the route: the spectrum of each dimension over a chunk, in steps of one size.
 
     Args:
-        route_bytes_per_place: what the map may take for each place, without what does not grow with the
-            route; the step is chosen so that its coded lines fit. Positions of frames count, but come on top,
-            and a line says so, where they would leave the lines less than half. None, with no step either, is
-            5, and more where that holds less than .85 of the variance of ready features, which need not be
-            smooth along the route, or where mean and chunks alone take it, as on a short route.
-        step: the step itself, in units of the descriptor; then route_bytes_per_place has to be None.
+        route_bytes_per_place: bytes of the map for each place, without those that do not grow with the route;
+            the step is the smallest whose coded lines fit. Positions of frames count, but come on top, with a
+            warning, if they would leave the lines less than half. None, without a step, is 5; more if that
+            holds less than .85 of the variance of ready features, or if mean and chunks alone take it.
+        step: the step itself, in units of the descriptor; route_bytes_per_place is then None.
         chunk: places of a chunk. Shorter chunks cost more bytes; a route no longer than one has one.
         transform, metric: of the maps, see `SpectralMap`.
         resolution: places; 0 codes all lines alike. The dead zone of a line of period P is
-            1 + (resolution / P)^2 times as wide, so that what changes from frame to frame takes no bytes from
-            what lasts. Of video of many frames for each place a user tells apart, where such changes are
-            mostly noise, 8 makes a better map; where every frame is another place it makes a worse one.
+            1 + (resolution / P)^2 times as wide. For video with many frames for each place that a user tells
+            apart 8 makes a better map; if every frame is another place it makes a worse one.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
@@ -112,7 +110,10 @@ class SpectralMapper(Mapper):
 
     def empty(self) -> SpectralMap:
         """See `Mapper`."""
-        return SpectralMap(None, self.metric, self.transform, self.chunk, self.resolution)
+        return self._map()
+
+    def _map(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
+        return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
 
     def with_overhead(self, overhead: int, ready: bool = False) -> SpectralMapper:
         """See `Mapper`."""
@@ -133,28 +134,21 @@ class SpectralMapper(Mapper):
         if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
             raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
         fixed = lines.mean.nbytes + CHUNK_BYTES * len(lines.chunks)
-        fixed += self._counted_overhead(places, fixed)
+        if self.budget is not None:
+            if self.overhead <= max(0, self.budget * places - fixed) / 2:
+                fixed += self.overhead
+            else:
+                log.warning(
+                    "positions of frames take %.3g bytes per place, over half of what "
+                    "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
+                    *(self.overhead / places, self.budget),
+                )
         step = float(torch.tensor(self._fitting_step(lines, fixed)))  # as the file holds it
-        route = SpectralMap(lines.mean[None], self.metric, self.transform, self.chunk, self.resolution, step)
-        held = 1 - lines.error(step) / lines.energy
-        if held < LITTLE:
+        route = self._map(lines.mean[None], step)
+        if 1 - lines.error(step) / lines.energy < LITTLE:
             even = lines.even()
             route.needed = (fixed + even.coded_bytes(even.step_that_holds(0.5))) / places
         return route, lines
-
-    def _counted_overhead(self, places: int, fixed: int) -> int:
-        """The overhead, where it counts: what exceeds half of the lines' room comes on top of the budget."""
-        if self.budget is None or not self.overhead:
-            return 0
-        if self.overhead <= max(0, self.budget * places - fixed) / 2:
-            return self.overhead
-        log.warning(
-            "positions of frames take %.3g bytes per place, over half of what "
-            "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
-            self.overhead / places,
-            self.budget,
-        )
-        return 0
 
     def _fitting_step(self, lines: RouteLines, fixed: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
@@ -206,11 +200,7 @@ def code_chunk(
 
 
 def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
-    """Refuse what is no route of descriptors, or with a dimension, no chunk of one.
-
-    Raises:
-        InputError: naming shape and dtype, or numbers that are not finite.
-    """
+    """Refuse descriptors that make no route, or with a dimension, no chunk of one."""
     least, expected = (2, "K") if dimension is None else (1, dimension)
     fits = features.ndim == 2 and len(features) >= least and dimension in (None, features.shape[1])
     if not fits or not features.numel() or not features.is_floating_point():

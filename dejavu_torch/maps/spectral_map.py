@@ -44,8 +44,7 @@ CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and chec
 class Chunk(NamedTuple):
     """All that a file holds of some places.
 
-    places: W. step: of their lines. stream: the coded levels. energy, error: the sums of squares of all lines
-    and of what the levels miss; 0 if not known.
+    energy, error: the sums of squares of all lines and of what the levels miss; 0 if not known.
     """
 
     places: int
@@ -56,7 +55,7 @@ class Chunk(NamedTuple):
 
 
 class SpectralState(NamedTuple):
-    """The header of a map file for a spectral map; see its arguments. routes: of a merged map, else ()."""
+    """The header of a map file for a spectral map; see its arguments."""
 
     kind: Literal["spectral"]
     places: int
@@ -87,32 +86,30 @@ class SpectralMap(PlaceMap):
         lengths: (G,) int64, places of each chunk. steps: (G,) float32, of each chunk.
         streams, stream_table: coded levels; bytes and checksum of each chunk.
         means: (R,K) bfloat16, of the descriptors of each route: the lines code the difference.
-        positions, visits: see `PlaceMap`.
     Buffers that follow from these:
         counts, feature, level: coefficients of each of N lines; of each of L coefficients the feature,
             ascending within a line, and the value in steps; in the smallest types that hold them.
-        norms: (N,) float32, of the descriptors that the map holds; 0 of one that has no direction.
+        norms: (N,) float32, of the descriptors that the map holds; 0 for next to none (`MIN_NORM`).
 
     Attributes:
         chunks: the places [start, stop) of each. needed: bytes per place that would hold half the variance
-            of a route of which this map holds under a tenth, None otherwise and for a loaded map.
+            of a learned route of which this map holds under a tenth, else None.
         energy, error: sums over the chunks that were added, not loaded; see `Chunk`.
 
     Args:
         means: as above; None makes a map that can load any state.
-        step: of chunks to come, where there are none yet.
         metric: "cosine": 1 - the cosine of the angle between query and coded descriptor. "l2": the square
             of their distance.
-        transform: of the lines, see `spectrum`. chunk: places of a chunk. resolution: see `SpectralMapper`.
+        transform: see `spectrum`. chunk, resolution: see `SpectralMapper`. step: of the first chunk.
 
     Shape: scores: descriptors (Q,K) -> (Q,N), lower is better.
 
-    Convention: a place whose coded descriptor has next to no length (`MIN_NORM`) has cosine 0 with every
-        query, and no gradient; so has a query of length 0. Gradients reach the queries.
+    Convention: a place of norm 0 has cosine 0 with every query, and no gradient; so has a query of length 0.
+        Gradients reach the queries.
 
     Raises:
-        InputError: an unknown metric or transform, buffers that do not fit together; scores: descriptors of
-            another dimension.
+        InputError: settings out of range, buffers that do not fit together; scores: descriptors of another
+            dimension.
     """
 
     kind = "spectral"
@@ -136,7 +133,7 @@ class SpectralMap(PlaceMap):
         transform: Transform = "dft",
         chunk: int = 10_000,
         resolution: float = 0.0,
-        step: float | None = None,
+        step: float = 0.0,
     ) -> None:
         if metric not in get_args(SpectralMetric):
             raise InputError(f"metric {metric!r} is none of a spectral map; expected 'cosine' or 'l2'")
@@ -185,11 +182,15 @@ class SpectralMap(PlaceMap):
         if not chunks:
             return
         places, device = [one.places for one in chunks], self.means.device
-        check_sizes(self.places + sum(places))
         if levels is None:
             levels = (decode(one.stream, one.places, self.dimension) for one in chunks)
         parts = [_nonzero(one) for one in levels]
-        check_sizes(coefficients=self._bounds[-1] + sum(len(level) for *_, level in parts))
+        sizes = self.places + sum(places), self._bounds[-1] + sum(len(level) for *_, level in parts)
+        if max(sizes) > LARGEST:
+            raise InputError(
+                f"the map has {sizes[0]} places and {sizes[1]} coefficients; expected at most {LARGEST} of "
+                "each: make several maps"
+            )
 
         def append(name: str, *more: Tensor) -> None:
             setattr(self, name, torch.cat([getattr(self, name), *(one.to(device) for one in more)]))
@@ -235,17 +236,13 @@ class SpectralMap(PlaceMap):
 
     def of_chunks(self, chunks: Iterable[Chunk]) -> SpectralMap:
         """A map of other chunks with the mean and settings of this one, on its device."""
-        made = SpectralMap(self.means, **self.settings()).train(self.training)
+        made = SpectralMap(self.means, **self.settings())
         made.extend(chunks)
         return made
 
     @classmethod
     def merged(cls, parts: Sequence[SpectralMap], names: Sequence[str]) -> SpectralMap:
-        """The map of several routes: the places of all, each route with its own mean and steps.
-
-        Args:
-            parts: of one dimension, metric and transform. names: of the routes, each another one.
-        """
+        """The map of several routes of one dimension and metric, each with its own mean and steps."""
         made = cls(torch.cat([part.means for part in parts]), **parts[0].settings())
         sizes = ((part.places, part.table.frames) for part in parts)
         made.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))
@@ -287,9 +284,7 @@ class SpectralMap(PlaceMap):
     @property
     def step(self) -> float:
         """Of the last chunk, and of those to come."""
-        if not len(self.steps) and self._step is None:
-            raise InputError("there is no map yet; expected one with a step")
-        return float(self.steps[-1]) if len(self.steps) else float(self._step or 0)
+        return float(self.steps[-1]) if len(self.steps) else self._step
 
     def lines(self, chunk: int) -> Lines:
         """The coefficients of a chunk, by line and feature."""
@@ -310,15 +305,15 @@ class SpectralMap(PlaceMap):
             yield self.products(some, range(chunk, chunk + 1))
 
     def inverse_norms(self, start: int = 0, stop: int | None = None) -> Tensor:
-        """1 / norm of the places [start, stop), 0 of those that have next to none."""
+        """1 / norm of the places [start, stop), 0 for a norm of 0."""
         norms = self.norms[start:stop]
         return torch.where(norms > 0, 1 / norms, 0)
 
     def products(self, queries: Tensor, chunks: range) -> Tensor:
-        """Inner products with all descriptors of equally long chunks, decoding none: (Q,K) -> (Q,W G).
+        """Inner products with all descriptors of equally long chunks: (Q,K) -> (Q,W G).
 
-        The inverse transform is linear, so the product with every descriptor is the inverse transform of the
-        product with every line: O(lines + W log W) for a query instead of O(W K).
+        The inverse transform is linear, so they are the inverse transform of the products with the lines:
+        O(lines + W log W) for a query instead of O(W K).
         """
         first, last = self.chunks[chunks.start][0], self.chunks[chunks.stop - 1][1]
         count, length = len(chunks), (last - first) // len(chunks)
@@ -450,10 +445,7 @@ class SpectralMap(PlaceMap):
 
     def summary(self) -> MapSummary:
         """See `MapSummary`; the parts are those of the route."""
-        chunks = [
-            ChunkSummary(start, stop, self._periods(g), (), Fraction(0), ())
-            for g, (start, stop) in enumerate(self.chunks)
-        ]
+        chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
         route = {own: packed[name].nbytes for name, own in names.items() if name in packed}
@@ -487,7 +479,7 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
 
     Shape: (Q,K) -> (Q,S).
 
-    Convention: on a CPU with MKL by a CSR product, made for the call, since it neither compiles nor exports;
+    Convention: by a CSR product on a CPU with MKL, made for the call, since it neither compiles nor exports;
         elsewhere, and of tensors that are traced, by `scatter_add`. No autocast.
     """
     plain = type(queries) is Tensor and queries.device.type == "cpu"
@@ -535,16 +527,3 @@ def _nonzero(levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _type_for(number: int) -> torch.dtype:
     return torch.uint8 if number < 2**8 else torch.int16 if number < 2**15 else torch.int32
-
-
-def check_sizes(places: int = 0, coefficients: int = 0) -> None:
-    """Refuse more than int32 holds.
-
-    Raises:
-        InputError: naming the numbers.
-    """
-    if max(places, coefficients) > LARGEST:
-        raise InputError(
-            f"the map has {places} places and {coefficients} coefficients; expected at most {LARGEST} of "
-            "each: make several maps"
-        )

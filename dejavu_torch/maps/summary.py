@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import combinations
 from typing import NamedTuple
 
-from dejavu_torch.periods.support import common_period, shared_factor
+from dejavu_torch.periods.support import common_period
 from dejavu_torch.types import Plan
 
 LAYERS_SHOWN = 6
@@ -19,19 +18,19 @@ LARGE = 10**9  # a common period beyond it is no figure that a person compares
 class ChunkSummary(NamedTuple):
     """One chunk [start, stop), and what repeats in it.
 
-    periods: of its layers; of a spectral map, of the ten strongest lines.
-    features: number of features of each layer; () in a spectral map.
-    common_period: the least common multiple of the periods, in places; the capacity.
-    shared_factors: greatest common divisor of each pair of periods, in the order of
-        itertools.combinations(periods, 2).
+    periods: of its layers, or of the ten strongest lines of a spectral map. features: number of features of
+    each layer; () in a spectral map.
     """
 
     start: int
     stop: int
     periods: tuple[Fraction, ...]
-    features: tuple[int, ...]
-    common_period: Fraction
-    shared_factors: tuple[Fraction, ...]
+    features: tuple[int, ...] = ()
+
+    @property
+    def common_period(self) -> Fraction:
+        """The least common multiple of the layers' periods, in places: the capacity; 0 without layers."""
+        return common_period(self.periods) if self.features else Fraction(0)
 
 
 @dataclass(frozen=True, repr=False)
@@ -39,8 +38,8 @@ class MapSummary:
     """Capacity and storage of a map; prints as a few lines for a person.
 
     Attributes:
-        kind: of the map. places: N. covered: places that at least one layer covers.
-        templates: sum of phases. template_numbers: sum of phases x features. lines: nonzero ones.
+        covered: places that at least one layer covers, or that have a descriptor. templates: sum of phases.
+        template_numbers: sum of phases x features. lines: of a spectral map.
         route: bytes of the map by part, such as the templates.
         fixed: other bytes by part, such as the backbone; of these only the names grow with the route.
     """
@@ -85,18 +84,15 @@ class MapSummary:
         lines = [_chunk_line(chunk) for chunk in self.chunks[:CHUNKS_SHOWN]]
         if len(self.chunks) > CHUNKS_SHOWN:
             lines.append(f"and {len(self.chunks) - CHUNKS_SHOWN} more chunks")
-        stored = f"{self.templates} templates, {self.template_numbers} numbers"
+        content = f"{self.templates} templates, {self.template_numbers} numbers"
         if self.kind != "templates":
-            stored = f"{self.lines} lines of their spectra"
-        lines.append(f"{self.covered} of {self.places} places covered; {stored}")
-        stored = (
-            f"{self.map_bytes} bytes, {self.bytes_per_place:.1f} per place: {self.route_bytes} of the route, "
-        )
-        stored += f"{self.route_bytes / self.places:.2f} per place ({_parts(self.route)})"
+            content = f"{self.lines} lines of their spectra"
+        size = f"{self.map_bytes} bytes, {self.bytes_per_place:.1f} per place: {self.route_bytes} of the "
+        size += f"route, {self.route_bytes / self.places:.2f} per place ({_parts(self.route)})"
         if self.fixed:
             names = ", with the names of its frames" * ("names" in self.fixed)
-            stored += f", and {self.fixed_bytes} fixed{names} ({_parts(self.fixed)})"
-        return "\n".join([*lines, stored])
+            size += f", and {self.fixed_bytes} fixed{names} ({_parts(self.fixed)})"
+        return "\n".join([*lines, f"{self.covered} of {self.places} places covered; {content}", size])
 
 
 def summarise(plan: Plan, places: int, route: Mapping[str, int]) -> MapSummary:
@@ -114,10 +110,8 @@ def summarise(plan: Plan, places: int, route: Mapping[str, int]) -> MapSummary:
     covered = end = 0
     for start, stop in sorted({(layer.start, layer.stop) for layer in plan}):
         members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
-        periods = tuple(layer.period for layer in members)
-        features = tuple(len(layer.features) for layer in members)
-        shared = tuple(shared_factor(a, b) for a, b in combinations(periods, 2))
-        chunks.append(ChunkSummary(start, stop, periods, features, common_period(periods), shared))
+        periods, features = zip(*((layer.period, len(layer.features)) for layer in members), strict=True)
+        chunks.append(ChunkSummary(start, stop, periods, features))
         covered, end = covered + max(0, stop - max(start, end)), max(stop, end)
     templates = sum(layer.phases for layer in plan)
     numbers = sum(layer.phases * len(layer.features) for layer in plan)
@@ -132,14 +126,13 @@ def _chunk_line(chunk: ChunkSummary) -> str:
     if not chunk.features:
         periods = ", ".join(_number(period) for period in chunk.periods) or "none"
         return f"places {chunk.start}-{chunk.stop - 1}: strongest periods {periods}"
-    largest = sorted(range(len(chunk.periods)), key=lambda j: -chunk.features[j])[:LAYERS_SHOWN]
+    count = len(chunk.periods)
+    largest = sorted(range(count), key=lambda j: -chunk.features[j])[:LAYERS_SHOWN]
     shown = ", ".join(f"{_number(chunk.periods[j])} ({chunk.features[j]} features)" for j in sorted(largest))
-    more = len(chunk.periods) - len(largest)
-    layers = f"{len(chunk.periods)} layer{'s' * (len(chunk.periods) > 1)}"
-    line = f"places {chunk.start}-{chunk.stop - 1}: {layers}, periods {shown}"
-    if more:
+    line = f"places {chunk.start}-{chunk.stop - 1}: {count} layer{'s' * (count > 1)}, periods {shown}"
+    if more := count - len(largest):
         line += f" and {more} smaller layer{'s' * (more > 1)}"
-    if len(chunk.periods) > 1 and chunk.common_period < LARGE:
+    if count > 1 and chunk.common_period < LARGE:
         line += f"; together {_number(chunk.common_period)} places"
     return line
 

@@ -36,14 +36,8 @@ def test_chunks_of_a_plan_made_by_hand() -> None:
     first, second, third = summarise(PLAN, places=2500, route={}).chunks
     assert (first.start, first.stop, first.periods, first.features) == (0, 1024, (93, 171), (3, 2))
     assert first.common_period == 5301  # not the product, 15903
-    assert first.shared_factors == (3,)
-    assert (second.periods, second.common_period, second.shared_factors) == (
-        (Fraction(195, 2),),
-        Fraction(195, 2),
-        (),
-    )
+    assert (second.periods, second.common_period) == ((Fraction(195, 2),), Fraction(195, 2))
     assert (third.start, third.stop, third.common_period) == (1900, 2100, 60)
-    assert third.shared_factors == (2, 1, 3)  # 4 and 6, 4 and 15, 6 and 15
 
 
 def test_the_order_of_the_layers_does_not_matter_to_the_totals() -> None:

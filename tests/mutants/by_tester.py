@@ -95,8 +95,8 @@ MUTANTS = [
     Mutant(
         "A map that holds under a tenth of its route tells what would hold half of it, and no other does.",
         "dejavu_torch/maps/spectral.py",
-        "if held < LITTLE:",
-        "if held > LITTLE:",
+        "if 1 - lines.error(step) / lines.energy < LITTLE:",
+        "if 1 - lines.error(step) / lines.energy > LITTLE:",
         ("tests/maps/test_spectral.py::test_noise_tells_what_half_of_its_variance_needs",),
     ),
     Mutant(
