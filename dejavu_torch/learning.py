@@ -32,7 +32,7 @@ from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.memory import IN_MEMORY, concatenate
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.recognition.calibration import Calibration, Trial, calibrated
+from dejavu_torch.recognition.calibration import Calibration, calibrated
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -660,7 +660,7 @@ def calibration_of(
         raise InputError(f"{seen}; expected as many")
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     try:
-        return calibrated(route, (Trial(*part) for part in parts), another)
+        return calibrated(route, parts, another)
     except InputError as error:
         raise InputError(f"calibrating by {name}: {error}") from error
 

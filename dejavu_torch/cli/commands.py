@@ -35,7 +35,7 @@ from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
-from dejavu_torch.recognition.calibration import NEVER
+from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search
 from dejavu_torch.recognition.select import check_candidates
@@ -774,7 +774,9 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.weight_bits < 32:
         print(f"weights of {model.weight_bits} bits, a scale for each output channel")
     print(f"map format {FORMAT}, its checksums agree")
-    known = [name for name, platt in (model.calibration or NEVER)._asdict().items() if platt is not None]
+    known = [
+        name for name, platt in (model.calibration or Calibration())._asdict().items() if platt is not None
+    ]
     print(f"calibrated for: {', '.join(known) or 'nothing'}; precision: {model.precision}")
     print(f"single queries: {model.acceptance()}")
     print(f"L1 here by {l1_backend()}, spectrogram by {BACKEND}")

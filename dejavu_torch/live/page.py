@@ -36,7 +36,7 @@ PAGE = Path(__file__).with_name("page.html")
 class Snapshot(NamedTuple):
     """What the page shows of one frame: `scores` (N,), or a `posterior` (N+1,); p50, p99 in milliseconds."""
 
-    shot: Frame
+    frame: Frame
     match: LiveMatch
     scores: Tensor
     posterior: bool
@@ -119,11 +119,11 @@ class Page:
         """What the page asks for again and again; little of a frame whose number it has `seen`."""
         if self.snapshot is None:
             return {"title": self.title, "number": -1}
-        shot, match, scores, posterior, *counts = self.snapshot
-        facts: dict[str, Any] = {"title": self.title, "number": shot.number}
-        if seen == str(shot.number):
+        frame, match, scores, posterior, *counts = self.snapshot
+        facts: dict[str, Any] = {"title": self.title, "number": frame.number}
+        if seen == str(frame.number):
             return facts
-        facts |= match._asdict() | {"time": shot.seconds}
+        facts |= match._asdict() | {"time": frame.seconds}
         facts |= zip(("frames", "dropped", "p50", "p99"), counts, strict=True)
         facts = {name: _number(value) for name, value in facts.items()}
         return facts | {
@@ -131,7 +131,7 @@ class Page:
             "off": round(float(scores[-1]), 6) if posterior else None,
             "kind": "Posterior over the route" if posterior else "Match over the route, the best place 1",
             "curve": curve(scores, posterior),
-            "query": as_picture(shot.pixels),
+            "query": as_picture(frame.pixels),
             "reference": self.reference(match.frame) if self.reference and match.frame >= 0 else None,
         }
 

@@ -41,24 +41,14 @@ class Platt(NamedTuple):
 class Calibration(NamedTuple):
     """What makes probabilities of confidences, None if nothing does."""
 
-    single: Platt | None  # of queries by themselves
-    filter: Platt | None  # of a `PlaceFilter` that searches for every query
+    single: Platt | None = None  # of queries by themselves
+    filter: Platt | None = None  # of a `PlaceFilter` that searches for every query
 
     def of(self, sequence: SequenceModel | None) -> Platt | None:
         """The one for a way of matching."""
         if sequence is None:
             return self.single
         return self.filter if isinstance(sequence, PlaceFilter) and sequence.search_every == 1 else None
-
-
-NEVER = Calibration(None, None)
-
-
-class Trial(NamedTuple):
-    """Consecutive queries whose places are known: descriptors (T,K) and places (T,) int64, -1 for none."""
-
-    descriptors: Tensor
-    places: Tensor
 
 
 def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:
@@ -152,16 +142,19 @@ def _around(index: Tensor, radius: int, scores: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def calibrated(route: PlaceMap, trials: Iterable[Trial], another_visit: bool = False) -> Calibration:
+def calibrated(
+    route: PlaceMap, segments: Iterable[tuple[Tensor, Tensor]], another_visit: bool = False
+) -> Calibration:
     """Fit on queries whose places are known, and on the same without the scores near these places: answers
     off the map, of which none is right.
 
     Args:
+        segments: consecutive queries: descriptors (T,K) and places (T,) int64, -1 for unknown.
         another_visit: the queries are of another visit, whose own wrong answers show how often to expect one.
             Those off the map then count, together, for as many as lack to `MISSED`.
     """
     answers: tuple[list[Tensor], list[Tensor]] = [], []  # of single queries, and of a filter
-    for descriptors, places in trials:
+    for descriptors, places in segments:
         scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
         away = scores.scatter(1, _around(places, 2 * TOLERANCE, scores), math.inf)

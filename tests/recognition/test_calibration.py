@@ -20,11 +20,9 @@ from dejavu_torch.evaluation.rejection import calibration_error
 from dejavu_torch.features.views import Views, augmented_segments
 from dejavu_torch.model import HIGHEST
 from dejavu_torch.recognition.calibration import (
-    NEVER,
     Calibration,
     Platt,
     Track,
-    Trial,
     calibrated,
     confidence_of,
     fit,
@@ -146,20 +144,20 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
     places = torch.arange(40)
     scores = 1 + 0.1 * torch.randn(40, 40, generator=draw)
     scores[places, places] = 0.3
-    own = calibrated(Table(), [Trial(scores[:20], places[:20]), Trial(scores[20:], places[20:])])
+    own = calibrated(Table(), [(scores[:20], places[:20]), (scores[20:], places[20:])])
     assert own.single is not None
     there = own.single.probability(confidence_of(scores))
     away = own.single.probability(confidence_of(1 + 0.1 * torch.randn(40, 40, generator=draw)))
     assert (float(there.mean()) > 0.9, float(away.mean()) < 0.1) == (True, True)
     known = places.where(places % 2 == 0, -1)  # what is not known does not count
-    half = calibrated(Table(), [Trial(scores, known)])
-    assert half.single == calibrated(Table(), [Trial(scores[::2], places[::2])]).single
-    visit = calibrated(Table(), [Trial(scores, places)], another_visit=True)
+    half = calibrated(Table(), [(scores, known)])
+    assert half.single == calibrated(Table(), [(scores[::2], places[::2])]).single
+    visit = calibrated(Table(), [(scores, places)], another_visit=True)
     assert float(visit.single.probability(confidence_of(scores)).mean()) > float(
         there.mean()
     )  # none was wrong
     with refused("none of 80 answers"):
-        calibrated(Table(), [Trial(scores, (places + 20) % 40)])
+        calibrated(Table(), [(scores, (places + 20) % 40)])
     with refused("no queries"):
         calibrated(Table(), [])
 
@@ -200,9 +198,9 @@ def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.Mon
     monkeypatch.setattr("dejavu_torch.learning.LONGEST_SEGMENT", 20)
     monkeypatch.setattr("dejavu_torch.learning.CALIBRATION_SCORES", 400 * 2000)
 
-    def noted(route: object, trials: Iterable[Trial], another: bool) -> Calibration:
-        seen.extend(trial.places for trial in trials)
-        return NEVER
+    def noted(route: object, trials: Iterable[tuple[Tensor, Tensor]], another: bool) -> Calibration:
+        seen.extend(places for _, places in trials)
+        return Calibration()
 
     monkeypatch.setattr("dejavu_torch.learning.calibrated", noted)
     model.calibrate(None, views)
@@ -298,7 +296,7 @@ def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_o
         assert (other.acceptance(), other.acceptance(PlaceFilter())) == (single, filtered)
         if sequence is not None:
             assert other.acceptance(SequenceMatcher(5)) == sequence
-    other.calibration = NEVER
+    other.calibration = Calibration()
     assert other.localize(queries).accepted.all()  # the last one, whatever the score
     assert other.acceptance(PlaceFilter()) == (math.log(2), None, False)
 
