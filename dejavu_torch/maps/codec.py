@@ -29,7 +29,6 @@ log = logging.getLogger("dejavu_torch")
 
 Ints = NDArray[np.integer[Any]]
 
-WRITE, READ, COUNT = range(3)  # what is done with each bit; COUNT only counts it in its context
 LEVELS_PER_BYTE, LEVELS_AT_LEAST = 2**13, 2**22  # most levels of a stream
 LEVEL, COLUMN = 4, 2**13  # bytes to decode a level, and a column
 MOST = 15  # larger magnitudes count as this one in the sums of a context
@@ -40,6 +39,7 @@ END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 32 * 32  # the first context of each kind
 CONTEXTS = LENGTH + 32 * NEAR
 FIRST = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
 BLOCK, ROOM = 2**13, 320  # levels that are coded at a time, and an upper bound of the bytes of each
+COUNTED = 2**16  # levels that are counted at a time
 SPAN, BYTE = 56, 48  # bits of the interval at first, and at least
 LEAST = 1 << BYTE
 WORTH_COMPILING = 2**19  # levels that Python codes in the time that numba loads
@@ -58,7 +58,7 @@ def encode(levels: Tensor) -> Stream:
     Shape: (W,K) int8 or int32 -> (n,) uint8.
     """
     whole = _numbers(levels)
-    coder = _Coder(WRITE, whole.shape)
+    coder = _Coder(whole.shape)
     filled = coder.write(whole)
     packed, size = coder.packed, int(coder.state[2])
     packed[size:] = bytes(1)
@@ -77,9 +77,20 @@ def coded_bytes(levels: Tensor) -> int:
         1
     """
     whole = _numbers(levels)
-    coder = _Coder(COUNT, whole.shape)
-    coder.write(whole)
-    after = torch.tensor(coder.counts).view(-1, 2).double() / 2
+    filled, width = _filled(whole), whole.shape[1]
+    counts, rows = np.zeros((CONTEXTS, 2)), max(2, COUNTED // width)
+    counts[END] = filled, filled < len(whole)
+    sums, signs = np.zeros((rows + RING, width + 1), np.int32), np.zeros((2, width), np.int64)
+    for start in range(0, filled, rows):
+        block = whole[start : min(start + rows, filled)].astype(np.int64)
+        here = np.arange(start, start + len(block))
+        ahead, totals = (here + 1) % len(sums), np.minimum(np.abs(block), MOST).cumsum(0)
+        sums[ahead, :-1] = sums[start % len(sums), :-1] + totals
+        sums[ahead, -1] = sums[ahead, :-1].sum(1)
+        near = _near(sums, here, _logarithms())
+        signs = np.concatenate([signs[-2:], np.sign(block)])
+        _count(counts, np.abs(block), signs[2:], signs[:-2], near)
+    after = torch.from_numpy(counts) + torch.tensor(FIRST, dtype=torch.float64) / 2
     start = torch.tensor(FIRST, dtype=torch.float64) / 2
     # the probability of all bits of a context, in any order, is a quotient of gamma functions
     nats = after.sum(1).lgamma() - after.lgamma().sum(1) + start.lgamma().sum() - start.sum().lgamma()
@@ -97,7 +108,7 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
             f"the map claims {rows} x {columns} levels; expected at least one, and what fits into the memory"
         )
     packed = stream.bytes.numpy().tobytes()
-    coder = _Coder(READ, (rows, columns), bytearray(packed + bytes(SPAN // 8 - 1)))
+    coder = _Coder((rows, columns), bytearray(packed + bytes(SPAN // 8 - 1)))
     levels = coder.read(rows, len(packed))
     left, checksum = len(coder.packed) - int(coder.state[2]), _checksum(levels)
     if left or checksum != stream.checksum:
@@ -131,32 +142,57 @@ def _checksum(levels: Ints) -> int:
     return zlib.crc32(levels.data, zlib.crc32(repr(levels.shape).encode()))
 
 
+def _filled(levels: Ints) -> int:
+    """The number of rows up to the last that is not 0."""
+    return 1 + int(np.flatnonzero(levels.any(1)).max(initial=-1))
+
+
+def _count(counts: Any, size: Ints, sign: Ints, before: Ints, near: Ints) -> None:
+    """Count the bits of levels (R,K) in their contexts, as `_code` codes them.
+
+    Args:
+        counts: (CONTEXTS,2), added to. size, sign: of each level. before: the sign two rows before.
+    """
+    length = np.frexp(size)[1].astype(np.int64)
+    ends = np.bincount((length * NEAR + near).ravel(), minlength=32 * NEAR).reshape(32, NEAR)
+    more = ends[::-1].cumsum(0)[::-1] - ends
+    counts[LENGTH:] += np.stack([ends, more], 2).reshape(-1, 2)
+    counts[LENGTH + LENGTH_MAX * NEAR :, 0] = 0  # no bit follows the longest
+    for minus in (0, 1):
+        there = sign == 1 - 2 * minus
+        counts[SIGN : SIGN + 3, minus] += np.bincount(1 + before[there], minlength=3)
+    for bits in range(2, 1 + int(length.max())):
+        large = size[length == bits]
+        ones = (large[:, None] >> np.arange(bits - 1) & 1).sum(0)
+        first = BITS + 32 * bits
+        counts[first : first + bits - 1] += np.stack([len(large) - ones, ones], 1)
+
+
 class _Coder:
     """Codes rows block by block, and keeps what one block leaves for the next.
 
-    packed: what is read or written. state: the lower end of the interval, when reading the value less that,
+    packed: what is read, or written. state: the lower end of the interval, when reading the value less that,
     its width, and the position in `packed`. counts: (2 CONTEXTS,), of 0s and 1s.
     """
 
-    def __init__(self, mode: int, shape: tuple[int, ...], packed: bytearray | None = None) -> None:
-        self.mode, self.kernel = mode, _kernel(math.prod(shape))
+    def __init__(self, shape: tuple[int, ...], packed: bytearray | None = None) -> None:
+        self.reads, self.kernel = packed is not None, _kernel(math.prod(shape))
         self.packed = bytearray() if packed is None else packed
-        begin = SPAN // 8 if mode == READ else 0
+        begin = SPAN // 8 if self.reads else 0
         self.state: Any = np.array([int.from_bytes(self.packed[:begin], "big"), 1 << SPAN, begin])
         self.counts: Any = np.tile(FIRST, CONTEXTS)
         if self.kernel is _code:  # lists, whose elements Python reads faster
             self.state, self.counts = self.state.tolist(), self.counts.tolist()
-        self.sums = np.zeros((RING, 2 + shape[1]), np.int32)
+        self.sums = np.zeros((RING, shape[1] + 1), np.int32)
         self.before = np.zeros((2, shape[1]), np.int32)
         self.rows = max(1, BLOCK // shape[1])
 
     def write(self, levels: Ints) -> int:
-        """Write the levels, or count their bits; the number of rows up to the last that is not 0."""
-        filled = 1 + int(np.flatnonzero(levels.any(1)).max(initial=-1))
+        """Write the levels; the number of rows up to the last that is not 0."""
+        filled = _filled(levels)
         for start in range(0, min(filled + 1, len(levels)), self.rows):
             block = levels[start : start + self.rows]
-            if self.mode == WRITE:
-                self.packed.extend(bytes(max(0, int(self.state[2]) + ROOM * block.size - len(self.packed))))
+            self.packed.extend(bytes(max(0, int(self.state[2]) + ROOM * block.size - len(self.packed))))
             self._code(block, start, filled)
         return filled
 
@@ -175,7 +211,7 @@ class _Coder:
     def _code(self, levels: Ints, start: int, filled: int) -> tuple[Ints, int]:
         block = np.concatenate([self.before, levels], dtype=np.int32)
         packed = self.packed if self.kernel is _code else np.frombuffer(self.packed, np.uint8)
-        coding = self.mode, self.state, self.counts, packed, self.sums, _logarithms()
+        coding = self.reads, self.state, self.counts, packed, self.sums, _logarithms()
         row = self.kernel(block, start, filled, coding)
         self.before = block[-2:]
         return block[2:], row
@@ -193,37 +229,36 @@ def _code(block: Any, start: int, filled: int, coding: Any) -> int:
     Returns:
         The row at which coding ended; all further ones are 0.
     """
-    mode, state, counts, packed, sums, logarithms = coding
+    reads, state, counts, packed, sums, logarithms = coding
     low, span, at = state[0], state[1], state[2]
     for r in range(2, len(block)):
         row = start + r - 2
-        bit, low, span, at = _bit(END, int(row >= filled), mode, low, span, at, counts, packed)
+        bit, low, span, at = _bit(END, int(row >= filled), reads, low, span, at, counts, packed)
         if bit:
             break
-        near = _near(sums, row, logarithms)
+        near = _near(sums, np.full(1, row), logarithms)[0]
         for f in range(block.shape[1]):
             level, around, before = int(block[r, f]), int(near[f]), int(block[r - 2, f])
-            if mode == COUNT and not level:  # as below, but faster
-                counts[2 * (LENGTH + around)] += 2
-                continue
             size, length, context = abs(level), 0, LENGTH + around
             while length < LENGTH_MAX:
                 more = int(size >> length > 0)
-                bit, low, span, at = _bit(context, more, mode, low, span, at, counts, packed)
+                bit, low, span, at = _bit(context, more, reads, low, span, at, counts, packed)
                 if not bit:
                     break
                 length, context = length + 1, context + NEAR
             if length:
                 context = SIGN + 1 + int(before > 0) - int(before < 0)
-                minus, low, span, at = _bit(context, int(level < 0), mode, low, span, at, counts, packed)
+                minus, low, span, at = _bit(context, int(level < 0), reads, low, span, at, counts, packed)
                 value, context = 1, BITS + 32 * length
                 for n in range(length - 2, -1, -1):
-                    bit, low, span, at = _bit(context + n, size >> n & 1, mode, low, span, at, counts, packed)
+                    bit, low, span, at = _bit(
+                        context + n, size >> n & 1, reads, low, span, at, counts, packed
+                    )
                     value = 2 * value + bit
                 block[r, f] = -value if minus else value
         now, after = sums[row % RING], sums[(row + 1) % RING]
-        after[1:-1] = now[1:-1] + np.minimum(np.abs(block[r]), MOST)
-        after[0], after[-1] = after[1], after[-2]
+        after[:-1] = now[:-1] + np.minimum(np.abs(block[r]), MOST)
+        after[-1] = after[:-1].sum()
     else:
         row = start + len(block) - 2
     state[0], state[1], state[2] = low, span, at
@@ -231,26 +266,22 @@ def _code(block: Any, start: int, filled: int, coding: Any) -> int:
 
 
 def _bit(
-    context: int, bit: int, mode: int, low: int, span: int, at: int, counts: Any, packed: Any
+    context: int, bit: int, reads: bool, low: int, span: int, at: int, counts: Any, packed: Any
 ) -> tuple[int, int, int, int]:
     """Code a bit in its context; the bit, and the interval and position after it."""
     zero, one = counts[2 * context], counts[2 * context + 1]
-    if mode != COUNT:
-        part = span // (zero + one) * zero
-        if mode == READ:
-            bit = int(low >= part)
-        if bit:
-            low += part if mode == WRITE else -part
-            span -= part
-        else:
-            span = part
-        while span < LEAST:
-            span <<= 8
-            if mode == WRITE:
-                low = _put(low, at, packed)
-            else:
-                low = low << 8 | (packed[at] if at < len(packed) else 0)
-            at += 1
+    part = span // (zero + one) * zero
+    if reads:
+        bit = int(low >= part)
+    if bit:
+        low += -part if reads else part
+        span -= part
+    else:
+        span = part
+    while span < LEAST:
+        span <<= 8
+        low = (low << 8 | (packed[at] if at < len(packed) else 0)) if reads else _put(low, at, packed)
+        at += 1
     counts[2 * context + bit] += 2
     return bit, low, span, at
 
@@ -268,21 +299,27 @@ def _put(low: int, at: int, packed: Any) -> int:
     return (low & LEAST - 1) << 8
 
 
-def _near(sums: Any, row: int, logarithms: Any) -> Any:
-    """The contexts of a row's levels by the magnitudes near each, 0 to `NEAR`.
+def _near(sums: Any, rows: Any, logarithms: Any) -> Any:
+    """The contexts of the levels of rows (R,) by the magnitudes near each: (R,K), 0 to `NEAR`.
 
     Args:
-        sums: (RING,1+K+1), of magnitudes over all rows before a row; the first and the last column twice.
+        sums: (over R,K+1), at the number of a row modulo the length the magnitudes over all rows before it,
+            of each column and of all.
     """
-    now, columns = sums[row % RING], sums.shape[1] - 2
-    far, close = min(max(row // 2, 16), REACH, row), min(max(row // 16, 2), 8, row)
-    recent = now[1:-1].sum() - sums[(row - close) % RING][1:-1].sum()
-    mean = (recent << 10) // (max(close, 1) * columns)
+    now, columns = sums[rows % len(sums)], sums.shape[1] - 1
+    far = np.minimum(np.minimum(np.maximum(rows // 2, 16), REACH), rows)
+    close = np.minimum(np.minimum(np.maximum(rows // 16, 2), 8), rows)
+    recent = now[:, -1] - sums[(rows - close) % len(sums)][:, -1]
+    mean = (recent << 10) // (np.maximum(close, 1) * columns)
     # the mean magnitude over the last rows, in 256ths, with more weight on the last two
-    column = ((now - sums[(row - far) % RING]) << 8) // max(far, 1)
-    column = column + ((now - sums[(row - min(row, 2)) % RING]) << 4)
-    wide = column[:-2] + 2 * column[1:-1] + column[2:]
-    return (2 * logarithms[(wide >> 2) + 3] + logarithms[mean + 4]) // 9
+    column = ((now - sums[(rows - far) % len(sums)]) << 8) // np.maximum(far, 1).reshape(-1, 1)
+    column = column + ((now - sums[(rows - np.minimum(rows, 2)) % len(sums)]) << 4)
+    wide = 2 * column[:, :-1]
+    wide[:, 1:] += column[:, :-2]
+    wide[:, :-1] += column[:, 1:-1]
+    wide[:, 0] += column[:, 0]
+    wide[:, -1] += column[:, -2]
+    return (2 * np.take(logarithms, (wide >> 2) + 3) + logarithms[mean + 4].reshape(-1, 1)) // 9
 
 
 @cache
@@ -305,7 +342,7 @@ def _kernel(levels: int) -> Callable[..., int]:
 def _compiled() -> Callable[..., int] | None:
     """`_code` compiled, or None if numba is missing or broken."""
     block, numbers = "int32[:,::1]", "int64[::1]"
-    coding = f"Tuple((int64, {numbers}, {numbers}, uint8[::1], {block}, {numbers}))"
+    coding = f"Tuple((boolean, {numbers}, {numbers}, uint8[::1], {block}, {numbers}))"
     try:
         from numba.extending import register_jitable
 

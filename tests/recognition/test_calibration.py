@@ -330,7 +330,7 @@ def test_a_map_without_calibration_tells_no_probability() -> None:
         model.calibrate(None)
     with refused("60 frames and 64 places"):
         model.calibrate(None, Views(open_source_of(features[:60]), torch.arange(64)))
-    with refused("shows place 64", "one of the map's 64"):
+    with refused("shows place 64", "one of 64"):
         model.calibrate(None, Views(open_source_of(features), torch.arange(64) + 1))
     with refused("calibrating by", "none of"):
         model.calibrate(None, Views(open_source_of(features.flip(0)[:20]), torch.arange(20)))
