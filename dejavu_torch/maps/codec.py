@@ -39,7 +39,8 @@ NEAR = 34  # contexts by the magnitudes near a level
 END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 32 * 32  # the first context of each kind of bit
 CONTEXTS = LENGTH + 32 * NEAR
 FIRST = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
-BLOCK, ROOM = 2**13, 320  # levels that are coded at a time, and an upper bound of the bytes of each
+BLOCK = 2**13  # levels that are coded at a time
+BIT = 5  # bytes of a bit at most
 SPAN, BYTE = 56, 48  # bits of the interval at first, and at least
 LEAST = 1 << BYTE
 WORTH_COMPILING = 2**19  # levels that Python codes in the time that numba loads
@@ -58,12 +59,11 @@ def encode(levels: Tensor) -> Stream:
     Shape: (W,K) int8 or int32 -> (n,) uint8.
     """
     whole = _numbers(levels)
-    coder = _Coder(WRITE, whole.shape)
-    filled = coder.write(whole)
-    packed, size = coder.packed, int(coder.state[2])
+    packed = bytearray()
+    _, row, (low, _, size), _ = _run(WRITE, whole, packed)
     packed[size:] = bytes(1)
-    _put(int(coder.state[0]) + LEAST - 1, size, packed)  # in the interval, its further bytes 0
-    _check_size(filled, whole.shape[1], len(packed))
+    _put(int(low) + LEAST - 1, size, packed)  # in the interval, its further bytes 0
+    _check_size(row, whole.shape[1], len(packed))
     return Stream(torch.frombuffer(packed, dtype=torch.uint8), _checksum(whole))
 
 
@@ -76,10 +76,8 @@ def coded_bytes(levels: Tensor) -> int:
         >>> coded_bytes(torch.zeros(500, 20, dtype=torch.int8))
         1
     """
-    whole = _numbers(levels)
-    coder = _Coder(COUNT, whole.shape)
-    coder.write(whole)
-    after = torch.tensor(coder.counts).view(-1, 2).double() / 2
+    *_, counts = _run(COUNT, _numbers(levels), bytearray())
+    after = torch.tensor(counts, dtype=torch.float64).view(-1, 2) / 2
     start = torch.tensor(FIRST, dtype=torch.float64) / 2
     # the probability of all bits of a context, in any order, is a quotient of gamma functions
     nats = after.sum(1).lgamma() - after.lgamma().sum(1) + start.lgamma().sum() - start.sum().lgamma()
@@ -97,9 +95,9 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
             f"the map claims {rows} x {columns} levels; expected at least one, and what fits into the memory"
         )
     packed = stream.bytes.numpy().tobytes()
-    coder = _Coder(READ, (rows, columns), bytearray(packed + bytes(SPAN // 8 - 1)))
-    levels = coder.read(rows, len(packed))
-    left, checksum = len(coder.packed) - int(coder.state[2]), _checksum(levels)
+    padded = bytearray(packed + bytes(SPAN // 8 - 1))
+    levels, _, state, _ = _run(READ, np.zeros((rows, columns), np.int8), padded)
+    left, checksum = len(padded) - int(state[2]), _checksum(levels)
     if left or checksum != stream.checksum:
         raise InputError(
             f"the coded lines are truncated or altered: {len(packed)} bytes, {left} of them left over, give "
@@ -131,69 +129,57 @@ def _checksum(levels: Ints) -> int:
     return zlib.crc32(levels.data, zlib.crc32(repr(levels.shape).encode()))
 
 
-class _Coder:
-    """Codes rows block by block, and keeps what one block leaves for the next.
+def _run(mode: int, levels: Ints, packed: bytearray) -> tuple[Ints, int, Any, Any]:
+    """Write levels to bytes, read as many from them, or only count bits, a block of rows at a time.
 
-    packed: what is read or written. state: the lower end of the interval, when reading the value less that,
-    its width, and the position in `packed`. counts: (2 CONTEXTS,), of 0s and 1s.
+    Returns:
+        The levels, the row at which coding ended, the state of `_code` and the counts of 0s and 1s.
     """
-
-    def __init__(self, mode: int, shape: tuple[int, ...], packed: bytearray | None = None) -> None:
-        self.mode, self.kernel = mode, _kernel(math.prod(shape))
-        self.packed = bytearray() if packed is None else packed
-        begin = SPAN // 8 if mode == READ else 0
-        self.state: Any = np.array([int.from_bytes(self.packed[:begin], "big"), 1 << SPAN, begin])
-        self.counts: Any = np.tile(FIRST, CONTEXTS)
-        if self.kernel is _code:  # lists, whose elements Python reads faster
-            self.state, self.counts = self.state.tolist(), self.counts.tolist()
-        self.sums = np.zeros((RING, 2 + shape[1]), np.int32)
-        self.before = np.zeros((2, shape[1]), np.int32)
-        self.rows = max(1, BLOCK // shape[1])
-
-    def write(self, levels: Ints) -> int:
-        """Write the levels, or count their bits; the number of rows up to the last that is not 0."""
-        filled = 1 + int(np.flatnonzero(levels.any(1)).max(initial=-1))
-        for start in range(0, min(filled + 1, len(levels)), self.rows):
-            block = levels[start : start + self.rows]
-            if self.mode == WRITE:
-                self.packed.extend(bytes(max(0, int(self.state[2]) + ROOM * block.size - len(self.packed))))
-            self._code(block, start, filled)
-        return filled
-
-    def read(self, rows: int, size: int) -> Ints:
-        """Read so many rows of a stream of `size` bytes."""
-        levels: Ints = np.zeros((rows, self.before.shape[1]), np.int8)
-        for start in range(0, rows, self.rows):
-            _check_size(start, levels.shape[1], size)
-            block, row = self._code(levels[start : start + self.rows], start, 0)
+    rows, columns = levels.shape
+    kernel, begin = _kernel(levels.size), SPAN // 8 if mode == READ else 0
+    state: Any = np.array([int.from_bytes(packed[:begin], "big"), 1 << SPAN, begin])
+    counts: Any = np.tile(FIRST, CONTEXTS)
+    if kernel is _code:  # lists, whose elements Python reads faster
+        state, counts = state.tolist(), counts.tolist()
+    sums, before = np.zeros((RING, 1 + columns + 1), np.int32), np.zeros((2, columns), np.int32)
+    filled = 1 + int(np.flatnonzero(levels.any(1)).max(initial=-1))
+    row, step = 0, max(1, BLOCK // columns)
+    for start in range(0, rows, step):
+        some = levels[start : start + step]
+        if mode == READ:
+            _check_size(start, columns, len(packed))
+        elif mode == WRITE:
+            bits = 2 * max(int(some.max()), -int(some.min())).bit_length() + 2  # of a level, and a row
+            packed.extend(bytes(max(0, int(state[2]) + BIT * bits * some.size - len(packed))))
+        block = np.concatenate([before, some], dtype=np.int32)
+        coding = mode, state, counts, sums, _logarithms()
+        row = kernel(
+            block, start, filled, packed if kernel is _code else np.frombuffer(packed, np.uint8), coding
+        )
+        before = block[-2:]
+        if mode == READ:
             levels = levels if _fits(block) else levels.astype(np.int32)
-            levels[start : start + self.rows] = block
-            if row < start + len(block) or self.state[2] > len(self.packed):
-                break
-        return levels
-
-    def _code(self, levels: Ints, start: int, filled: int) -> tuple[Ints, int]:
-        block = np.concatenate([self.before, levels], dtype=np.int32)
-        packed = self.packed if self.kernel is _code else np.frombuffer(self.packed, np.uint8)
-        coding = self.mode, self.state, self.counts, packed, self.sums, _logarithms()
-        row = self.kernel(block, start, filled, coding)
-        self.before = block[-2:]
-        return block[2:], row
+            levels[start : start + step] = block[2:]
+        if row < start + len(some) or state[2] > len(packed):
+            break
+    return levels, row, state, counts
 
 
 # The functions from here to `_near` run as they are, on lists, and compiled by numba, on arrays.
 
 
-def _code(block: Any, start: int, filled: int, coding: Any) -> int:
+def _code(block: Any, start: int, filled: int, packed: Any, coding: Any) -> int:
     """Code the rows of a block from row `start` on, in which the two before them come first.
 
     Args:
-        filled: rows up to the last that is not 0, if they are known. coding: see `_Coder` and `_near`.
+        filled: rows up to the last that is not 0, if they are known.
+        coding: mode; state: the lower end of the interval, or the value read less that, its width, and the
+            position in `packed`; counts of 0s and 1s in each context; sums and logarithms, see `_near`.
 
     Returns:
         The row at which coding ended; all further ones are 0.
     """
-    mode, state, counts, packed, sums, logarithms = coding
+    mode, state, counts, sums, logarithms = coding
     low, span, at = state[0], state[1], state[2]
     for r in range(2, len(block)):
         row = start + r - 2
@@ -305,13 +291,13 @@ def _kernel(levels: int) -> Callable[..., int]:
 def _compiled() -> Callable[..., int] | None:
     """`_code` compiled, or None if numba is missing or broken."""
     block, numbers = "int32[:,::1]", "int64[::1]"
-    coding = f"Tuple((int64, {numbers}, {numbers}, uint8[::1], {block}, {numbers}))"
+    coding = f"Tuple((int64, {numbers}, {numbers}, {block}, {numbers}))"
     try:
         from numba.extending import register_jitable
 
         for function in (_bit, _put, _near):
             register_jitable(function)
-        return compiled(_code, f"int64({block}, int64, int64, {coding})")
+        return compiled(_code, f"int64({block}, int64, int64, uint8[::1], {coding})")
     except Exception as error:  # a broken compiler must not break what works without one
         log.info("levels are coded in Python, not by numba: %s", " ".join(str(error).split()))
         return None
