@@ -38,8 +38,8 @@ NEAR = 34  # contexts by the magnitudes near a level
 END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 32 * 32  # the first context of each kind of bit
 CONTEXTS = LENGTH + 32 * NEAR
 FIRST = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
-BLOCK, ROOM = 2**13, 320  # levels that are coded at a time, and an upper bound of the bytes of each
-COUNTED = 2**16  # levels that are counted at a time
+BLOCK, COUNTED = 2**13, 2**16  # levels that are coded, and counted, at a time
+BIT = 5  # bytes of a bit at most
 SPAN, BYTE = 56, 48  # bits of the interval at first, and at least
 LEAST = 1 << BYTE
 WORTH_COMPILING = 2**19  # levels that Python codes in the time that numba loads
@@ -58,12 +58,11 @@ def encode(levels: Tensor) -> Stream:
     Shape: (W,K) int8 or int32 -> (n,) uint8.
     """
     whole = _numbers(levels)
-    coder = _Coder(whole.shape)
-    filled = coder.write(whole)
-    packed, size = coder.packed, int(coder.state[2])
+    packed = bytearray()
+    _, row, (low, _, size) = _run(whole, packed)
     packed[size:] = bytes(1)
-    _put(int(coder.state[0]) + LEAST - 1, size, packed)  # in the interval, its further bytes 0
-    _check_size(filled, whole.shape[1], len(packed))
+    _put(int(low) + LEAST - 1, size, packed)  # in the interval, its further bytes 0
+    _check_size(row, whole.shape[1], len(packed))
     return Stream(torch.frombuffer(packed, dtype=torch.uint8), _checksum(whole))
 
 
@@ -90,10 +89,10 @@ def coded_bytes(levels: Tensor) -> int:
         near = _near(sums, here, _logarithms())
         signs = np.concatenate([signs[-2:], np.sign(block)])
         _count(counts, np.abs(block), signs[2:], signs[:-2], near)
-    after = torch.from_numpy(counts) + torch.tensor(FIRST, dtype=torch.float64) / 2
-    start = torch.tensor(FIRST, dtype=torch.float64) / 2
+    prior = torch.tensor(FIRST, dtype=torch.float64) / 2
+    after = torch.from_numpy(counts) + prior
     # the probability of all bits of a context, in any order, is a quotient of gamma functions
-    nats = after.sum(1).lgamma() - after.lgamma().sum(1) + start.lgamma().sum() - start.sum().lgamma()
+    nats = after.sum(1).lgamma() - after.lgamma().sum(1) + prior.lgamma().sum() - prior.sum().lgamma()
     return int(float(nats.sum()) / math.log(256) + 1.01)
 
 
@@ -108,9 +107,9 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
             f"the map claims {rows} x {columns} levels; expected at least one, and what fits into the memory"
         )
     packed = stream.bytes.numpy().tobytes()
-    coder = _Coder((rows, columns), bytearray(packed + bytes(SPAN // 8 - 1)))
-    levels = coder.read(rows, len(packed))
-    left, checksum = len(coder.packed) - int(coder.state[2]), _checksum(levels)
+    padded = bytearray(packed + bytes(SPAN // 8 - 1))
+    levels, _, state = _run(np.zeros((rows, columns), np.int8), padded, reads=True)
+    left, checksum = len(padded) - int(state[2]), _checksum(levels)
     if left or checksum != stream.checksum:
         raise InputError(
             f"the coded lines are truncated or altered: {len(packed)} bytes, {left} of them left over, give "
@@ -168,68 +167,57 @@ def _count(counts: Any, size: Ints, sign: Ints, before: Ints, near: Ints) -> Non
         counts[first : first + bits - 1] += np.stack([len(large) - ones, ones], 1)
 
 
-class _Coder:
-    """Codes rows block by block, and keeps what one block leaves for the next.
+def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, int, Any]:
+    """Write levels to bytes, or read as many from them, a block of rows at a time.
 
-    packed: what is read, or written. state: the lower end of the interval, when reading the value less that,
-    its width, and the position in `packed`. counts: (2 CONTEXTS,), of 0s and 1s.
+    Returns:
+        The levels, the row at which coding ended, and the state of `_code`.
     """
-
-    def __init__(self, shape: tuple[int, ...], packed: bytearray | None = None) -> None:
-        self.reads, self.kernel = packed is not None, _kernel(math.prod(shape))
-        self.packed = bytearray() if packed is None else packed
-        begin = SPAN // 8 if self.reads else 0
-        self.state: Any = np.array([int.from_bytes(self.packed[:begin], "big"), 1 << SPAN, begin])
-        self.counts: Any = np.tile(FIRST, CONTEXTS)
-        if self.kernel is _code:  # lists, whose elements Python reads faster
-            self.state, self.counts = self.state.tolist(), self.counts.tolist()
-        self.sums = np.zeros((RING, shape[1] + 1), np.int32)
-        self.before = np.zeros((2, shape[1]), np.int32)
-        self.rows = max(1, BLOCK // shape[1])
-
-    def write(self, levels: Ints) -> int:
-        """Write the levels; the number of rows up to the last that is not 0."""
-        filled = _filled(levels)
-        for start in range(0, min(filled + 1, len(levels)), self.rows):
-            block = levels[start : start + self.rows]
-            self.packed.extend(bytes(max(0, int(self.state[2]) + ROOM * block.size - len(self.packed))))
-            self._code(block, start, filled)
-        return filled
-
-    def read(self, rows: int, size: int) -> Ints:
-        """Read so many rows of a stream of `size` bytes."""
-        levels: Ints = np.zeros((rows, self.before.shape[1]), np.int8)
-        for start in range(0, rows, self.rows):
-            _check_size(start, levels.shape[1], size)
-            block, row = self._code(levels[start : start + self.rows], start, 0)
+    rows, columns = levels.shape
+    kernel, begin = _kernel(levels.size), SPAN // 8 if reads else 0
+    state: Any = np.array([int.from_bytes(packed[:begin], "big"), 1 << SPAN, begin])
+    counts: Any = np.tile(FIRST, CONTEXTS)
+    if kernel is _code:  # lists, whose elements Python reads faster
+        state, counts = state.tolist(), counts.tolist()
+    sums, before = np.zeros((RING, columns + 1), np.int32), np.zeros((2, columns), np.int32)
+    filled, row, step = _filled(levels), 0, max(1, BLOCK // columns)
+    for start in range(0, rows, step):
+        some = levels[start : start + step]
+        if reads:
+            _check_size(start, columns, len(packed))
+        else:
+            bits = 2 * max(int(some.max()), -int(some.min())).bit_length() + 2  # of a level, and a row
+            packed.extend(bytes(max(0, int(state[2]) + BIT * bits * some.size - len(packed))))
+        block = np.concatenate([before, some], dtype=np.int32)
+        coding = reads, state, counts, sums, _logarithms()
+        row = kernel(
+            block, start, filled, packed if kernel is _code else np.frombuffer(packed, np.uint8), coding
+        )
+        before = block[-2:]
+        if reads:
             levels = levels if _fits(block) else levels.astype(np.int32)
-            levels[start : start + self.rows] = block
-            if row < start + len(block) or self.state[2] > len(self.packed):
-                break
-        return levels
-
-    def _code(self, levels: Ints, start: int, filled: int) -> tuple[Ints, int]:
-        block = np.concatenate([self.before, levels], dtype=np.int32)
-        packed = self.packed if self.kernel is _code else np.frombuffer(self.packed, np.uint8)
-        coding = self.reads, self.state, self.counts, packed, self.sums, _logarithms()
-        row = self.kernel(block, start, filled, coding)
-        self.before = block[-2:]
-        return block[2:], row
+            levels[start : start + step] = block[2:]
+        if row < start + len(some) or state[2] > len(packed):
+            break
+    return levels, row, state
 
 
 # The functions from here to `_near` run as they are, on lists, and compiled by numba, on arrays.
 
 
-def _code(block: Any, start: int, filled: int, coding: Any) -> int:
+def _code(block: Any, start: int, filled: int, packed: Any, coding: Any) -> int:
     """Code the rows of a block from row `start` on, in which the two before them come first.
 
     Args:
-        filled: rows up to the last that is not 0, if they are known. coding: see `_Coder` and `_near`.
+        filled: rows up to the last that is not 0, if they are known.
+        coding: whether to read; state: the lower end of the interval, or the value read less that, its
+            width, and the position in `packed`; counts of 0s and 1s in each context; sums and logarithms,
+            see `_near`.
 
     Returns:
         The row at which coding ended; all further ones are 0.
     """
-    reads, state, counts, packed, sums, logarithms = coding
+    reads, state, counts, sums, logarithms = coding
     low, span, at = state[0], state[1], state[2]
     for r in range(2, len(block)):
         row = start + r - 2
@@ -342,13 +330,13 @@ def _kernel(levels: int) -> Callable[..., int]:
 def _compiled() -> Callable[..., int] | None:
     """`_code` compiled, or None if numba is missing or broken."""
     block, numbers = "int32[:,::1]", "int64[::1]"
-    coding = f"Tuple((boolean, {numbers}, {numbers}, uint8[::1], {block}, {numbers}))"
+    coding = f"Tuple((boolean, {numbers}, {numbers}, {block}, {numbers}))"
     try:
         from numba.extending import register_jitable
 
         for function in (_bit, _put, _near):
             register_jitable(function)
-        return compiled(_code, f"int64({block}, int64, int64, {coding})")
+        return compiled(_code, f"int64({block}, int64, int64, uint8[::1], {coding})")
     except Exception as error:  # a broken compiler must not break what works without one
         log.info("levels are coded in Python, not by numba: %s", " ".join(str(error).split()))
         return None
