@@ -64,9 +64,10 @@ def _fitting(module: nn.Module) -> list[nn.Parameter]:
 @torch.no_grad()
 def round_weights(module: nn.Module) -> bool:
     """Round in place all parameters that fit into 8 bits, but no buffers; whether there are any."""
-    for weight in _fitting(module):
+    weights = _fitting(module)
+    for weight in weights:
         weight.copy_(rounded(weight))
-    return bool(_fitting(module))
+    return bool(weights)
 
 
 def is_rounded(module: nn.Module) -> bool:
