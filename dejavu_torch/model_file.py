@@ -328,7 +328,7 @@ def _fill(route: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any])
     """Give an empty map what a file holds of it; nothing if there is only a descriptor."""
     checked(state, route.state, "its map")
     own = part_of(tensors, "map")
-    if own or state["places"]:
+    if own or state.get("places"):
         route.load_packed(own, state)
     else:
         route.set_extra_state(state)

@@ -26,6 +26,7 @@ NAME = "dejavu_torch-map"
 ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
 EXPORT = "or `dejavu train export` of the checkpoint"
+CONTIGUOUS = torch.contiguous_format
 HEADER = "header"  # the digest that is of no tensor
 SHOWN = 60  # characters of a value in a message
 
@@ -74,15 +75,7 @@ def _sealed(
     tensors: Mapping[str, Tensor], header: dict[str, Any]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors with memory of their own, as safetensors needs, and one entry of metadata: it mixes several."""
-    plain: dict[str, Tensor] = {}
-    owners: set[int] = set()
-    for name, tensor in tensors.items():
-        tensor = tensor.detach().cpu().contiguous()
-        memory = tensor.untyped_storage()
-        if memory.data_ptr() in owners or memory.nbytes() != tensor.nbytes:
-            tensor = tensor.clone()
-        owners.add(tensor.untyped_storage().data_ptr())
-        plain[name] = tensor
+    plain = {name: one.detach().cpu().clone(memory_format=CONTIGUOUS) for name, one in tensors.items()}
     sealed = {"version": FORMAT, "checksums": checksums(plain, header), HEADER: header}
     return plain, {NAME: json.dumps(sealed, allow_nan=False)}
 

@@ -21,10 +21,7 @@ class Route(NamedTuple):
 
 
 class FrameTable(NamedTuple):
-    """Which frames the places of a map show, and on which route they are.
-
-    places: N, of the map. positions: (F,) float, how many even steps each frame lies from the first place of
-    its route; (0,) if place i is frame i. routes: of a merged map, in order, else ().
+    """Which frames the places of a map show, and on which route; its columns are those of `PlaceMap`.
 
     Convention: tensors of places and frames are int64 of any shape, and count through all routes. -1, no
         place or frame, stays -1.
@@ -58,15 +55,10 @@ class FrameTable(NamedTuple):
         return look_up(shown_frames(self.steps), places) if len(self.positions) else places
 
     def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each frame, -1 for one before the first place.
-
-        Raises:
-            InputError: a frame that the reference does not have.
-        """
+        """The place nearest to each frame, -1 for one before the first place; no other frames than F."""
         if frames.numel() and int(frames.max()) >= self.frames:
-            raise InputError(
-                f"frame {int(frames.max())} of the reference; expected frames from 0 to {self.frames - 1}"
-            )
+            seen = f"frame {int(frames.max())} of the reference"
+            raise InputError(f"{seen}; expected frames from 0 to {self.frames - 1}")
         return place_of(self.steps, frames) if len(self.positions) else frames
 
     def scored(self, places: Tensor) -> Tensor:

@@ -93,11 +93,11 @@ class PlaceMap(nn.Module, ABC):
         return FrameTable(self.places, self.positions, self.routes)
 
     def frame_of(self, places: Tensor) -> Tensor:
-        """The reference frame that each place shows; -1, no place, stays -1. int64 of any shape."""
+        """The reference frame that each place shows, see `FrameTable`."""
         return self.table.frame_of(places)
 
     def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each reference frame, see `FrameTable`. int64 of any shape."""
+        """The place nearest to each reference frame, see `FrameTable`."""
         return self.table.place_of(frames)
 
     @property
@@ -145,9 +145,8 @@ class PlaceMap(nn.Module, ABC):
                 raise InputError(f"the map's {name} is {state.get(name)!r}; expected {value!r}")
         sizes = state.get("places"), state.get("dimension")
         if not all(type(size) is int and 0 <= size < LARGEST for size in sizes):
-            raise InputError(
-                f"the map has {sizes[0]!r} places of {sizes[1]!r} features; expected whole numbers"
-            )
+            seen = f"the map has {sizes[0]!r} places of {sizes[1]!r} features"
+            raise InputError(f"{seen}; expected whole numbers")
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
@@ -190,13 +189,11 @@ class PlaceMap(nn.Module, ABC):
 
 
 class Mapper(nn.Module, ABC):
-    """Makes a map from descriptors. Subclass it, and `PlaceMap`, to bring another kind of map.
+    """Makes a map of N places from descriptors (N,D). Subclass it, and `PlaceMap`, for another kind of map.
 
     Attributes:
         kind: of its maps, the name that they store.
         whitens: whether it expects whitened descriptors by default.
-
-    Shape: features (N,D) float -> PlaceMap of N places.
     """
 
     kind: ClassVar[str]

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from functools import reduce
 from itertools import accumulate, pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -25,17 +25,6 @@ Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
 PHASE_COST = 8  # of a phase of two layers that are searched, in places that are scored in the same time
 SEARCH_COST = 2**15  # of any search, in the same unit
-
-
-class TemplateState(NamedTuple):
-    """What the header of a map file says of a template map; see its arguments."""
-
-    kind: Literal["templates"]
-    places: int
-    dimension: int
-    metric: Metric
-    reduction: Reduction
-    temperature: float | None
 
 
 def segments(plan: Plan, places: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
@@ -101,7 +90,6 @@ class TemplateMap(PlaceMap):
     """
 
     kind = "templates"
-    state = TemplateState
 
     layers: Tensor
     feature_ptr: Tensor
@@ -189,16 +177,7 @@ class TemplateMap(PlaceMap):
         return ""
 
     def settings(self) -> dict[str, Any]:
-        return {"metric": self.metric, "reduction": self.reduction}
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """See `PlaceMap`."""
-        return super().get_extra_state() | {"temperature": self.temperature}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See `PlaceMap`."""
-        super().set_extra_state(state)
-        self.temperature = state.get("temperature")
+        return {"metric": self.metric, "reduction": self.reduction, "temperature": self.temperature}
 
     def blocks(self) -> list[Tensor]:
         """Templates of each layer, (P,F) views of the flat buffer."""

@@ -31,8 +31,8 @@ def phase_mask(
 
     Shape: -> (P,n), 1 where frame i of the chunk has phase k, else 0.
 
-    Convention: phases count 0..P-1 from absolute frame 0: with phases = period M(i, tau, k) = 1 where
-        mod(i - k, tau) = 0.
+    Convention: phases count 0..P-1 from absolute frame 0; if they are as many as frames of the period, M is 1
+        where mod(i - k, tau) = 0.
 
     Raises:
         InputError: a fractional period without `phases`, or a chunk that ends after a number of frames.
@@ -64,10 +64,7 @@ class PhaseTemplates(nn.Module):
     Shape: features (N,D), plan of L layers -> tuple of L tensors (P,F).
 
     Convention: the mean runs over the layer's own chunk. A phase without frames gets 0, which nothing reads.
-        Gradients reach the features; the plan is exact numbers and gets none.
-
-    Raises:
-        InputError: a layer that reaches beyond the N frames or the D features.
+        Gradients reach the features. A layer beyond the N frames or the D features is an InputError.
 
     Example:
         >>> plan = (FrequencyLayer(Fraction(2), 2, 0, 4, (0,)),)

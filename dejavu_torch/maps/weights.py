@@ -22,9 +22,7 @@ SCALE = ".scale"  # follows the name of a weight; torch allows no dot in the nam
 
 
 def quantised(weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Whole numbers and scales whose product is a float32 weight, to within half a scale.
-
-    Shape: (O,...) -> int8 (O,...), bfloat16 (O,).
+    """A float32 weight (O,...) as int8 (O,...) times bfloat16 scales (O,), to within half a scale.
 
     Convention: the largest number of a channel is 127, unless all are 0. So the product, which is exact,
         gives the same numbers and scales again: a bfloat16 is off by at most 1 in 257, which moves 127 steps
@@ -66,9 +64,10 @@ def _fitting(module: nn.Module) -> list[nn.Parameter]:
 @torch.no_grad()
 def round_weights(module: nn.Module) -> bool:
     """Round in place all parameters that fit into 8 bits, but no buffers; whether there are any."""
-    for weight in _fitting(module):
+    weights = _fitting(module)
+    for weight in weights:
         weight.copy_(rounded(weight))
-    return bool(_fitting(module))
+    return bool(weights)
 
 
 def is_rounded(module: nn.Module) -> bool:

@@ -33,7 +33,7 @@ class ImposedPeriods(PeriodFinder):
         and logged; one period of as many phases as bins is a classifier of places.
 
     Raises:
-        InputError: periods or a bin out of range, or features not (N,D) with N >= 2 and D >= 1.
+        InputError: periods or a bin out of range, features of another shape.
 
     Example:
         >>> [layer.phases for layer in ImposedPeriods(bin=5).plan(Tensor(2700, 8))]
@@ -56,9 +56,8 @@ class ImposedPeriods(PeriodFinder):
 
     def plan(self, features: Tensor) -> Plan:
         if features.ndim != 2 or len(features) < 2 or features.shape[1] < 1:
-            raise InputError(
-                f"imposed periods got features {tuple(features.shape)}; expected (N,D) with N >= 2, D >= 1"
-            )
+            seen = f"imposed periods got features {tuple(features.shape)}"
+            raise InputError(f"{seen}; expected (N,D) with N >= 2, D >= 1")
         places, dimension = features.shape
         bins = -(-places // self.bin)
         periods = self.periods or supportive_periods(bins)

@@ -36,12 +36,11 @@ def shared_factor(a: Fraction | int, b: Fraction | int) -> Fraction:
 
 
 def support_of(periods: Sequence[int], places: int) -> tuple[int, int]:
-    """How whole periods >= 1 support each other over a route of at least 3 places.
+    """How whole periods >= 1 support each other over a route of at least 3 places: two distances.
 
-    Returns:
-        The code distance, in how many layers any two places differ at least: (code distance - 1) // 2 wrong
-        layers are survived. The torus distance, the least sum over layers of
-        min(D mod tau, tau - D mod tau) for places D > 1 apart.
+    The code distance d is in how many layers any two places differ at least; (d - 1) // 2 wrong layers are
+    survived. The torus distance is the least sum over layers of min(D mod tau, tau - D mod tau), D > 1 places
+    apart.
 
     Source: R. W. Watson and C. W. Hastings, Self-checked computation using residue arithmetic, Proc. IEEE
         54 (1966).
