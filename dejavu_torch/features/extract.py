@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.features.views import AugmentedTraverse
 from dejavu_torch.types import InputError, Traverse
 
@@ -94,21 +95,14 @@ def _progress(text: str | None, total: int | None) -> Iterator[Callable[[int], o
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
     """Features of one batch: (B,C,H,W) frames are described, (B,D) features stay unchanged."""
-    if not isinstance(batch, Tensor):
-        raise InputError(f"{name} is a {type(batch).__name__}; expected a tensor of frames or features")
-    if batch.ndim not in (2, 4) or not batch.is_floating_point():
-        raise InputError(
-            f"{name} gives batches {tuple(batch.shape)} {batch.dtype}; "
-            "expected float frames (B,C,H,W) in [0, 1] or float features (B,D)"
-        )
-    if batch.ndim == 2:
+    if isinstance(batch, Tensor) and batch.ndim == 2 and batch.is_floating_point():
         return batch
+    check_frames(batch, f"{name} is", " or float features (B,D)")
     features = describe(batch)
     if features.ndim != 2 or features.shape[0] != batch.shape[0]:
-        owner = (
-            describe[-1] if isinstance(describe, nn.Sequential) else getattr(describe, "__self__", describe)
-        )
-        owner = getattr(owner, "features", owner)  # of a DejaVu
+        owner = describe[-1] if isinstance(describe, nn.Sequential) else describe
+        owner = getattr(owner, "__self__", owner)  # of a method
+        owner = getattr(owner, "features", owner)
         raise InputError(
             f"{type(owner).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
             f"expected features ({len(batch)}, D)"

@@ -57,7 +57,7 @@ class HOG(nn.Module):
             )
 
     def forward(self, frames: Tensor) -> Tensor:
-        check_frames(frames, "HOG")
+        check_frames(frames, "HOG got")
         height, width = frames.shape[-2:] if self.resize is None else self.resize
         least = self.cell * self.block
         if min(height, width) < least:

@@ -30,7 +30,7 @@ class PatchPixels(nn.Module):
         self.size, self.patch = check_size(size, patch, "PatchPixels got size"), patch
 
     def forward(self, frames: Tensor) -> Tensor:
-        check_frames(frames, "PatchPixels")
+        check_frames(frames, "PatchPixels got")
         side, (height, width) = self.patch, frames.shape[-2:]
         if min(height, width) < side:
             raise InputError(

@@ -20,14 +20,12 @@ FLAT = 1 / 255  # one step of an 8-bit image: a smaller standard deviation says 
 VALUES_AT_ONCE = 2**19  # of frames, so that intermediate results stay in the cache
 
 
-def check_frames(frames: Tensor, name: str) -> None:
-    """Refuse all but a batch of float frames."""
-    if not isinstance(frames, Tensor):
-        raise InputError(f"{name} got a {type(frames).__name__}; expected a tensor of frames (B,C,H,W)")
-    if frames.ndim != 4 or not frames.is_floating_point():
-        raise InputError(
-            f"{name} got {tuple(frames.shape)} {frames.dtype}; expected float frames (B,C,H,W) in [0, 1]"
-        )
+def check_frames(frames: Tensor, seen: str, other: str = "") -> None:
+    """Refuse all but a batch of float frames; the message begins with `seen`, and names what else may be."""
+    if not isinstance(frames, Tensor) or frames.ndim != 4 or not frames.is_floating_point():
+        tensor = isinstance(frames, Tensor)
+        kind = f"{tuple(frames.shape)} {frames.dtype}" if tensor else f"a {type(frames).__name__}"
+        raise InputError(f"{seen} {kind}; expected a tensor of float frames (B,C,H,W) in [0, 1]{other}")
 
 
 def in_parts(work: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
@@ -190,7 +188,7 @@ class Preprocess(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         if self.channel is None and self.contrast is None:
             return frames
-        check_frames(frames, "preprocess")
+        check_frames(frames, "preprocess got")
         if self.channel is not None:
             frames = select_channel(frames, self.channel)
         if self.contrast == "patch":
