@@ -153,7 +153,7 @@ class PlaceMap(nn.Module, ABC):
         if not any(name.startswith(prefix) for name in state_dict):  # of other parts of a model
             super()._load_from_state_dict(state_dict, prefix, *args)
             return
-        before = self.__dict__ | {name: dict(self.__dict__[name]) for name in ("_buffers", "_parameters")}
+        before = self.__dict__ | {"_buffers": {**self._buffers}, "_parameters": {**self._parameters}}
         try:
             if prefix + EXTRA in state_dict:  # before any tensor is touched
                 self.set_extra_state(state_dict[prefix + EXTRA])
@@ -181,9 +181,8 @@ class PlaceMap(nn.Module, ABC):
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load what `packed` and `get_extra_state` gave; an InputError names tensors that are missing."""
         own = self.state_dict()
-        missing = sorted(own.keys() - tensors.keys() - {EXTRA, *OPTIONAL})
-        if missing:
-            raise InputError(f"it does not hold the map's {', '.join(missing)}")
+        if missing := own.keys() - tensors.keys() - {EXTRA, *OPTIONAL}:
+            raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
         optional = {name: own[name][:0] for name in OPTIONAL if name in own}
         self.load_state_dict({**optional, **tensors, EXTRA: extra})
 

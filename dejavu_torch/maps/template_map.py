@@ -177,7 +177,16 @@ class TemplateMap(PlaceMap):
         return ""
 
     def settings(self) -> dict[str, Any]:
-        return {"metric": self.metric, "reduction": self.reduction, "temperature": self.temperature}
+        return {"metric": self.metric, "reduction": self.reduction}
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """See `PlaceMap`."""
+        return super().get_extra_state() | {"temperature": self.temperature}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """See `PlaceMap`."""
+        super().set_extra_state(state)
+        self.temperature = state.get("temperature")
 
     def blocks(self) -> list[Tensor]:
         """Templates of each layer, (P,F) views of the flat buffer."""
