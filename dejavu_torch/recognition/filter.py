@@ -28,6 +28,7 @@ class Moments(NamedTuple):
 
 
 def moments_of(scores: Tensor) -> Moments:
+    """Of scores (Q,N)."""
     valid = scores.isfinite()
     count = valid.sum(1, keepdim=True).clamp(min=1)
     mean = torch.where(valid, scores, 0).sum(1, keepdim=True) / count
@@ -177,13 +178,15 @@ class PlaceFilter(SequenceModel):
         off = stay * (on.sum() - moved.sum()) + leave * (1 - off) + (1 - enter) * off
         return torch.cat([stay * moved + anywhere, off[None]])
 
-    def near_scores(self, posterior: Tensor, scores: Tensor) -> Tensor:
-        """-log of the probability of each place and its neighbours, (Q,W) -> (Q,W); +inf where scores are."""
+    def near_scores(self, posterior: Tensor, scores: Tensor, lowest: Tensor | None = None) -> Tensor:
+        """-log of the probability of each place and its neighbours, at least `lowest`, (Q,W) -> (Q,W); +inf
+        where scores are."""
         within = min(self.within, posterior.shape[1])  # further neighbours there are not
         side = within + 1  # two means over so many make a triangle
         padded = F.pad(posterior[:, None], (within, within))
         mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
-        score = -mass.clamp(torch.finfo(mass.dtype).tiny, 1.0).log()  # an exporter promotes no types
+        mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
+        score = -(mass if lowest is None else torch.maximum(mass, lowest)).log()
         return score.masked_fill(~scores.isfinite(), math.inf)
 
     def check(self, queries: int | None, places: int) -> None:
@@ -240,10 +243,9 @@ class LocalSearch:
         if near is None and moments.varied:  # a query that says nothing is no search
             self.search, since = moments, 0
         self.belief, self.start, self.since, self.skipped = belief, start, since + 1, 0
-        elsewhere = (filter.within + 1) * _rest(belief, others) / max(1, others)
-        elsewhere = -elsewhere.clamp(torch.finfo(belief.dtype).tiny, 1).log()
-        found = filter.near_scores(belief[None, :-1], scores)
-        found = torch.where(found.isfinite(), torch.minimum(found, elsewhere), math.inf)
+        lowest = (filter.within + 1) * _rest(belief, others) / max(1, others)
+        lowest = lowest.clamp(torch.finfo(belief.dtype).tiny, 1)
+        found, elsewhere = filter.near_scores(belief[None, :-1], scores, lowest), -lowest.log()
         if not others or (not whole and bool(found.amin() < elsewhere)):
             return found, start
         row = elsewhere.repeat(1, places).masked_fill_(~moments.valid, math.inf)

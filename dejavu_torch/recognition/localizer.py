@@ -104,7 +104,8 @@ class Localizer:
     def match(self, scores: Tensor) -> Match:
         """Match the next queries by their scores: (B,N) -> (B,), or (B,k)."""
         if not self.models:
-            return self._matched(scores, None if self.matching.platt is None else confidence_of(scores))
+            confidence = None if self.matching.platt is None else confidence_of(scores)
+            return self._answer(self._candidates(scores), confidence)
         return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
 
     @torch.no_grad()
@@ -126,7 +127,8 @@ class Localizer:
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
         steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
         together = steps[self.own][0]
-        match = self._matched(together, None if self.matching.platt is None else self.track(together, scores))
+        confidence = None if self.matching.platt is None else self.track(together, scores)
+        match = self._answer(self._candidates(together), confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
         beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.lengths}
         return match._replace(sequences=beside)
@@ -135,13 +137,13 @@ class Localizer:
         assert self.local is not None
         whole = self.matching.k is not None or self.matching.on_scores is not None
         scores, start = self.local(descriptor, whole)
-        match = self._matched(scores)
+        match = self._candidates(scores)
         return match._replace(index=match.index + start)
 
-    def _matched(self, scores: Tensor, confidence: Tensor | None = None) -> Match:
+    def _candidates(self, scores: Tensor) -> Match:
         if self.matching.on_scores is not None:
             self.matching.on_scores(scores)
-        return self._answer(best_candidates(scores, self.matching.k or 1, self.matching.radius), confidence)
+        return best_candidates(scores, self.matching.k or 1, self.matching.radius)
 
     def _answer(self, match: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) as they are handed out, with the probability that the first is right."""
@@ -159,7 +161,7 @@ class Localizer:
         assert self.route is not None
         if self.local is None:
             return self.match(self.route.scores(descriptors))
-        return Match.joined(map(self._locally, descriptors.split(1)))
+        return self._answer(Match.joined(map(self._locally, descriptors.split(1))))
 
     def _by_search(
         self, find: Callable[..., Best], wanted: list[tuple[int, int]], n: int, descriptors: Tensor

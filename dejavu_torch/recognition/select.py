@@ -83,9 +83,12 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
         else:
             scores = scores.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
     index, score = (torch.stack(column, 1) for column in zip(*found, strict=True))
-    finite = score.isfinite() & score[:, :1].isfinite()  # a query with a NaN has no candidates
+    finite = score.isfinite()
+    if k > 1:  # a query with a NaN has no candidates
+        finite = finite & finite[:, :1]
+        score = score.masked_fill(~finite, torch.inf)
     index = torch.where(finite, index, -1)
-    return Match(index, torch.where(finite | score.isnan(), score, torch.inf), finite)
+    return Match(index, score, finite)
 
 
 def check_candidates(k: int, radius: int, places: int | None = None) -> None:
