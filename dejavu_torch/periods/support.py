@@ -24,17 +24,6 @@ def common_period(periods: Sequence[Fraction | int]) -> Fraction:
     return Fraction(math.lcm(*numerators), math.gcd(*denominators))
 
 
-def shared_factor(a: Fraction | int, b: Fraction | int) -> Fraction:
-    """Greatest common divisor of two periods; 1 for co-prime whole periods.
-
-    Example:
-        >>> shared_factor(93, 171), shared_factor(Fraction(195, 2), 171)
-        (Fraction(3, 1), Fraction(3, 2))
-    """
-    a, b = Fraction(a), Fraction(b)
-    return Fraction(math.gcd(a.numerator, b.numerator), math.lcm(a.denominator, b.denominator))
-
-
 def support_of(periods: Sequence[int], places: int) -> tuple[int, int]:
     """How whole periods >= 1 support each other over a route of at least 3 places: two distances.
 
