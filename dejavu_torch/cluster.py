@@ -137,7 +137,7 @@ def code_on(
     progress: str | None = None,
     together: int = 0,
 ) -> Iterator[Chunk]:
-    """As `code_here`, by a cluster: the same bytes in the same order.
+    """As `encode_local`, by a cluster: the same bytes in the same order.
 
     A traverse that cannot seek is read from its beginning by every worker, so that its chunks are divided
     into few tasks.

@@ -18,7 +18,7 @@ from dejavu_torch.learning import (
     Checkpoint,
     ChunkCoder,
     Code,
-    code_here,
+    encode_local,
     extend,
     observation_counts,
     positions_of,
@@ -44,7 +44,7 @@ def append(
     traverse: Traverse | Tensor,
     progress: bool = False,
     checkpoint: Checkpoint | None = None,
-    code: Code = code_here,
+    code: Code = encode_local,
     visits: Views | None = None,
 ) -> DejaVu:
     """Add the places of a traverse after those of a model's map, which stay as they are.
@@ -110,7 +110,7 @@ def learn_mean(
     progress: bool = False,
     second: Views | None = None,
     checkpoint: Checkpoint | None = None,
-    code: Code = code_here,
+    code: Code = encode_local,
 ) -> DejaVu:
     """As `DejaVu.learn`, of the mean of several visits to each place: what changes between them cancels out.
 

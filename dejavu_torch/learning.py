@@ -346,7 +346,7 @@ class _ByChunks(Traverse):
 Code = Callable[[ChunkCoder, Traverse, int, str | None], Iterator[Chunk]]
 
 
-def code_here(
+def encode_local(
     coder: ChunkCoder, traverse: Traverse, first: int, progress: str | None = None
 ) -> Iterator[Chunk]:
     """The chunks of a traverse from number `first` on, coded in this process."""
@@ -460,7 +460,7 @@ def learn_map(
     progress: str | None = None,
     checkpoint: Checkpoint | None = None,
     key: Callable[[], Mapping[str, str]] = dict,
-    code: Code = code_here,
+    code: Code = encode_local,
 ) -> PlaceMap:
     """The map of a traverse; the describer's whitening is learned for it.
 
@@ -541,7 +541,7 @@ def extend(
     traverse: Traverse,
     progress: str | None = None,
     checkpoint: Checkpoint | None = None,
-    code: Code = code_here,
+    code: Code = encode_local,
 ) -> None:
     """Extend a map by the chunks of a traverse that it does not have yet, with a partial file each minute.
 

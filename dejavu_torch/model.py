@@ -28,7 +28,7 @@ from dejavu_torch.learning import (
     Code,
     Describer,
     calibration_of,
-    code_here,
+    encode_local,
     is_ready,
     learn_descriptors,
     learn_map,
@@ -174,7 +174,7 @@ class DejaVu(nn.Module):
         progress: bool = False,
         second: Views | None = None,
         checkpoint: Checkpoint | None = None,
-        code: Code = code_here,
+        code: Code = encode_local,
         visits: Views | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
@@ -186,7 +186,7 @@ class DejaVu(nn.Module):
             progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
             checkpoint: keeps the partial map of a long route, from which learning continues after a kill; it
                 is the caller's to remove.
-            code: what codes the chunks of a long route: `code_here`, or a cluster.
+            code: what codes the chunks of a long route: `encode_local`, or a cluster.
             visits: see `growth.learn_mean`.
 
         Returns:

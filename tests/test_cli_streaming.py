@@ -16,7 +16,7 @@ import torch
 from command_line import fails, frames, run, write_images
 
 from dejavu_torch.cli import commands, main
-from dejavu_torch.learning import ChunkCoder, code_here
+from dejavu_torch.learning import ChunkCoder, encode_local
 from dejavu_torch.maps.spectral_map import Chunk
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import Traverse
@@ -61,9 +61,9 @@ def test_a_killed_run_goes_on_where_it_was(
 
     def noted(coder: ChunkCoder, traverse: Traverse, first: int, text: str | None = None) -> Iterator[Chunk]:
         began.append(first)
-        return code_here(coder, traverse, first, text)
+        return encode_local(coder, traverse, first, text)
 
-    monkeypatch.setattr(commands, "code_here", noted)
+    monkeypatch.setattr(commands, "encode_local", noted)
     run(*words)
     assert 0 < began[0] < LONG / 250
     assert out.read_bytes() == whole.read_bytes()

@@ -18,7 +18,7 @@ from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.experiments.bench import Row, write_bench
-from dejavu_torch.learning import ChunkCoder, code_here
+from dejavu_torch.learning import ChunkCoder, encode_local
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
@@ -65,7 +65,7 @@ def _contenders(
     """By name and number of threads in all: what makes all chunks."""
 
     def here() -> list[Chunk]:
-        return [*code_here(coder, route, 0)]
+        return [*encode_local(coder, route, 0)]
 
     def threaded() -> list[Chunk]:
         threads = torch.get_num_threads()
