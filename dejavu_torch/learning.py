@@ -554,8 +554,8 @@ def extend(
 
     def add() -> None:
         if held:
-            route.extend(held)
-            held.clear()
+            chunks, held[:] = [*held], []  # if this is interrupted, they are not added again
+            route.extend(chunks)
             if checkpoint is not None:
                 checkpoint.save(route, coder.describer.whitening, traverse)
 

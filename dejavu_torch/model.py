@@ -149,7 +149,7 @@ class DejaVu(nn.Module):
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self._whitens = self.whitening is not None  # else it may be made for a route, see `_describer_of`
+        self._made: tuple[Whitening, ...] = ()  # the whitening, if `_describer_of` made it for a route
         self.threshold = None if threshold is None else float(min(threshold, HIGHEST))
         self.precision = precision
         self.batch_size = batch_size
@@ -249,19 +249,19 @@ class DejaVu(nn.Module):
 
         Ready features too wide for a spectral map become principal components without whitening, too.
         """
-        whitening = copy.deepcopy(self.whitening) if self._whitens else None
-        if whitening is not None and whitening.fixed:
-            whitening = self.whitening
+        whitening = None if self._made == (self.whitening,) else self.whitening
+        if whitening is not None and not whitening.fixed:
+            whitening = copy.deepcopy(whitening)
         wide = is_ready(traverse) and traverse.frame_shape[0] > WIDEST
         if whitening is None and wide and isinstance(self.mapper, SpectralMapper):
             whitening = Whitening(views=0).to(self.map.positions.device)
         return self.describer._replace(whitening=whitening)
 
     def _keep(self, learned: Whitening | None) -> None:
-        if self.whitening is not None and self._whitens and learned is not None:
-            self.whitening.load_state_dict(learned.state_dict())  # it may be the user's, too
+        if self.whitening is None or self._made == (self.whitening,) or learned is None:
+            self.whitening, self._made = learned, (learned,) if learned else ()
         else:
-            self.whitening = learned
+            self.whitening.load_state_dict(learned.state_dict())  # it may be the user's, too
 
     def take_whitening(self, other: DejaVu) -> None:
         """Describe as another model does: its preprocess, features and whitening, which stays as it is.
@@ -273,7 +273,7 @@ class DejaVu(nn.Module):
             raise InputError("its map was learned without whitening; expected one that was learned with it")
         self.preprocess, self.features, self.whitening = other.preprocess, other.features, other.whitening
         self.weight_bits = other.weight_bits
-        self.whitening.fixed = self._whitens = True
+        self.whitening.fixed, self._made = True, ()
 
     def take_descriptor(self, other: DejaVu) -> None:
         """Use the preprocess and features of another model, such as one trained on many routes; whitening is

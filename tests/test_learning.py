@@ -198,6 +198,24 @@ def test_finished_chunks_are_not_made_again(tmp_path: Path, made: list[int]) -> 
     assert not (tmp_path / "m.part").exists()
 
 
+def test_an_interruption_while_the_map_grows_adds_no_chunk_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = file_of(learned(route()), tmp_path)
+    extend, calls = SpectralMap.extend, iter([False, True])
+
+    def interrupted(self: SpectralMap, chunks: Any, *rest: Any) -> None:
+        extend(self, chunks, *rest)
+        if next(calls, False):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(learning, "SAVED", 0)
+    monkeypatch.setattr(SpectralMap, "extend", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        learned(route(), checkpoint=Checkpoint(tmp_path / "m"))
+    assert file_of(learned(route(), checkpoint=Checkpoint(tmp_path / "m")), tmp_path) == whole
+
+
 def test_the_partial_map_is_written_each_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "SAVED", 60)
     now = iter(range(0, 10**6, 25))

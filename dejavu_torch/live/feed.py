@@ -54,9 +54,10 @@ class FrameReader:
             except queue.Empty:
                 seen = f"{self.name} stalled: no frame in {self.timeout:g} seconds"
                 raise InputError(f"{seen}; expected it to go on") from None
-            if frame is None:
-                return
-            if isinstance(frame, BaseException):
+            if frame is None or isinstance(frame, BaseException):
+                self._waiting.put(frame)  # for whoever iterates again
+                if frame is None:
+                    return
                 raise frame
             yield frame
 

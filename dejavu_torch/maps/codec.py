@@ -109,7 +109,7 @@ def decode(stream: Stream, rows: int, columns: int) -> Tensor:
     packed = stream.bytes.numpy().tobytes()
     padded = bytearray(packed + bytes(SPAN // 8 - 1))
     levels, _, state = _run(np.zeros((rows, columns), np.int8), padded, reads=True)
-    left, checksum = len(padded) - int(state[2]), _checksum(levels)
+    left, checksum = max(0, len(padded) - int(state[2])), _checksum(levels)
     if left or checksum != stream.checksum:
         raise InputError(
             f"the coded lines are truncated or altered: {len(packed)} bytes, {left} of them left over, give "
@@ -195,7 +195,7 @@ def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, in
         )
         before = block[-2:]
         if reads:
-            levels = levels if _fits(block) else levels.astype(np.int32)
+            levels = levels if _fits(block) else levels.astype(np.int32, copy=False)
             levels[start : start + step] = block[2:]
         if row < start + len(some) or state[2] > len(packed):
             break
@@ -297,7 +297,7 @@ def _near(sums: Any, rows: Any, logarithms: Any) -> Any:
     now, columns = sums[rows % len(sums)], sums.shape[1] - 1
     far = np.minimum(np.minimum(np.maximum(rows // 2, 16), REACH), rows)
     close = np.minimum(np.minimum(np.maximum(rows // 16, 2), 8), rows)
-    recent = now[:, -1] - sums[(rows - close) % len(sums)][:, -1]
+    recent = (now[:, -1] - sums[(rows - close) % len(sums)][:, -1]).astype(np.int64)
     mean = (recent << 10) // (np.maximum(close, 1) * columns)
     # the mean magnitude over the last rows, in 256ths, with more weight on the last two
     column = ((now - sums[(rows - far) % len(sums)]) << 8) // np.maximum(far, 1).reshape(-1, 1)

@@ -152,7 +152,8 @@ def checked(value: Any, kind: Any, where: str) -> Any:
             items = [checked(one, of, f"{where}[{i}]") for i, (one, of) in pairs]
             return items if origin is list else tuple(items)
     elif origin in (dict, Mapping) and isinstance(value, dict):
-        return {name: checked(one, inner[1], f"{where}.{name}") for name, one in value.items()}
+        kind = inner[1] if inner else Any
+        return {name: checked(one, kind, f"{where}.{name}") for name, one in value.items()}
     elif _fits(value, origin, inner):
         return value
     limit = ", finite and below 2^53" if isinstance(value, int | float) else ""

@@ -179,10 +179,12 @@ class PlaceMap(nn.Module, ABC):
         }
 
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
-        """Load what `packed` and `get_extra_state` gave; an InputError names tensors that are missing."""
+        """Load what `packed` and `get_extra_state` gave; an InputError names tensors that do not belong."""
         own = self.state_dict()
         if missing := own.keys() - tensors.keys() - {EXTRA, *OPTIONAL}:
             raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
+        if unknown := tensors.keys() - own.keys():
+            raise InputError(f"it holds {', '.join(sorted(unknown))}, which no map has")
         optional = {name: own[name][:0] for name in OPTIONAL if name in own}
         self.load_state_dict({**optional, **tensors, EXTRA: extra})
 

@@ -225,7 +225,7 @@ class SpectralMap(PlaceMap):
 
     @property
     def held(self) -> float | None:
-        """The share of the variance that the lines hold; None if that is not known."""
+        """The share of the variance that the lines hold, of chunks that were not loaded; None for none."""
         return 1 - self.error / self.energy if self.energy else None
 
     def coded(self) -> list[Chunk]:
@@ -242,7 +242,8 @@ class SpectralMap(PlaceMap):
 
     @classmethod
     def merged(cls, parts: Sequence[SpectralMap], names: Sequence[str]) -> SpectralMap:
-        """The map of several routes of one dimension and metric, each with its own mean and steps."""
+        """The map of several routes of one dimension, metric and transform, each with its own mean and steps;
+        `growth.merge` checks that."""
         made = cls(torch.cat([part.means for part in parts]), **parts[0].settings())
         sizes = ((part.places, part.table.frames) for part in parts)
         made.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))

@@ -231,7 +231,7 @@ class TemplateMap(PlaceMap):
                 parts.append(total / self.divisor(layers) if self.reduction == "mean" else total)
             elif count > 0:
                 parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, count))
-        return torch.cat(parts, 1)
+        return torch.cat(parts, 1) if parts else distances[0][:, :0]
 
     def scores(self, queries: Tensor) -> Tensor:
         """S(i) of all places (eq. 3, eq. 4): (Q,D) -> (Q,N)."""
