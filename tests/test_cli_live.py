@@ -205,9 +205,9 @@ def test_the_page_shows_frame_reference_and_answer(
     states: list[dict[str, Any]] = []
     show = Page.show
 
-    def shown(self: Page, moment: Any) -> None:
-        show(self, moment)
-        if moment.shot.number in (2, 30, 39):
+    def shown(self: Page, snapshot: Any) -> None:
+        show(self, snapshot)
+        if snapshot.frame.number in (2, 30, 39):
             with urlopen(f"{self.url}state") as answer:
                 states.append(json.load(answer))
 
