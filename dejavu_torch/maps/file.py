@@ -77,7 +77,16 @@ def _sealed(
     """Tensors with memory of their own, as safetensors needs, and one entry of metadata: it mixes several."""
     plain = {name: one.detach().cpu().clone(memory_format=CONTIGUOUS) for name, one in tensors.items()}
     sealed = {"version": FORMAT, "checksums": checksums(plain, header), HEADER: header}
-    return plain, {NAME: json.dumps(sealed, allow_nan=False)}
+    try:
+        return plain, {NAME: json.dumps(sealed, allow_nan=False)}
+    except ValueError as error:
+        raise InputError(f"the model cannot be written: {error}; expected finite numbers") from error
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(float(text)):
+        raise ValueError(f"{text} is no finite number")
+    return float(text)
 
 
 def read_map(path: Path) -> Contents:
@@ -93,7 +102,7 @@ def read_map(path: Path) -> Contents:
             if NAME not in metadata:
                 problem = f"{path} is no map of dejavu_torch, or an old one"
                 raise InputError(f"{problem}; expected {EXPECTED}; of an old one, learn the route anew")
-            sealed = json.loads(metadata[NAME])
+            sealed = json.loads(metadata[NAME], parse_constant=_finite, parse_float=_finite)
             version = sealed["version"]
             if version != FORMAT:
                 newer = isinstance(version, int) and version > FORMAT
