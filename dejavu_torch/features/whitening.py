@@ -237,7 +237,7 @@ class Whitening(nn.Module):
                     f"the views have {view.shape[1]} features; expected {len(mean)} as in the route"
                 )
             own = places[place.to(places.device)].to(mean)
-            pairs.append(torch.stack([view - mean, own - mean]) @ basis)
+            pairs.append(torch.stack([(part - mean) @ basis for part in (view, own)]))
         if not pairs:
             raise InputError("there are no views to whiten with; expected some, or None for none")
         shown, own = torch.cat(pairs, 1)
