@@ -20,7 +20,7 @@ Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
     IV-A   (ours) channel, local contrast        Preprocess          features.preprocess
            (ours) few numbers, that tell places  Whitening           features.whitening
     IV-C   precision, recall, area               pr_curve, evaluate  evaluation.curves
-    V      (ours) beside baselines and nulls     compare             experiments.compare
+    V      (ours) beside baselines and nulls     compare             evaluation.compare
     VI     (ours) several queries one by one     SequenceMatcher     recognition.sequence
     VI     (ours) probabilities on the way        PlaceFilter         recognition.filter
     VI     (ours) frames as they come            LiveLocalizer       live.localizer
@@ -39,8 +39,8 @@ from dejavu_torch.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from dejavu_torch.data.source import open_source
+    from dejavu_torch.evaluation.compare import compare
     from dejavu_torch.evaluation.curves import evaluate, pr_curve
-    from dejavu_torch.experiments.compare import compare
     from dejavu_torch.features.embedding import Embedding
     from dejavu_torch.features.hog import HOG, hog
     from dejavu_torch.features.preprocess import Preprocess
@@ -120,7 +120,7 @@ _HOMES = {
     "Traverse": "types",
     "Whitening": "features.whitening",
     "best_match": "recognition.select",
-    "compare": "experiments.compare",
+    "compare": "evaluation.compare",
     "evaluate": "evaluation.curves",
     "hog": "features.hog",
     "open_source": "data.source",

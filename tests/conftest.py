@@ -36,7 +36,7 @@ settings.load_profile("repeatable")
 
 # whole commands, trainings, real footage and notebooks: not in a developer's inner loop
 SLOW = (
-    *("training", "experiments", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
+    *("training", "benchmarks", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
     *("test_real_routes", "test_golden"),
     *(
         "test_periods_on_real_data",
@@ -55,13 +55,13 @@ FEW_VIEWS = {
         "test_cli_growth",
         "test_faults",
         "test_readme",
-        "test_footprint",
+        "test_memory_bench",
         "test_scale",
         "test_demo",
         "test_cli_networks",
         "test_pretrained",
         "test_cli_rejection",
-        "test_onnx_file",
+        "test_onnx_export",
         "test_reproduce",
         "test_routes",
         "test_spectral_training",

@@ -15,7 +15,7 @@ from helpers import template_model
 from dejavu_torch import DejaVu
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.experiments.compare import compare
+from dejavu_torch.evaluation.compare import compare
 
 CORNERS = ["--velocity.corners", "[[0,0],[1,0],[1,1],[0,1]]", "--velocity.size", f"[{SIDE},{SIDE}]"]
 STEPS = [*CORNERS, "--velocity.step", str(STEP)]

@@ -19,7 +19,7 @@ from dejavu_torch import DejaVu, InputError
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import check_config, find_config, preset_names, with_configs
-from dejavu_torch.experiments.reproduce import paper_model
+from dejavu_torch.evaluation.reproduce import paper_model
 from dejavu_torch.model_file import PARTS, recipe_of
 
 ROOT = Path(__file__).parents[1]

@@ -138,9 +138,9 @@ def test_a_training_that_is_interrupted_leaves_a_map(folder: Path) -> None:
 def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from benchmarks import memory
     from dejavu_torch.cli import process
     from dejavu_torch.data.output import remove_temporaries
-    from dejavu_torch.experiments import footprint
 
     (tmp_path / "tmp").mkdir()
     script = "#!/bin/sh", 'cd "${0%/*}"', "echo $$ > new", "mv new pid", "exec sleep 60"
@@ -152,7 +152,7 @@ def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_pr
     def bench() -> None:
         process.take_over()
         process.cleanup[:] = [remove_temporaries]
-        list(footprint.bench_memory([64]))
+        list(memory.bench_memory([64]))
 
     child = forked(bench)
     pid = tmp_path / "pid"

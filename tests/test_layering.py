@@ -26,10 +26,9 @@ ORDER = [
     {"model"},
     {"growth"},
     {"cluster"},
-    {"live"},
+    {"live", "export"},
     {"evaluation"},
     {"training"},
-    {"experiments"},
     {"cli"},
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
@@ -51,13 +50,13 @@ ARROWS = {
     "growth": "types data features maps motion learning model_file model",
     "cluster": "text types data maps recognition learning",
     "live": "types data features recognition model",
-    "evaluation": "text types memory resize data features periods maps recognition motion model",
+    "evaluation": "text version types memory resize data features periods maps recognition motion model_file "
+    "model growth",
+    "export": "text version types data features maps recognition model",
     "training": "text types memory resize data features periods maps recognition "
     "motion model_file model growth evaluation",
-    "experiments": "text types data features periods maps recognition motion learning model_file "
-    "model growth cluster live evaluation training",
     "cli": "text types data features periods maps recognition motion learning model_file model "
-    "growth cluster live evaluation training experiments",
+    "growth cluster live export evaluation training",
 }
 
 
@@ -205,7 +204,7 @@ def test_imports_point_one_way(file: Path) -> None:
             "evaluation/curves.py",
             "try:\n    from dejavu_torch.training import metrics\nexcept ImportError: pass",
         ),
-        ("experiments/compare.py", "from dejavu_torch.cli import main"),
+        ("evaluation/compare.py", "from dejavu_torch.cli import main"),
     ],
 )
 def test_a_wrong_arrow_is_caught(file: str, source: str) -> None:
@@ -225,7 +224,7 @@ def test_a_wrong_arrow_is_caught(file: str, source: str) -> None:
         ("model.py", "from .data import arrays\nfrom . import types"),
         (
             "cli/parser.py",
-            "from dejavu_torch import model\nfrom dejavu_torch.experiments import compare",
+            "from dejavu_torch import model\nfrom dejavu_torch.evaluation import compare",
         ),
         ("types.py", "import dejavu_torch_other\nfrom torch import cli"),
     ],

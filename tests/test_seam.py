@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from dejavu_torch import HOG, best_match, evaluate, model_file
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
-from dejavu_torch.experiments.compare import compare
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper

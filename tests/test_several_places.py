@@ -15,9 +15,9 @@ from helpers import Fixed, refused, template_model
 
 from dejavu_torch import DejaVu, FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.compare import compare
+from dejavu_torch.evaluation.evaluate import evaluate_file
 from dejavu_torch.evaluation.matches import read_matches, write_matches
-from dejavu_torch.experiments.compare import compare
-from dejavu_torch.experiments.evaluate import evaluate_file
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 

@@ -44,8 +44,8 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 if TYPE_CHECKING:
+    from dejavu_torch.evaluation.compare import Comparison
     from dejavu_torch.evaluation.report import Report
-    from dejavu_torch.experiments.compare import Comparison
 
 NO_CALIBRATION = "none"
 UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
@@ -63,8 +63,8 @@ def run_demo(
         seed: which route, and of the whitening and the null control
         second: another traverse of the route, from which whitening learns what a visit changes
     """
-    from dejavu_torch.experiments.compare import compare
-    from dejavu_torch.experiments.reproduce import paper_model
+    from dejavu_torch.evaluation.compare import compare
+    from dejavu_torch.evaluation.reproduce import paper_model
 
     _check_report_folder(out, COMPARED, [second])
     _set_seed(model, seed)
@@ -425,7 +425,7 @@ def run_compare(
         distractors: another route, or a list of several, '[A,B]': how many of its frames are accepted
         device: as of `dejavu learn`
     """
-    from dejavu_torch.experiments.compare import compare
+    from dejavu_torch.evaluation.compare import compare
 
     where = device_of(device, learns=map is None)
     matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
@@ -509,8 +509,8 @@ def run_evaluate(
         route: of matches on a merged map, the route that --truth, --reference and the query are of; answers
             on other routes are wrong
     """
+    from dejavu_torch.evaluation.evaluate import evaluate_file
     from dejavu_torch.evaluation.report import report_folder, write_report
-    from dejavu_torch.experiments.evaluate import evaluate_file
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
     _check_report_folder(out, (), [reference, query], [matches, truth, map])
@@ -533,15 +533,15 @@ def run_reproduce(
         seed: which routes
         tolerance: right within this many places, inclusive
     """
-    from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
-    from dejavu_torch.experiments.paper_tables import (
+    from dejavu_torch.evaluation.paper_tables import (
         FOOTAGE,
         PUBLISHED,
         boundary_lines,
         route_lines,
         section_five,
     )
-    from dejavu_torch.experiments.reproduce import lengths_picture, reproduce
+    from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
+    from dejavu_torch.evaluation.reproduce import lengths_picture, reproduce
 
     if dataset not in ("all", *PUBLISHED):
         raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(PUBLISHED)} or all")
@@ -596,16 +596,13 @@ def run_bench(
         seeds: of train, a training each; 0, 1 and 2 if not given
         device: of scale, what localizes: as of `dejavu localize`
     """
+    from benchmarks import cluster as cluster_speed
+    from benchmarks import live as live_speed
+    from benchmarks import matcher as bench
+    from benchmarks import memory as footprint
+    from benchmarks import scale, scale_report
+    from benchmarks import storage as frontier
     from dejavu_torch.evaluation.report import text_table
-    from dejavu_torch.experiments import (
-        bench,
-        cluster_speed,
-        footprint,
-        frontier,
-        live_speed,
-        scale,
-        scale_report,
-    )
 
     for file in (out, out / "bench.json", out / "bench.png"):
         check_not_read(file, *sources, codebooks)
@@ -636,7 +633,7 @@ def run_bench(
         _say(f"the best of each family, T queries matched together; next: open {out / 'bench.png'}")
         return
     if what == "train":
-        from dejavu_torch.experiments import train_speed
+        from benchmarks import train as train_speed
 
         if map or codebooks or whitening or places:
             raise InputError(
@@ -696,7 +693,7 @@ def run_export(
         threshold: noted in the file; the map's own if not given
         features: class of the map's features, if not ours
     """
-    from dejavu_torch.experiments.onnx_file import OPSET, export_onnx
+    from dejavu_torch.export import OPSET, export_onnx
 
     if onnx.suffix != ".onnx":
         raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")

@@ -117,7 +117,7 @@ def test_recall_and_bytes_over_the_length_of_a_chunk() -> None:
 
 
 def test_every_contender_that_grows_has_a_style_of_its_own() -> None:
-    from dejavu_torch.experiments.scale_contenders import CONTENDERS
+    from benchmarks.scale_contenders import CONTENDERS
 
     shares = {name: [(1e4, 1.0), (1e5, 0.0)] for name in CONTENDERS}
     figure, axes = plot_growth({"recall@1": shares, "ms": {"dejavu 1 B": [(1e4, 1.0)]}}, ["recall@1"])

@@ -30,6 +30,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from benchmarks import matcher, storage
 from dejavu_torch import cli
 from dejavu_torch.cli import commands, live, train
 from dejavu_torch.cli.parser import parse
@@ -38,10 +39,10 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.camera import Camera
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation import compare, reproduce
+from dejavu_torch.evaluation import evaluate as evaluating
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.matches import read_matches
-from dejavu_torch.experiments import bench, compare, frontier, reproduce
-from dejavu_torch.experiments import evaluate as evaluating
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.maps import file as map_file
@@ -536,7 +537,7 @@ def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
     def too_long(*_: object, **__: object) -> None:
         raise InputError("this would take too long here")
 
-    bench.run_bench = frontier.run_storage = reproduce.reproduce = too_long  # type: ignore[assignment]
+    matcher.run_bench = storage.run_storage = reproduce.reproduce = too_long  # type: ignore[assignment]
     live._stay = lambda url: None  # type: ignore[assignment]  # a page is there until Ctrl-C
     if words[:1] == ["demo"]:
         compare.compare = too_long  # type: ignore[assignment]

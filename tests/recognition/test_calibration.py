@@ -351,7 +351,7 @@ def test_a_threshold_or_a_precision() -> None:
 
 def test_an_export_tells_how_to_get_probabilities(model: DejaVu, tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
-    from dejavu_torch.experiments.onnx_file import export_onnx, run_session, session_of
+    from dejavu_torch.export import export_onnx, run_session, session_of
 
     facts = export_onnx(model, tmp_path / "map.onnx").facts["calibration"]
     queries = torch.cat(list(open_source(AGAIN).batches(64)))[:20]

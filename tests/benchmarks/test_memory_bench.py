@@ -13,8 +13,8 @@ import torch
 from command_line import fails, run
 from helpers import refused
 
-from dejavu_torch.experiments import footprint
-from dejavu_torch.experiments.footprint import (
+from benchmarks import memory as footprint
+from benchmarks.memory import (
     CONTENDERS,
     TOLERANCE,
     Drive,

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from dejavu_torch.experiments.bench import Program, Row, benchmark, in_one_thread
+from benchmarks.matcher import Program, Row, benchmark, in_one_thread
 from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.recognition.select import best_match

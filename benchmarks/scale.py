@@ -19,16 +19,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 import dejavu_torch
-from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
-from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_file, whole_folder
-from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
-from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.score_plots import plot_growth
-from dejavu_torch.experiments.bench import Row, peak_memory, programs
-from dejavu_torch.experiments.footprint import give_back, in_process
-from dejavu_torch.experiments.made import Likeness, MadeRoute, likeness
-from dejavu_torch.experiments.repeating import TiledRoute, tiles_of
-from dejavu_torch.experiments.scale_contenders import (
+from benchmarks.made import Likeness, MadeRoute, likeness
+from benchmarks.matcher import Row, peak_memory, programs
+from benchmarks.memory import give_back, in_process
+from benchmarks.repeating import TiledRoute, tiles_of
+from benchmarks.scale_contenders import (
     CELLS_PER_PROBE,
     CONTENDERS,
     EF_SEARCH,
@@ -45,9 +40,14 @@ from dejavu_torch.experiments.scale_contenders import (
     Found,
     Opened,
 )
-from dejavu_torch.experiments.scale_report import RECALL, ScaleRow, exponents, pictured, with_ratios
-from dejavu_torch.experiments.template_search import PLACES as TEMPLATES
-from dejavu_torch.experiments.template_search import bench_templates
+from benchmarks.scale_report import RECALL, ScaleRow, exponents, pictured, with_ratios
+from benchmarks.template_search import PLACES as TEMPLATES
+from benchmarks.template_search import bench_templates
+from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
+from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_file, whole_folder
+from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.score_plots import plot_growth
 from dejavu_torch.maps import codec, distance
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match

@@ -318,7 +318,7 @@ def _export_case(
 
     def exported() -> Run:
         nonlocal size
-        from dejavu_torch.experiments.onnx_file import export_onnx, run_session, session_of
+        from dejavu_torch.export import export_onnx, run_session, session_of
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "map.onnx"

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-import dejavu_torch
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
@@ -37,6 +36,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.version import __version__
 
 RANKS = (5, 10)  # among so many candidates a right place is looked for
 
@@ -151,7 +151,7 @@ def evaluation_facts(
         "tolerance": tolerance,
         "unit": unit_of(positions),
         "recall_definition": RECALL_DEFINITION,
-        "version": dejavu_torch.__version__,
+        "version": __version__,
         "torch": torch.__version__,
     }
     if truth is not None:

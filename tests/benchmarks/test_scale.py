@@ -17,14 +17,11 @@ from command_line import fails, run
 from helpers import all_of, refused
 from torch import Tensor
 
-from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
-from dejavu_torch.evaluation.baselines import as_int8, interpolated
-from dejavu_torch.experiments import scale, scale_contenders
-from dejavu_torch.experiments.made import BLOCK, Likeness, MadeRoute, likeness
-from dejavu_torch.experiments.repeating import TiledRoute, step_that_holds, tiles_of
-from dejavu_torch.experiments.scale import Task, spread
-from dejavu_torch.experiments.scale_contenders import (
+from benchmarks import scale, scale_contenders
+from benchmarks.made import BLOCK, Likeness, MadeRoute, likeness
+from benchmarks.repeating import TiledRoute, step_that_holds, tiles_of
+from benchmarks.scale import Task, spread
+from benchmarks.scale_contenders import (
     CONTENDERS,
     FLOWN,
     ONE_CHUNK,
@@ -34,7 +31,10 @@ from dejavu_torch.experiments.scale_contenders import (
     Interpolated,
     Mapped,
 )
-from dejavu_torch.experiments.scale_report import ScaleRow, exponents, scale_tables
+from benchmarks.scale_report import ScaleRow, exponents, scale_tables
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
+from dejavu_torch.evaluation.baselines import as_int8, interpolated
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu

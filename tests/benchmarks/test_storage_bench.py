@@ -13,13 +13,10 @@ from command_line import fails, run
 from helpers import refused
 from torch import Tensor
 
-from dejavu_torch import DejaVu
-from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.quantisers import Kept
-from dejavu_torch.evaluation.score_plots import plot_frontiers
-from dejavu_torch.experiments import frontier
-from dejavu_torch.experiments.bench import MEMORY
-from dejavu_torch.experiments.frontier import (
+from benchmarks import storage as frontier
+from benchmarks.matcher import MEMORY
+from benchmarks.quantisers import Kept
+from benchmarks.storage import (
     Contender,
     Point,
     Row,
@@ -35,6 +32,9 @@ from dejavu_torch.experiments.frontier import (
     storage_tables,
     whitenings,
 )
+from dejavu_torch import DejaVu
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.recognition.localizer import Matching
 

@@ -18,9 +18,9 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
+from dejavu_torch.evaluation.evaluate import Evaluation, evaluate_file
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.evaluation.report import score_table, text_table, write_report
-from dejavu_torch.experiments.evaluate import Evaluation, evaluate_file
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.types import Match
 

@@ -9,8 +9,8 @@ import pytest
 from command_line import run
 from helpers import refused
 
-from dejavu_torch.experiments import live_speed
-from dejavu_torch.experiments.live_speed import LiveRow, bench_live, live_table
+from benchmarks import live as live_speed
+from benchmarks.live import LiveRow, bench_live, live_table
 
 SMALL = {"places": 400, "frames": 40, "sizes": ((48, 64), (32, 48)), "camera": (96, 128), "numbers": 12}
 

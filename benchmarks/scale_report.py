@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.scale_contenders import GIVEN, OURS
 from dejavu_torch.data.simulate.aerial import LONGEST
-from dejavu_torch.experiments.scale_contenders import GIVEN, OURS
 
 FITTED = 3  # sizes at least
 RECALL = "recall@1"  # the panel of it

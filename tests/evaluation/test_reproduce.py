@@ -18,17 +18,17 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.data.simulate.train import Railway
 from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.report import Report
-from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.paper_tables import (
+from dejavu_torch.evaluation.paper_tables import (
     PUBLISHED,
     Published,
     boundary_lines,
     route_lines,
     section_five,
 )
-from dejavu_torch.experiments.reproduce import (
+from dejavu_torch.evaluation.report import Report
+from dejavu_torch.evaluation.reproduce import (
     BoundaryEffect,
     GivenChunks,
     boundary_effect,
@@ -65,7 +65,7 @@ def test_the_paper_s_settings_are_the_default(monkeypatch: pytest.MonkeyPatch) -
         pass
 
     asked = create_autospec(compare, side_effect=Asked)
-    monkeypatch.setattr("dejavu_torch.experiments.reproduce.compare", asked)
+    monkeypatch.setattr("dejavu_torch.evaluation.reproduce.compare", asked)
     for dataset in PUBLISHED:
         with pytest.raises(Asked):
             reproduce(dataset)
@@ -175,7 +175,7 @@ def test_the_command_writes_an_index_over_the_reports(
     aerial: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short = create_autospec(reproduce, return_value=aerial)
-    monkeypatch.setattr("dejavu_torch.experiments.reproduce.reproduce", short)
+    monkeypatch.setattr("dejavu_torch.evaluation.reproduce.reproduce", short)
     main(["reproduce", "aerial", "--out", str(tmp_path / "out")])
     assert short.call_args.args == ("aerial",)
     assert "aerial: the paper, its own footage" in capsys.readouterr().out

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.matcher import Row, write_bench
 from dejavu_torch.cluster import Cluster, code_on
 from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.simulate.aerial import AerialRoad
-from dejavu_torch.experiments.bench import Row, write_bench
 from dejavu_torch.learning import ChunkCoder, encode_local
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap

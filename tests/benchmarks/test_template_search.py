@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import refused
 
-from dejavu_torch.experiments.template_search import OURS, SCAN, bench_templates, random_map
+from benchmarks.template_search import OURS, SCAN, bench_templates, random_map
 
 
 def test_times_both_ways_to_the_same_places() -> None:

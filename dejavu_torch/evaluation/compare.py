@@ -25,13 +25,13 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqslam_baseline
 from dejavu_torch.evaluation.contenders import Contender, contend, lengths_beside
+from dejavu_torch.evaluation.evaluate import RANKS, candidate_facts, evaluation_facts
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.score_plots import Stored
-from dejavu_torch.experiments.evaluate import RANKS, candidate_facts, evaluation_facts
-from dejavu_torch.experiments.storage import noise_over_map, storage_curve
+from dejavu_torch.evaluation.storage import noise_over_map, storage_curve
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views

@@ -8,8 +8,7 @@ from helpers import refused
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, keyframes
-from dejavu_torch.evaluation.quantisers import (
+from benchmarks.quantisers import (
     Kept,
     ProductQuantiser,
     every_kth,
@@ -17,6 +16,7 @@ from dejavu_torch.evaluation.quantisers import (
     signs,
     spectral,
 )
+from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, keyframes
 
 
 def route(places: int = 300, numbers: int = 12, seed: int = 0) -> Tensor:

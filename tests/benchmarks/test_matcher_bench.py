@@ -13,10 +13,8 @@ import torch
 from helpers import refused
 from matplotlib.figure import Figure
 
-from dejavu_torch.evaluation.report import text_table
-from dejavu_torch.evaluation.score_plots import plot_ratios
-from dejavu_torch.experiments import bench
-from dejavu_torch.experiments.bench import (
+from benchmarks import matcher as bench
+from benchmarks.matcher import (
     Program,
     Row,
     Run,
@@ -26,6 +24,8 @@ from dejavu_torch.experiments.bench import (
     run_bench,
     write_bench,
 )
+from dejavu_torch.evaluation.report import text_table
+from dejavu_torch.evaluation.score_plots import plot_ratios
 
 
 def small(**options: object) -> list[Row]:
@@ -181,7 +181,7 @@ def test_peak_memory_sees_what_is_freed_again() -> None:
 
     # in a process of its own, where nothing else is freed meanwhile
     code = (
-        "import time, torch; from dejavu_torch.experiments.bench import peak_memory\n"
+        "import time, torch; from benchmarks.matcher import peak_memory\n"
         "def run():\n"
         "    large = torch.ones(16, 2**20)\n"  # 64 MiB
         "    time.sleep(0.1)\n"

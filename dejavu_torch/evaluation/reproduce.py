@@ -11,15 +11,15 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.compare import Comparison, compare, of_shown_frames
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.paper_tables import PUBLISHED
 from dejavu_torch.evaluation.pictures import paper_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import Length, plot_lengths
-from dejavu_torch.experiments.compare import Comparison, compare, of_shown_frames
-from dejavu_torch.experiments.paper_tables import PUBLISHED
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry

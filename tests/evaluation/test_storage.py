@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, SequenceMatcher
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.experiments.compare import Comparison, compare
-from dejavu_torch.experiments.storage import noise_over_map, storage_curve
+from dejavu_torch.evaluation.compare import Comparison, compare
+from dejavu_torch.evaluation.storage import noise_over_map, storage_curve
 from dejavu_torch.maps.spectral import SpectralMapper
 
 PLACES, NUMBERS = 400, 16

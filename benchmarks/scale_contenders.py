@@ -13,8 +13,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from benchmarks.repeating import step_that_holds
 from dejavu_torch.data.frame_range import IndexedTraverse
-from dejavu_torch.experiments.repeating import step_that_holds
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 

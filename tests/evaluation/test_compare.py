@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu, InputError, SequenceMatcher, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.experiments.compare import compare
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -370,7 +370,7 @@ def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.Monk
     monkeypatch.setattr(SpectralMap, "score_blocks", counting(SpectralMap.score_blocks, 1))
     stores = "dejavu_torch.evaluation.baselines.phase_distances"
     monkeypatch.setattr(stores, counting(phase_distances, 0))
-    monkeypatch.setattr("dejavu_torch.experiments.compare.draw_pictures", lambda *_: {})
+    monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     totals = []
     for sequence in (None, SequenceMatcher(21), PlaceFilter()):
         asked.clear()

@@ -10,9 +10,9 @@ import pytest
 from command_line import run
 from helpers import refused
 
+from benchmarks import train as train_speed
+from benchmarks.train import Rung, TrainRow, bench_train, ladder, train_table
 from dejavu_torch import open_source
-from dejavu_torch.experiments import train_speed
-from dejavu_torch.experiments.train_speed import Rung, TrainRow, bench_train, ladder, train_table
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 

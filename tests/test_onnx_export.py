@@ -28,8 +28,8 @@ from dejavu_torch import (
     Whitening,
     open_source,
 )
-from dejavu_torch.experiments import onnx_file
-from dejavu_torch.experiments.onnx_file import METADATA, OPSET, export_onnx, run_session, session_of
+from dejavu_torch import export as onnx_file
+from dejavu_torch.export import METADATA, OPSET, export_onnx, run_session, session_of
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.types import FrequencyLayer, SequenceModel
 

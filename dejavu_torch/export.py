@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import dejavu_torch
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.features.extract import in_mode
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -29,6 +28,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGI
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.version import __version__
 
 OPSET = 18
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
@@ -238,7 +238,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
     """The metadata; dimensions that are free have a name."""
     shape, places = list(model.frame_shape or ()), model.map.places
     name, taken = ("frames", [*shape[:1], "height", "width"]) if len(shape) == 3 else ("features", shape)
-    facts: dict[str, Any] = {"version": dejavu_torch.__version__, "opset": OPSET, "places": places}
+    facts: dict[str, Any] = {"version": __version__, "opset": OPSET, "places": places}
     facts |= {
         "frame_shape": shape,
         "inputs": {name: ["batch", *taken]},
@@ -328,7 +328,7 @@ def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
         node.metadata_props.clear()
     model.metadata_props.clear()
     model.metadata_props[METADATA] = json.dumps(facts)
-    model.producer_name, model.producer_version = METADATA, dejavu_torch.__version__
+    model.producer_name, model.producer_version = METADATA, __version__
     written: bytes = ir.to_proto(model).SerializeToString()
     return written
 

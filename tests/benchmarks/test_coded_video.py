@@ -7,9 +7,9 @@ import pytest
 import torch
 from helpers import all_of, refused
 
+from benchmarks.coded_video import CodedVideo
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.evaluation.coded_video import CodedVideo
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libx265"])

@@ -1,1 +1,0 @@
-"""Whole runs made of the rooms before this one."""
