@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import NoReturn
 
@@ -21,7 +22,6 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "evaluate": "evaluate the matches in a csv, whatever found them",
     "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
     "train": "train features that repeat: fit, validate, test or export",
-    "bench": "speed, trainings, memory, or accuracy over bytes, beside what a user would pick instead",
     "merge": "join the maps of several routes",
     "export": "write a map, and what is ahead of it, as an ONNX file",
     "info": "what is in a map",
@@ -30,8 +30,16 @@ BARE = {"--velocity": "GroundOdometry", "--page": "8765"}  # what an option with
 LONGEST = 300  # characters of a message of torch's
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the `dejavu` command.
+BENCHES = "in a clone of the repository, with pip install '.[bench]'"  # where the benchmarks are
+
+
+def main(
+    arguments: Sequence[str] | None = None, program: Callable[[Sequence[str]], None] | None = None
+) -> None:
+    """Entry point of the `dejavu` command, and of `python -m benchmarks`, whose errors are one line as well.
+
+    Args:
+        program: what runs a command line, if not the commands of `dejavu`.
 
     Environment: OMP_NUM_THREADS, how many threads torch computes with. Unless OMP_WAIT_POLICY says otherwise
         they sleep while they wait for each other: spinning, which is the default of most builds, takes the
@@ -41,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         process.take_over()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
     try:
-        run(sys.argv[1:] if arguments is None else arguments)
+        run(sys.argv[1:] if arguments is None else arguments, program or run_command)
     except SystemExit as error:
         if not error.code:
             _check_output()
@@ -53,10 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         process.let_go()
 
 
-def run(given: Sequence[str]) -> None:
+def run(given: Sequence[str], program: Callable[[Sequence[str]], None]) -> None:
     """Run a command line; what it gets wrong is one line on stderr and exit status 2."""
     try:
-        _run(given)
+        program(given)
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
         shortage = _shortage(error)
         if shortage is None:
@@ -65,9 +73,9 @@ def run(given: Sequence[str]) -> None:
     _check_output()
 
 
-def _run(given: Sequence[str]) -> None:
-    if not given or given[0] not in COMMANDS:
-        overview(given[0] if given else "--help")
+@contextmanager
+def errors_of_one_line(given: Sequence[str]) -> Iterator[None]:
+    """In the block, which imports torch, errors in the command line or its files end the command."""
     _log_to_stderr()
     try:
         here = os.getcwd()
@@ -75,14 +83,29 @@ def _run(given: Sequence[str]) -> None:
         fail("the current folder does not exist any more; expected one that does")
     if here not in sys.path:
         sys.path.append(here)  # a user's own classes, as `python -m` finds them
-    from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
-    from dejavu_torch.cli.parser import COMMAND, UsageError, parse
-    from dejavu_torch.cli.presets import with_configs
+    from dejavu_torch.cli.parser import UsageError
     from dejavu_torch.data.output import remove_temporaries
     from dejavu_torch.types import InputError
 
     process.cleanup[:] = [remove_temporaries]
     try:
+        yield
+    except UsageError as error:
+        config = [value for name, value in pairwise(given) if name == "--config"]
+        fail(f"{error} (with --config {' --config '.join(config)})" if config else f"{error} (see --help)")
+    except (InputError, OSError) as error:
+        fail(str(error))
+
+
+def run_command(given: Sequence[str]) -> None:
+    """Run a command of `dejavu`."""
+    if not given or given[0] not in COMMANDS:
+        overview(given[0] if given else "--help")
+    with errors_of_one_line(given):
+        from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
+        from dejavu_torch.cli.parser import COMMAND, parse
+        from dejavu_torch.cli.presets import with_configs
+
         name, words = given[0], with_configs(given[1:])
         if name == "train":  # Lightning's own command line
             from dejavu_torch.cli.train import run_train
@@ -96,11 +119,6 @@ def _run(given: Sequence[str]) -> None:
 
             chosen[COMMAND] = shlex.join(["dejavu", *given])
         function(**chosen)
-    except UsageError as error:
-        config = [value for name, value in pairwise(given) if name == "--config"]
-        fail(f"{error} (with --config {' --config '.join(config)})" if config else f"{error} (see --help)")
-    except (InputError, OSError) as error:
-        fail(str(error))
 
 
 def _log_to_stderr() -> None:
@@ -146,6 +164,8 @@ def overview(word: str) -> NoReturn:
         for name, text in COMMANDS.items():
             print(f"  {name:<10}  {text}")
         print("\n`dejavu COMMAND --help` shows its options, `dejavu --version` the version.")
+    elif word == "bench":
+        fail(f"the benchmarks are not part of the package; expected `python -m benchmarks` {BENCHES}")
     else:
         fail(f"{word!r} is no command; expected one of {', '.join(COMMANDS)} (see --help)")
     raise SystemExit(0)

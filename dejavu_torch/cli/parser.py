@@ -232,8 +232,8 @@ def _wanted(types: str) -> str:
     return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
 
 
-def command_parser(name: str, function: Callable[..., None]) -> Parser:
-    """The parser of one command, made from its function.
+def command_parser(name: str, function: Callable[..., None], program: str = "dejavu") -> Parser:
+    """The parser of one command of a program, made from its function.
 
     Args:
         function: its positional parameters are positional arguments, optional ones where they have a default,
@@ -242,7 +242,7 @@ def command_parser(name: str, function: Callable[..., None]) -> Parser:
     """
     text = docstring_parser.parse(inspect.getdoc(function) or "")
     helps = {one.arg_name: one.description for one in text.params}
-    parser = Parser(prog=f"dejavu {name}", description=text.description)
+    parser = Parser(prog=f"{program} {name}", description=text.description)
     for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if key == COMMAND:
             continue
