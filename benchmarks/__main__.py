@@ -42,7 +42,7 @@ def run_storage(
 
     Args:
         sources: pairs REFERENCE QUERY; the built-in routes if not given
-        out: as of matcher
+        out: folder for bench.json and bench.png
         map: a map of the REFERENCE to set beside the others
         codebooks: another route, where codebooks and a whitening are learned that count nothing
         whitening: a map whose whitening describes all routes; each learns its own if not given
@@ -65,7 +65,7 @@ def run_train(
 
     Args:
         sources: REFERENCE QUERY; the built-in road if not given
-        out: as of matcher
+        out: folder for bench.json and bench.png
         steps: those of each training; 600 if not given
         seeds: a training each; 0, 1 and 2 if not given
     """
@@ -83,7 +83,7 @@ def run_live(*, out: Path) -> None:
     """Time of single frames of a video on a map of 100000 places.
 
     Args:
-        out: as of matcher
+        out: folder for bench.json and bench.png
     """
     print(text_table(live.live_table(live.run_live(out))))
     close(out, "100000 places; found: within 5; from decoding on: milliseconds of each part by itself")
@@ -93,7 +93,7 @@ def run_memory(*, out: Path, places: Sequence[int] = ()) -> None:
     """Memory of learning a route and of localizing on it.
 
     Args:
-        out: as of matcher
+        out: folder for bench.json and bench.png
         places: frames that are learned; 1000, 10000 and 50000 if not given
     """
     print(text_table(memory.memory_table(memory.run_memory(out, places))))
@@ -104,7 +104,7 @@ def run_scale(*, out: Path, places: Sequence[int] = (), device: str = "cpu") -> 
     """Time, memory, bytes and accuracy over the number of places, beside the indexes of faiss.
 
     Args:
-        out: as of matcher
+        out: folder for bench.json and bench.png
         places: 10000, 100000 and 1000000 if not given
         device: what localizes: as of `dejavu localize`
     """
@@ -118,10 +118,10 @@ def run_cluster(*, out: Path) -> None:
     """Time of the workers of a cluster, beside one process.
 
     Args:
-        out: as of matcher
+        out: folder for bench.json and bench.png
     """
     print(text_table(cluster.cluster_table(cluster.run_cluster(out))))
-    close(out, "other chunks: share that differ from those of one process; processor seconds of all processes")
+    close(out, "other chunks: share unlike those of one process; processor seconds of all processes")
 
 
 BENCHES: dict[str, Any] = {

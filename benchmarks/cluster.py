@@ -1,4 +1,4 @@
-"""How fast workers of a cluster make the chunks of a route, beside one process: `dejavu bench cluster`."""
+"""How fast workers of a cluster make the chunks of a route, beside one process: `benchmarks cluster`."""
 
 from __future__ import annotations
 

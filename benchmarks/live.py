@@ -1,4 +1,4 @@
-"""How fast frames of a video are found one by one on a long map: `dejavu bench live`."""
+"""How fast frames of a video are found one by one on a long map: `benchmarks live`."""
 
 from __future__ import annotations
 

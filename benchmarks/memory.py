@@ -1,4 +1,4 @@
-"""Memory of learning a route and of finding places on it, as `dejavu bench memory` measures it."""
+"""Memory of learning a route and of finding places on it, as `benchmarks memory` measures it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How maps grow with the route, beside the indexes of faiss on the same descriptors: `dejavu bench scale`."""
+"""How maps grow with the route, beside the indexes of faiss on the same descriptors: `benchmarks scale`."""
 
 from __future__ import annotations
 

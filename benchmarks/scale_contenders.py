@@ -1,4 +1,4 @@
-"""What stands side by side in `dejavu bench scale`: ways to keep descriptors, and to find the nearest."""
+"""What stands side by side in `benchmarks scale`: ways to keep descriptors, and to find the nearest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `dejavu bench scale` reports: rows, how they grow with the number of places, tables and pictures."""
+"""What `benchmarks scale` reports: rows, how they grow with the number of places, tables and pictures."""
 
 from __future__ import annotations
 

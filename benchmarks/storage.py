@@ -1,4 +1,4 @@
-"""Accuracy over bytes: the map beside what else would keep the same descriptors (`dejavu bench storage`)."""
+"""Accuracy over bytes: the map beside what else would keep the same descriptors."""
 
 from __future__ import annotations
 

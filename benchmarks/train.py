@@ -1,4 +1,4 @@
-"""How fast a descriptor is trained, and what it is then worth: `dejavu bench train`."""
+"""How fast a descriptor is trained, and what it is then worth: `benchmarks train`."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.__main__ import run as run_benchmark
 from dejavu_torch.cli import main
 
 TEMPLATES = ("--config", "local_maxima")  # the defaults are a spectral map
@@ -19,10 +21,19 @@ def run(*arguments: str | Path) -> None:
     main([str(argument) for argument in arguments])
 
 
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+def benchmark(*arguments: str | Path) -> None:
+    main([str(argument) for argument in arguments], run_benchmark)
+
+
+def benchmark_fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Run a benchmark that must fail; its one line on stderr."""
+    return fails(capsys, *arguments, call=benchmark)
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path, call: Callable[..., None] = run) -> str:
     """Run a command that must fail; its one line on stderr."""
     with pytest.raises(SystemExit) as stop:
-        run(*arguments)
+        call(*arguments)
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert error.startswith("dejavu: ")

@@ -499,7 +499,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "evaluate a.csv --truth 0 --out r --tolerance some": ("--tolerance is some", "integer"),
     "live m a.npy --page many": ("--page is many", "integer"),
     "merge m.safetensors --map n.safetensors": ("m.safetensors", "at least two maps"),
-    "bench scale --out r --places few": ("--places is few", "integer"),
+    "bench scale --out r --places 8": ("python -m benchmarks", "clone"),
     "train": ("fit, validate, test",),
     "train fit --data.source a.npy --model.lr fast": ("--model.lr is fast", "a number"),
     "train fit --data.source a.npy --trainer.accelerator abacus": ("--trainer.accelerator abacus", "cpu"),
@@ -707,7 +707,6 @@ def test_a_map_has_its_ending(bad: str, tmp_path: Path, capsys: pytest.CaptureFi
         "compare sim:aerial?frames=64 sim:aerial?frames=48 --truth maybe",
         "compare sim:aerial?frames=1 sim:aerial?frames=1&traverse=1",
         "evaluate nowhere.csv --truth 0",
-        "bench dance",
         "reproduce mars",
     ],
 )

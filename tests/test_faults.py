@@ -206,7 +206,7 @@ def test_an_interrupt_that_was_turned_into_another_exception_is_one() -> None:
         "    with cli.process.interrupts_raise():\n"
         "        try: signal.raise_signal(2)\n"
         "        except KeyboardInterrupt: raise RuntimeError('of an extension')\n"
-        "cli.run = run; cli.main()"
+        "cli.main(program=run)"
     )
     assert python(code) == (130, "", "dejavu: interrupted\n")
 
@@ -339,7 +339,6 @@ def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(
         "compare a.npy b.npy --truth report/matches.csv --out report",
         "compare a.npy b.npy --second images --out images",
         "evaluate m.csv --truth 0 --reference strip:report/pr.png?width=8 --out report",
-        "bench storage a.npy images --out images",
         "demo --second images --out images",
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.__main__ import BENCHES
 from dejavu_torch import DejaVu, ImposedPeriods, PlaceFilter, TemplateMapper
 from dejavu_torch.cli import _spelt_out, commands, train
 from dejavu_torch.cli.parser import UsageError, command_parser, without_whitening_map
@@ -82,6 +83,9 @@ class Understood(Exception):
     """A command line of `dejavu train` has been parsed."""
 
 
+PROGRAMS = "dejavu|python -m benchmarks"
+
+
 class ParseOnly(train.TrainCLI):
     """Reads a command line, and neither seeds, instantiates nor runs anything."""
 
@@ -91,20 +95,21 @@ class ParseOnly(train.TrainCLI):
 
 
 @cache
-def parser_of(name: str) -> Any:
+def parser_of(program: str, name: str) -> Any:
     """The parser of a command, which takes as long to make as to read a line with."""
-    return command_parser(name, getattr(commands, f"run_{name}"))
+    return command_parser(name, getattr(commands, f"run_{name}") if program == "dejavu" else BENCHES[name])
 
 
 def understand(line: str) -> None:
     """Parse a command as it is shown, without running it."""
-    _, name, *words = shlex.split(line, comments=True)
+    program, line = re.match(f"({PROGRAMS}) (.*)", line, re.DOTALL).groups()
+    name, *words = shlex.split(line, comments=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)  # where the configs lie
         words = _spelt_out(with_configs(words))
-        if name != "train":
-            words, _ = without_whitening_map(words)
-            parser_of(name).parse_args(words)
+        if program != "dejavu" or name != "train":
+            words, _ = without_whitening_map(words) if program == "dejavu" else (words, None)
+            parser_of(program, name).parse_args(words)
             return
         patch.setattr(train, "TrainCLI", ParseOnly)
         with pytest.raises(Understood):
@@ -121,9 +126,9 @@ def understand(line: str) -> None:
 )
 def test_every_command_shown_is_understood(text: str) -> None:
     setting = r"(?:[A-Z_]+=\S+ )*"  # of the environment
-    shown = re.findall(rf"^{setting}(dejavu .*)$", text.replace("\\\n", " "), re.MULTILINE)
-    inline = re.findall(rf"`{setting}(dejavu [^`]+)`", text)
-    shown += [line for line in inline if " -" in line and "--help" not in line]
+    shown = re.findall(rf"^{setting}((?:{PROGRAMS}) .*)$", text.replace("\\\n", " "), re.MULTILINE)
+    inline = re.findall(rf"`{setting}((?:{PROGRAMS}) [^`]+)`", text)
+    shown += [line for line in inline if " -" in line.removeprefix("python -m") and "--help" not in line]
     assert len(shown) >= 2
     for line in dict.fromkeys(shown):
         understand(line)

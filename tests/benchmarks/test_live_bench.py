@@ -1,4 +1,4 @@
-"""`dejavu bench live`, on a short route."""
+"""`python -m benchmarks live`, on a short route."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import benchmark
 from helpers import refused
 
 from benchmarks import live as live_speed
@@ -35,7 +35,7 @@ def test_the_command_writes_them(
     rows: list[LiveRow], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(live_speed, "bench_live", lambda *_, **__: rows)
-    run("bench", "live", "--out", tmp_path / "bench")
+    benchmark("live", "--out", tmp_path / "bench")
     assert "p99 ms" in capsys.readouterr().out
     written = json.loads((tmp_path / "bench" / "bench.json").read_text())["rows"]
     assert [row["contender"] for row in written] == ["dejavu", "dejavu"]

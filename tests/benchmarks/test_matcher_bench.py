@@ -1,4 +1,4 @@
-"""`dejavu bench`: the contenders, what is compared, and what is written."""
+"""`python -m benchmarks`: the contenders, what is compared, and what is written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dejavu bench memory`: what is measured, in processes of their own, and what is written."""
+"""`python -m benchmarks memory`: what is measured, in processes of their own, and what is written."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command_line import fails, run
+from command_line import benchmark, benchmark_fails
 from helpers import refused
 
 from benchmarks import memory as footprint
@@ -78,7 +78,7 @@ def test_every_contender_learns_each_size_and_localizes_on_the_middle_one(stub: 
 
 
 def test_what_fails_is_a_row_and_the_others_go_on(stub: Stub, tmp_path: Path) -> None:
-    run("bench", "memory", "--places", "64", "--out", tmp_path)
+    benchmark("memory", "--places", "64", "--out", tmp_path)
     written = json.loads((tmp_path / "bench.json").read_text())["rows"]
     rows = {(row["case"], row["contender"]): row for row in written}
     assert rows["learn 64 frames", "dejavu templates"]["skipped"] == "ended by signal 9"
@@ -91,13 +91,13 @@ def test_what_fails_is_a_row_and_the_others_go_on(stub: Stub, tmp_path: Path) ->
 def test_bad_sizes_are_refused_ahead_of_the_work(
     stub: Stub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = fails(capsys, "bench", "memory", "--places", "7", "--out", tmp_path / "out")
+    error = benchmark_fails(capsys, "memory", "--places", "7", "--out", tmp_path / "out")
     assert "7" in error
     assert "64" in error
     with refused("1 query"):
         list(bench_memory([64], queries=[0]))
-    error = fails(capsys, "bench", "memory", "sim:aerial", "--out", tmp_path / "out")
-    assert "takes no sources" in error
+    error = benchmark_fails(capsys, "memory", "sim:aerial", "--out", tmp_path / "out")
+    assert "unrecognized" in error
     assert stub.tasks == list(tmp_path.iterdir()) == []
 
 

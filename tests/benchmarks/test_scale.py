@@ -1,4 +1,4 @@
-"""`dejavu bench scale`: what is made and kept, what is measured of it, and what is written."""
+"""`python -m benchmarks scale`: what is made and kept, what is measured of it, and what is written."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from command_line import fails, run
+from command_line import benchmark, benchmark_fails
 from helpers import all_of, refused
 from torch import Tensor
 
@@ -199,7 +199,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rows_of_all_cases_are_written(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run("bench", "scale", "--places", "600", "900", "--out", tmp_path)
+    benchmark("scale", "--places", "600", "900", "--out", tmp_path)
     written = json.loads((tmp_path / "bench.json").read_text())
     rows = {(row["case"], row["contender"]): row for row in written["rows"]}
     cases = [
@@ -277,13 +277,13 @@ def test_a_process_learns_and_another_localizes(tmp_path: Path) -> None:
 def test_bad_sizes_are_refused_ahead_of_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for given, word in (
         (("--places", "7"), "500"),
-        (("sim:aerial",), "takes no sources"),
+        (("sim:aerial",), "unrecognized"),
         (("--device", "tpu"), "tpu"),
     ):
-        error = fails(capsys, "bench", "scale", *given, "--out", tmp_path / "out")
+        error = benchmark_fails(capsys, "scale", *given, "--out", tmp_path / "out")
         assert word in error
-    error = fails(capsys, "bench", "memory", "--device", "cuda", "--out", tmp_path / "out")
-    assert "takes no device" in error
+    error = benchmark_fails(capsys, "memory", "--device", "cuda", "--out", tmp_path / "out")
+    assert "unrecognized" in error
     assert not list(tmp_path.iterdir())
 
 

@@ -1,4 +1,4 @@
-"""`dejavu bench storage`: which contenders, what is scored, what is written, and what is refused."""
+"""`python -m benchmarks storage`: which contenders, what is scored, what is written, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import fails, run
+from command_line import benchmark, benchmark_fails, run
 from helpers import refused
 from torch import Tensor
 
@@ -161,16 +161,15 @@ def test_a_whitening_that_is_given_describes_all(
         whitened.append(route.places)
         return Kept(route.places, len(route.places))
 
-    run("bench", "storage", *pair, "--whitening", tmp_path / "map.safetensors", "--out", tmp_path / "out")
+    benchmark("storage", *pair, "--whitening", tmp_path / "map.safetensors", "--out", tmp_path / "out")
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert torch.equal(whitened[0], model.whitened(series(0)))
     written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
     assert [row["family"] for row in written] == ["frames", "the paper"]
     raw = DejaVu(whitening="none").learn(series(0))
     raw.save(tmp_path / "raw.safetensors")
-    error = fails(
+    error = benchmark_fails(
         capsys,
-        "bench",
         "storage",
         *pair,
         "--whitening",
@@ -316,7 +315,7 @@ def test_a_map_that_is_given_is_set_beside(
     for name in ("SPACED", "BETWEEN", "COMPONENTS", "CODE_BYTES", "BIT_SPACED", "QUALITIES"):
         monkeypatch.setattr(frontier, name, ())
     monkeypatch.setattr(frontier, "BUDGETS", few)
-    run("bench", "storage", *pair, "--map", tmp_path / "map.safetensors", "--out", tmp_path / "out")
+    benchmark("storage", *pair, "--map", tmp_path / "map.safetensors", "--out", tmp_path / "out")
     written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
     found = {row["contender"]: row for row in written}
     given, ours = found["dejavu, the map that was given"], found["dejavu 5"]
@@ -325,7 +324,7 @@ def test_a_map_that_is_given_is_set_beside(
     assert "null" in capsys.readouterr().out
     np.save(tmp_path / "short.npy", series(0)[:200].numpy())
     words = (tmp_path / "short.npy", tmp_path / "short.npy", "--map", tmp_path / "map.safetensors")
-    assert "300 places" in fails(capsys, "bench", "storage", *words, "--out", tmp_path / "out")
+    assert "300 places" in benchmark_fails(capsys, "storage", *words, "--out", tmp_path / "out")
 
 
 def test_built_in_routes() -> None:
@@ -377,7 +376,7 @@ def test_what_is_refused(
         "OF_NARROW": str(tmp_path / "narrow.safetensors"),
     }
     chosen = [known.get(word, word) for word in words]
-    error = fails(capsys, "bench", "storage", *chosen, "--out", tmp_path / "out")
+    error = benchmark_fails(capsys, "storage", *chosen, "--out", tmp_path / "out")
     assert [word for word in named if word not in error] == [], error
     assert not (tmp_path / "out").exists()
 
@@ -389,8 +388,8 @@ def test_pairs_of_other_lengths_that_know_their_places(monkeypatch: pytest.Monke
 
 
 def test_the_matcher_takes_no_sources(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = fails(capsys, "bench", "matcher", "sim:aerial", "--out", tmp_path / "out")
-    assert "storage" in error
+    error = benchmark_fails(capsys, "matcher", "sim:aerial", "--out", tmp_path / "out")
+    assert "unrecognized" in error
 
 
 def test_a_map_is_of_one_route() -> None:

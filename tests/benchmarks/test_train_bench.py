@@ -1,4 +1,4 @@
-"""`dejavu bench train`, a few steps of a small network."""
+"""`python -m benchmarks train`, a few steps of a small network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import benchmark
 from helpers import refused
 
 from benchmarks import train as train_speed
@@ -69,7 +69,7 @@ def test_the_command_writes_them(
     rows: list[TrainRow], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(train_speed, "bench_train", lambda *_, **__: rows)
-    run("bench", "train", ROUTE, AGAIN, "--out", tmp_path / "bench", "--steps", "3", "--seeds", "0", "1")
+    benchmark("train", ROUTE, AGAIN, "--out", tmp_path / "bench", "--steps", "3", "--seeds", "0", "1")
     assert "AUC at 1 B" in capsys.readouterr().out
     written = json.loads((tmp_path / "bench" / "bench.json").read_text())["rows"]
     assert [row["seed"] for row in written] == [0, 1, 0, 1]

@@ -30,7 +30,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks import matcher, storage
 from dejavu_torch import cli
 from dejavu_torch.cli import commands, live, train
 from dejavu_torch.cli.parser import parse
@@ -455,8 +454,6 @@ evaluate in/matches.csv --truth in/truth.npz --out out/s --map in/spectral.safet
 evaluate in/matches.csv --truth 2 --tolerance 3 --out out/s --reference in/frames.npy
 demo --out out/demo --seed 2
 reproduce aerial --out out/paper --tolerance 4
-bench storage in/frames.npy in/query.npy --out out/bench --places 100
-bench matcher --out out/bench
 --help
 --version
 learn --help
@@ -537,7 +534,7 @@ def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
     def too_long(*_: object, **__: object) -> None:
         raise InputError("this would take too long here")
 
-    matcher.run_bench = storage.run_storage = reproduce.reproduce = too_long  # type: ignore[assignment]
+    reproduce.reproduce = too_long  # type: ignore[assignment]
     live._stay = lambda url: None  # type: ignore[assignment]  # a page is there until Ctrl-C
     if words[:1] == ["demo"]:
         compare.compare = too_long  # type: ignore[assignment]
