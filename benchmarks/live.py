@@ -16,10 +16,10 @@ from torch.nn.functional import interpolate
 from tqdm import tqdm
 
 import dejavu_torch
+from benchmarks.plots import plot_ratios
 from dejavu_torch.data.camera import shots_of
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.video import Video
-from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer

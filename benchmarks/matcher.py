@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 import dejavu_torch
+from benchmarks.plots import plot_ratios
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.evaluation.plots import Plot
-from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.hog import HOG, hog
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.distance import l1_backend, phase_distances

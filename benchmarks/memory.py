@@ -26,10 +26,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.matcher import MEMORY, Row, bars, peak_memory, resident, write_bench
+from benchmarks.plots import plot_ratios
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
-from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.spectral import SpectralMapper

@@ -22,6 +22,7 @@ import dejavu_torch
 from benchmarks.made import Likeness, MadeRoute, likeness
 from benchmarks.matcher import Row, peak_memory, programs
 from benchmarks.memory import give_back, in_process
+from benchmarks.plots import plot_growth
 from benchmarks.repeating import TiledRoute, tiles_of
 from benchmarks.scale_contenders import (
     CELLS_PER_PROBE,
@@ -47,7 +48,6 @@ from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
 from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_file, whole_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.score_plots import plot_growth
 from dejavu_torch.maps import codec, distance
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match

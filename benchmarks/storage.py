@@ -17,6 +17,7 @@ from tqdm import tqdm
 import dejavu_torch
 from benchmarks.coded_video import CodedVideo
 from benchmarks.matcher import peak_memory
+from benchmarks.plots import plot_frontiers
 from benchmarks.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import check_output_folder, whole_file, whole_folder
@@ -24,7 +25,6 @@ from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.contenders import LENGTHS, evaluate_each, lengths_beside, sequences_as_json
 from dejavu_torch.evaluation.reproduce import paper_model
-from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of

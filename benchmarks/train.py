@@ -17,11 +17,11 @@ from torch import nn
 from tqdm import tqdm
 
 import dejavu_torch
+from benchmarks.plots import plot_ratios
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import check_output_folder, whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.score_plots import plot_ratios
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.spectral import SpectralMapper

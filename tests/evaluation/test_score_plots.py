@@ -15,9 +15,7 @@ from dejavu_torch.evaluation.score_plots import (
     Length,
     plot_auc,
     plot_curves,
-    plot_growth,
     plot_lengths,
-    plot_ratios,
 )
 
 
@@ -99,13 +97,6 @@ def test_a_colour_means_one_contender() -> None:
     assert len({*COLOURS.values(), RIGHT, WRONG, GREY, DARK, *LAYERS}) == len(COLOURS) + 6
 
 
-def test_running_times_are_drawn_in_the_colours_of_the_contenders() -> None:
-    _, (axis,) = plot_ratios({"one": {"dejavu (numba)": 1.0, "scipy": 3.0, "uncompressed": 2.0}})
-    colours = [bar.get_facecolor()[:3] for bar in axis.patches]
-    expected = [COLOURS["map"], GREY, COLOURS["uncompressed"]]
-    assert colours == [pytest.approx(rgb(colour)) for colour in expected]
-
-
 def test_recall_and_bytes_over_the_length_of_a_chunk() -> None:
     rows = [Length(256, 0.8, 0.7, 0.85, 4000, 40.0), Length(512, 0.9, 0.8, 0.95, 3000, 30.0)]
     plot = plot_lengths({"aerial": rows, "nothing": []})
@@ -114,15 +105,3 @@ def test_recall_and_bytes_over_the_length_of_a_chunk() -> None:
     assert (comparable, printed) == ([0.85, 0.95], [0.8, 0.9])
     assert list(plot[1][1].lines[0].get_ydata()) == [40.0, 30.0]
     assert {line.get_color() for line in plot[1][1].lines[:1]} == {COLOURS["map"]}
-
-
-def test_every_contender_that_grows_has_a_style_of_its_own() -> None:
-    from benchmarks.scale_contenders import CONTENDERS
-
-    shares = {name: [(1e4, 1.0), (1e5, 0.0)] for name in CONTENDERS}
-    figure, axes = plot_growth({"recall@1": shares, "ms": {"dejavu 1 B": [(1e4, 1.0)]}}, ["recall@1"])
-    render(figure)
-    styles = {(line.get_color(), line.get_marker(), line.get_linestyle()) for line in axes[0].lines}
-    assert len(styles) == len(CONTENDERS)
-    assert set(CONTENDERS) <= set(texts(figure))
-    assert [axis.get_yscale() for axis in axes] == ["linear", "log"]

@@ -1,0 +1,171 @@
+"""Pictures of the benchmarks; each returns (figure, axes)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from textwrap import fill
+from types import MappingProxyType
+from typing import Any
+
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas, label
+from dejavu_torch.evaluation.score_plots import area_axis, drawn_areas
+
+OURS = COLOURS["map"]
+RATIO = "time over that of our fastest; less is better"
+# of `plot_growth`: the families of a kind, in turn
+_GROWTH = {
+    "dejavu": ("#5aa9d6", "#00406b", OURS),
+    "null": (COLOURS["null"], COLOURS["null_same_plan"], GREY),
+}
+_OTHERS = ("#222222", "#e07b00", "#c21f0a", "#10b248", "#b43cff", "#f2b80f")
+FAMILIES = {  # of `plot_frontiers`: colour and line
+    "dejavu": (OURS, "-"),
+    "dejavu, given": ("#00406b", "--"),
+    "null": (COLOURS["null"], ":"),
+    "frames": (COLOURS["stride"], "-"),
+    "interpolated": (COLOURS["interpolated"], "-"),
+    "PCA": ("#10b248", "-"),
+    "binary": ("#785567", "-"),
+    "PQ, codebooks of another route": ("#c21f0a", "-"),
+    "PQ, own codebooks": ("#f28e6b", "--"),
+    "video": ("#56b4e9", "-"),
+    "the paper": (COLOURS["paper"], "-"),
+}
+
+
+def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) -> Plot:
+    """A figure of each contender, its time over ours if not said otherwise: one bar each, grouped by case.
+
+    Args:
+        cases: at least one: case -> contender -> figure. Names that start with "dejavu" are ours.
+        label: what is drawn.
+    """
+    bars = [len(ratios) for ratios in cases.values()]
+    height = 0.5 + 0.42 * sum(bars) + 0.5 * len(bars)
+    figure, axes = canvas(height, len(bars), squeeze=False, height_ratios=bars)
+    for axis, (case, ratios) in zip(axes[:, 0], cases.items(), strict=True):
+        colours = [OURS if name.startswith("dejavu") else COLOURS.get(name, GREY) for name in ratios]
+        drawn = axis.barh(range(len(ratios)), list(ratios.values()), color=colours, height=0.42)
+        for row, name in enumerate(ratios):
+            axis.text(0, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
+        axis.bar_label(drawn, [f"{ratio:.1f}" for ratio in ratios.values()], padding=3, fontsize=9)
+        if label == RATIO:
+            axis.axvline(1, color=OURS, linewidth=0.8, linestyle=":")
+        axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
+        axis.set(xlim=(0, 1.15 * max(ratios.values())), ylim=(len(ratios) - 0.6, -0.8), yticks=[])
+    axes[-1, 0].set_xlabel(label)
+    return figure, axes[:, 0]
+
+
+def plot_growth(
+    panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], linear: Collection[str] = ()
+) -> Plot:
+    """Figures of contenders over the number of places, a panel each, both axes logarithmic.
+
+    Args:
+        panels: at least one: what is drawn -> contender -> places and figure. What stands before the first
+            comma of a name is its family, which gives the colour; a mark is of one contender. Families that
+            start with "dejavu" are ours, those with "null" nulls.
+        linear: panels of shares, 0 to 1, on a linear axis.
+    """
+    names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
+    styles = _growth_styles(names)
+    figure, axes = canvas(2.6 * len(panels) + 1.1 * LINE * len(names), len(panels), squeeze=False)
+    drawn = {}
+    for axis, (heading, lines) in zip(axes[:, 0], panels.items(), strict=True):
+        for name, points in lines.items():
+            drawn[name] = axis.plot(*zip(*points, strict=True), **styles[name])[0]
+        axis.set_xscale("log")
+        if heading in linear:
+            axis.set_ylim(0, 1.02)
+        else:
+            axis.set_yscale("log")
+        axis.set_title(heading, loc="left", fontsize=10, weight="bold")
+        axis.grid(alpha=0.25)
+    axes[-1, 0].set_xlabel("places")
+    handles = [drawn[name] for name in names]
+    figure.legend(handles, names, loc="outside lower left", frameon=False, fontsize=9, handlelength=4)
+    return figure, axes[:, 0]
+
+
+def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """A style of each contender: of its family the colour, of its own the mark and the line."""
+    families = {name: name.partition(",")[0] for name in names}
+    colours: dict[str, str] = {}
+    for family in dict.fromkeys(families.values()):
+        kind = family.partition(" ")[0]
+        among = _GROWTH.get(kind, _OTHERS)
+        used = sum(colour in among for colour in colours.values())
+        colours[family] = among[used % len(among)]
+    styles = {}
+    for i, (name, family) in enumerate(families.items()):
+        order = list(families.values())[:i].count(family)  # in its family
+        styles[name] = {
+            "color": colours[family],
+            "marker": "os^Dv"[order % 5],
+            "markerfacecolor": colours[family] if order % 2 == 0 else "white",
+            "markersize": 6,
+            "linestyle": ":" if family.startswith("null") else ("-", "--", "-.")[order % 3],
+            "linewidth": 1.6 if family.startswith("dejavu") else 1.2,
+        }
+    return styles
+
+
+def plot_frontiers(
+    cases: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]],
+    whitenings: Mapping[str, Sequence[tuple[str, int, float]]] = MappingProxyType({}),
+) -> Plot:
+    """The best area of each family of stores over route bytes per place, a panel for each route.
+
+    Convention: areas below `LOWEST` and above `HIGHEST` are drawn as these.
+
+    Args:
+        cases: at least one: case -> family -> bytes per place and area, ascending.
+        whitenings: case -> name, fixed bytes and area of a map by each; a panel below that of the case.
+    """
+    names = list(dict.fromkeys(name for families in cases.values() for name in families))
+    panels = [share for case in cases for share in ([1.0, 0.6] if case in whitenings else [1.0])]
+    height = 3.0 * sum(panels) + 1.1 * LINE * len(names)
+    figure, axes = canvas(height, len(panels), squeeze=False, height_ratios=panels)
+    column = iter(axes[:, 0])
+    shown = []
+    for case, families in cases.items():
+        axis = next(column)
+        shown.append(axis)
+        for name, points in reversed(list(families.items())):  # ours, the first, on top
+            colour, line = FAMILIES.get(name, (GREY, "-"))
+            ours = name.startswith("dejavu")
+            style = {"color": colour, "linestyle": line, "linewidth": 3 if ours else 1.4}
+            sizes, areas = zip(*points, strict=True)
+            axis.plot(sizes, drawn_areas(areas), marker="o", markersize=5 if ours else 3, label=name, **style)
+        axis.set_xscale("log")
+        ticks = [0.5, 1, 2, 5, 10, 20, 50, 200]
+        axis.set_xlim(0.4, 1.2 * max([50.0, *(size for points in families.values() for size, _ in points)]))
+        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.minorticks_off()
+        area_axis(axis)
+        title = re.sub(r"[^ :]*/", "", case)  # sources without their folders
+        axis.set_title(fill(label(title), LETTERS - 10), loc="left", fontsize=10, weight="bold")
+        axis.set_xlabel("route bytes per place")
+        if case in whitenings:
+            _plot_whitenings(next(column), whitenings[case])
+    lines = {text: h for a in shown for h, text in zip(*a.get_legend_handles_labels(), strict=True)}
+    figure.legend([lines[name] for name in names], names, loc="outside lower left", frameon=False, fontsize=9)
+    return figure, axes[:, 0]
+
+
+def _plot_whitenings(axis: Any, whitenings: Sequence[tuple[str, int, float]]) -> None:
+    """The area of a map by each whitening, with its name and bytes, the largest on top."""
+    ordered = sorted(whitenings, key=lambda one: one[1])
+    areas = [area for _, _, area in ordered]
+    axis.scatter(areas, range(len(ordered)), color=OURS)
+    for row, (name, size, _) in enumerate(ordered):
+        text = f"{name}, {size / 1000:.0f} kB"
+        axis.text(0.01, row, text, transform=axis.get_yaxis_transform(), va="center", fontsize=9)
+    reach = max(max(areas) - min(areas), 0.01)
+    axis.set_xlim(min(areas) - 1.2 * reach, max(areas) + 0.1 * reach)  # names in the left half
+    axis.locator_params(axis="x", nbins=5)
+    axis.set(ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="AUC of the map, by whitening")
+    axis.grid(alpha=0.25)
