@@ -20,7 +20,19 @@ from torch import Tensor, nn
 
 from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.data.chain import chained, parts_of
+from dejavu_torch.cli.options import (
+    NO_CALIBRATION,
+    UNREAD,
+    Acceptance,
+    Growth,
+    Judging,
+    Learning,
+    LiveSearches,
+    Searches,
+    Sequences,
+    truth_by,
+)
+from dejavu_torch.data.chain import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
@@ -31,24 +43,20 @@ from dejavu_torch.learning import Checkpoint, Code, encode_local
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.model import DejaVu, check_precision
+from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import NO_MAP, REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
-from dejavu_torch.motion.resampling import ResampledTraverse, source_of
+from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search
 from dejavu_torch.recognition.select import check_candidates
-from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
     from dejavu_torch.evaluation.report import Report
 
-NO_CALIBRATION = "none"
-UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
 COMPARED = ("map.safetensors", "matches.csv")  # beside a report of them
 APART = 5  # places: any two candidates of a query are further apart
 
@@ -67,11 +75,12 @@ def run_demo(
     from dejavu_torch.evaluation.reproduce import paper_model
 
     _check_report_folder(out, COMPARED, [second])
-    _set_seed(model, seed)
+    given = Learning(seed, second)
+    given.seed_whitening(model)
     learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
     reference, query = open_source(learned), open_source(localized)
     print(f"learning {reference.name}, then finding {query.name} on it")
-    reference, views = _with_second(model, reference, second, None, query)
+    reference, views = given.with_second(model, reference, query)
     paper = paper_model()
     named = [recipe_of(one.mapper) for one in (model, paper)]
     others = {"paper": ("the paper to the letter", paper)} if named[0] != named[1] else {}
@@ -98,17 +107,9 @@ def run_learn(
     sources: Sequence[str] = (),
     *,
     map: Path | None = None,
-    append: Path | None = None,
-    average: str | None = None,
-    average_truth: str | None = None,
-    seed: int = 0,
-    second: str | None = None,
-    second_truth: str | None = None,
-    descriptor: Path | None = None,
-    calibration: str | None = None,
-    calibration_truth: str | None = None,
+    growing: Growth,
+    learning: Learning,
     cluster: str | None = None,
-    device: str = "cpu",
     model: DejaVu,
     command: str,
 ) -> None:
@@ -118,23 +119,11 @@ def run_learn(
         sources: folder of images, video (clip.mp4?width=160), .npy of frames or features,
             sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96; several are one route, one behind the other
         map: map file to write (.safetensors)
-        append: map file behind whose places those of the source come; it is written again unless --map names
-            another file
-        average: a further traverse of the source's places, averaged in before they are coded; without a
-            source of those of --append, which are decoded, averaged and coded again at the same step
-        average_truth: which places it shows, as --truth of `dejavu compare`
-        seed: of the whitening, where it has none of its own
-        second: another traverse of the same places, from which whitening learns what a visit changes
-        second_truth: which places it shows, as --truth of `dejavu compare`
-        descriptor: file whose features are taken, as `dejavu train` makes of several routes, or a map
-        calibration: another traverse of the same places, which tells how probably answers are right; changed
-            frames of the route itself if not given, none if "none"
-        calibration_truth: which places it shows, as --truth
         cluster: Ray workers that make the chunks of a long route: auto, one for each processor of this
             machine, or the address of a cluster. Sources are read there, by the same paths
-        device: what learns: cpu, cuda or cuda:1
     """
-    where, map = device_of(device, learns=True), append if map is None else map
+    append, average, calibration = growing.append, growing.average, learning.calibration
+    where, map = device_of(learning.device, learns=True), append if map is None else map
     given = model.precision
     assert map is not None  # the parser has seen to it
     if append is None:
@@ -143,37 +132,34 @@ def run_learn(
         model = _map_to_append_to(append, model, len(sources) > 0).to(where)
     precision = f"--precision {given}" if given is not None else f"the map's precision, {model.precision},"
     if cluster is not None:
-        _check_cluster(cluster, device)
+        _check_cluster(cluster, learning.device)
         _check_chunks(cluster, model)
     _check_map_name(map)
     check_output_file(map)
-    check_not_read(map, *sources, second, second_truth, descriptor, calibration, calibration_truth)
-    check_not_read(map, average, average_truth)
+    check_not_read(map, *sources, learning.second, *learning.files, average, growing.average_truth)
     if calibration == NO_CALIBRATION and model.precision is not None:
         seen = f"{precision} with --calibration none"
         raise InputError(f"{seen}; expected one of them, as --threshold replaces the precision")
-    _set_seed(model, seed)
-    _check_average(average, average_truth, sources, calibration)
+    learning.seed_whitening(model)
+    growing.check(sources, calibration)
     visits: Views | None = None
     if sources:
         chain = chained([open_source(one) for one in sources])
         traverse = model.resample(chain, model.step, True, model.frame_shape)
         _print_steps(traverse)
-        traverse, views = _with_second(model, traverse, second, second_truth)
-        if average is not None:
-            with _truth_by("--average_truth"):
-                visits = growth.associate(model, traverse, open_source(average), average_truth)
-        _check_calibration(model, traverse, calibration, precision)
-        traverse, known = _with_calibration(model, traverse, calibration, calibration_truth, None, second)
+        traverse, views = learning.with_second(model, traverse)
+        visits = growing.visits(model, traverse) if average is not None else None
+        learning.check_precision(model, traverse, precision)
+        traverse, known = learning.with_calibration(model, traverse)
     else:
-        with _truth_by("--average_truth"):
-            visits = growth.associate(model, None, open_source(str(average)), average_truth)
+        visits = growing.visits(model, None)
         traverse, views = visits.traverse, None
-        _check_calibration(model, traverse, calibration, precision)
+        learning.check_precision(model, traverse, precision)
         known = None
         if calibration not in UNREAD:
-            with _truth_by("--calibration_truth"):
-                known = growth.associate(model, None, open_source(str(calibration)), calibration_truth)
+            with truth_by("--calibration_truth"):
+                further = open_source(str(calibration))
+                known = growth.associate(model, None, further, learning.calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
     with _coding(cluster) as code:
@@ -214,16 +200,11 @@ def run_localize(
     source: str,
     *,
     out: Path,
-    threshold: float | None = None,
-    precision: float | None = None,
+    acceptance: Acceptance,
     top: int | None = None,
     corners: list[list[float]] | None = None,
     as_is: bool = False,
-    sequence: int = 1,
-    speeds: list[float] | None = None,
-    filter: bool = False,
-    moves: list[float] | None = None,
-    search_every: int | None = None,
+    sequences: Searches,
     search: Search = "auto",
     cluster: str | None = None,
     device: str = "cpu",
@@ -235,21 +216,10 @@ def run_localize(
         map: map file
         source: as of `dejavu learn`
         out: csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name
-        threshold: accept a match whose score is below; .inf accepts all
-        precision: accept instead what is at least as probably right, such as .99. Without either, and none in
-            the map, .5 on a calibrated map, else all
         top: write so many places of each query, no two within 5 of each other, a row each with its rank; a
             probability is that of the first
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         as_is: take the frames as they are, though the map's are resampled
-        sequence: queries that are matched together, one place after another
-        speeds: of a sequence, such as '[.8,1,1.25]' places a query, of which the best counts; 1 if not given
-        filter: the most probable place given all queries so far, at varying speed, or off the map; scores and
-            --threshold are -log of the filter's own probability
-        moves: of the filter, probabilities of moving by 0, 1, 2, .. places from query to query; '[.2,.6,.2]'
-            if not given
-        search_every: of the filter, queries from one search of all places to the next; in between only those
-            near the last place are scored; 1 if not given
         search: of single queries: scan scores all places; auto also, unless the map has a faster way to the
             same places
         cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
@@ -259,14 +229,14 @@ def run_localize(
     where = device_of(device)
     check_output_file(out)
     check_not_read(out, map, source)
-    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold, search_every)
-    _check_accepting(threshold, precision, matcher)
+    matcher = sequences.matcher(APART, acceptance.threshold)
+    acceptance.check(matcher)
     if top is not None:
         check_candidates(top, APART)
     if cluster is not None:
         _check_cluster(cluster, device)
-        if filter or sequence != 1:
-            together = "--filter" if filter else f"--sequence {sequence}"
+        if sequences.filter or sequences.sequence != 1:
+            together = "--filter" if sequences.filter else f"--sequence {sequences.sequence}"
             raise InputError(f"--cluster {cluster} and {together}; expected one of them")
     model = _load_map(map, features).to(where)
     if corners is not None:
@@ -277,7 +247,7 @@ def run_localize(
         model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
     if as_is:
         model.velocity = None
-    _accept_by(model, threshold, precision)
+    acceptance.of(model)
     if top is not None:
         check_candidates(top, APART, model.map.places)
     query = model.fit(open_source(source), model.frame_shape or ())
@@ -311,13 +281,8 @@ def run_live(
     map: Path,
     source: str,
     *,
-    filter: bool = False,
-    sequence: int | None = None,
-    speeds: list[float] | None = None,
-    moves: list[float] | None = None,
-    search_every: int | None = None,
-    threshold: float | None = None,
-    precision: float | None = None,
+    sequences: LiveSearches,
+    acceptance: Acceptance,
     page: int | None = None,
     reference: str | None = None,
     realtime: bool = False,
@@ -335,13 +300,6 @@ def run_live(
         source: a camera (/dev/video0), an address (rtsp://host/path), a named pipe, - for standard input, or
             a source as of `dejavu learn`. Of cameras, addresses and pipes the newest frame is taken, and
             those that came while the one before was being found are dropped; of a file none is
-        filter: the most probable place given all frames so far, as of `dejavu localize`; the default
-        sequence: frames that are matched together in place of the filter; 1 takes each by itself
-        speeds: as of `dejavu localize`
-        moves: as of `dejavu localize`
-        search_every: as of `dejavu localize`
-        threshold: as of `dejavu localize`
-        precision: as of `dejavu localize`
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
             for any that is free. A file is then played in real time, and the page stays until Ctrl-C
         reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
@@ -360,15 +318,12 @@ def run_live(
         raise InputError(f"--reference {reference} without --page; expected both")
     if not 0 < timeout <= threading.TIMEOUT_MAX:
         raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
-    if sequence is None:
-        filter = True
-    length = 1 if sequence is None else sequence
-    matcher = _sequence_of(length, speeds, filter, moves, APART, threshold, search_every)
-    _check_accepting(threshold, precision, matcher)
+    matcher = sequences.matcher(APART, acceptance.threshold)
+    acceptance.check(matcher)
     model = _load_map(map, features).to(where)
     if as_is:
         model.velocity = None
-    _accept_by(model, threshold, precision)
+    acceptance.of(model)
     model.matching(matcher)
     follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
 
@@ -378,25 +333,10 @@ def run_compare(
     query: str,
     *,
     out: Path,
-    truth: str | None = None,
-    tolerance: int = 5,
-    interpolate: bool = False,
-    leave_out: int | None = None,
-    seed: int = 0,
-    second: str | None = None,
-    second_truth: str | None = None,
+    judging: Judging,
+    learning: Learning,
     map: Path | None = None,
-    sequence: int = 1,
-    speeds: list[float] | None = None,
-    filter: bool = False,
-    moves: list[float] | None = None,
-    top: int | None = None,
-    descriptor: Path | None = None,
-    calibration: str | None = None,
-    calibration_truth: str | None = None,
-    distractors: list[str] | str | None = None,
-    storage_curve: bool = False,
-    device: str = "cpu",
+    sequences: Sequences,
     model: DejaVu,
     command: str,
 ) -> None:
@@ -406,36 +346,20 @@ def run_compare(
         reference: traverse to learn, a source as of `dejavu learn`
         query: second traverse, likewise
         out: folder for report, pictures, matches.csv and map.safetensors
-        truth: offset (place = query + offset), csv of query,place[,place...], npz with GThard, or utm:25 for
-            coordinates in image names
-        tolerance: right within this many places, inclusive
-        interpolate: fill in a csv that lists some queries only
-        leave_out: diagnostic of templates, the reference on itself, this many frames to each side left out
-        seed: of the null control's shuffle and of the whitening
-        second: a third traverse, as of `dejavu learn`
-        second_truth: which places it shows, as --truth
         map: evaluate this map of the reference as it is, and learn none
-        sequence: queries that are matched together, one place after another
-        speeds: as of `dejavu localize`
-        filter: as of `dejavu localize`
-        moves: as of `dejavu localize`
-        top: write so many places of each query, no two within the tolerance, a row each with its rank; a
-            probability is that of the first
-        descriptor: as of `dejavu learn`
-        calibration: as of `dejavu learn`; a third traverse
-        calibration_truth: which places it shows, as --truth
-        distractors: another route, or a list of several, '[A,B]': how many of its frames are accepted
-        storage_curve: also evaluate the descriptors coded at other sizes, with null and keyframes (spectral
-            maps); takes as long as all the rest
-        device: as of `dejavu learn`
     """
     from dejavu_torch.evaluation.compare import compare
 
-    where = device_of(device, learns=map is None)
-    matcher = _sequence_of(sequence, speeds, filter, moves, max(0, tolerance), model.threshold)
-    _check_accepting(model.threshold, model.precision, matcher, distractors)
+    where, top, calibration = (
+        device_of(learning.device, learns=map is None),
+        judging.top,
+        learning.calibration,
+    )
+    filter, within = sequences.filter, max(0, judging.tolerance)
+    matcher = sequences.matcher(within, model.threshold)
+    Acceptance(model.threshold, model.precision).check(matcher, judging.distractors)
     if top is not None:
-        check_candidates(top, max(0, tolerance))
+        check_candidates(top, within)
     asked = model.threshold
     if filter:
         model.threshold = None  # of distances: that of the filter is none for the map to keep
@@ -445,43 +369,38 @@ def run_compare(
         if model.map.routes:
             names = ", ".join(route.name for route in model.map.routes)
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
-        _accept_by(model, asked, given.precision)
+        Acceptance(asked, given.precision).of(model)
         model.threshold = None if filter and asked is not None else model.threshold
     model.to(where)
     first, queries = open_source(reference), open_source(query)
-    read = [truth, second_truth, descriptor, calibration, calibration_truth]
-    _check_report_folder(out, COMPARED, [reference, query, second], read)
-    others = [distractors] if isinstance(distractors, str) else distractors or []
-    strange = [open_source(other) for other in others]
-    traverses = [first, queries, *(open_source(one) for one in (second, calibration) if one not in UNREAD)]
-    for other in strange:
-        if _same_as(other, traverses):
-            raise InputError(f"--distractors {other.name} is one of the traverses; expected another route")
+    _check_report_folder(out, COMPARED, [reference, query, learning.second], [judging.truth, *learning.files])
+    beside = [open_source(one) for one in (learning.second, calibration) if one not in UNREAD]
+    strange = judging.off_map([first, queries, *beside])
     known_frames = calibration is None and len(first.frame_shape) == 3
     certain = calibration not in UNREAD or (known_frames if map is None else model.calibration is not None)
     if not certain or (matcher is not None and not filter):
-        for name, value in (("--precision", model.precision), ("--distractors", others or None)):
+        for name, value in (("--precision", model.precision), ("--distractors", judging.distractors or None)):
             if value is not None:
                 why = "probabilities are of single queries and of a filter, on a calibrated map"
                 raise InputError(f"{name} {value}: {why}; expected --threshold, or none of both")
-    _set_seed(model, seed)
-    first, views = _with_second(model, first, second, second_truth, queries)
-    first, known = _with_calibration(model, first, calibration, calibration_truth, queries, second)
+    learning.seed_whitening(model)
+    first, views = learning.with_second(model, first, queries)
+    first, known = learning.with_calibration(model, first, queries)
     result = compare(
         first,
         queries,
-        truth,
+        judging.truth,
         model,
-        tolerance=tolerance,
-        leave_out=leave_out,
-        seed=seed,
-        interpolate=interpolate,
+        tolerance=judging.tolerance,
+        leave_out=judging.leave_out,
+        seed=learning.seed,
+        interpolate=judging.interpolate,
         second=views,
         sequence=matcher,
         top=1 if top is None else top,
         calibration="none" if calibration == NO_CALIBRATION else known,
         distractors=strange,
-        storage_curve=storage_curve,
+        storage_curve=judging.storage_curve,
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map, top)
@@ -574,23 +493,17 @@ def run_export(
     map: Path,
     *,
     onnx: Path,
-    sequence: int = 1,
-    speeds: list[float] | None = None,
-    filter: bool = False,
-    moves: list[float] | None = None,
+    sequences: Sequences,
     threshold: float | None = None,
     features: nn.Module | None = None,
 ) -> None:
     """Write a map, and what is ahead of it, as an ONNX file, opset 18: frames in, scores of all places out.
 
+    With a sequence or a filter the file takes a frame and a state, and gives the next state.
+
     Args:
         map: map file
         onnx: file to write (.onnx)
-        sequence: as of `dejavu localize`; the file then takes a frame and a state, and gives the next state
-        speeds: as of `dejavu localize`
-        filter: as of `dejavu localize`, with a state likewise
-        moves: as of `dejavu localize`
-        search_every: as of `dejavu localize`
         threshold: noted in the file; the map's own if not given
         features: class of the map's features, if not ours
     """
@@ -600,9 +513,9 @@ def run_export(
         raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")
     check_output_file(onnx)
     check_not_read(onnx, map)
-    matcher = _sequence_of(sequence, speeds, filter, moves, APART, threshold)
+    matcher = sequences.matcher(APART, threshold)
     model = _load_map(map, features)
-    _accept_by(model, threshold, None)
+    Acceptance(threshold).of(model)
     if matcher is not None and model.precision is not None:
         seen = f"the map's precision, {model.precision}, is of single frames in an ONNX file"
         raise InputError(f"{seen}; expected --threshold with a sequence or a filter")
@@ -747,7 +660,7 @@ def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
         growth.one_route(model, "append to" if places else "average visits into")
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    _accept_by(model, given.threshold, given.precision)
+    Acceptance(given.threshold, given.precision).of(model)
     return model
 
 
@@ -805,150 +718,6 @@ def _check_report_folder(
         for name in ("index.html", "report.json", *beside, *(f"{name}.png" for name in PICTURES)):
             check_output_file(out / name)
             check_not_read(out / name, *sources, *files)
-
-
-def _sequence_of(
-    length: int,
-    speeds: list[float] | None,
-    filter: bool,
-    moves: list[float] | None,
-    within: int,
-    threshold: float | None,
-    search_every: int | None = None,
-) -> SequenceModel | None:
-    """What scores queries together: the filter, or a sum over so many; none for one.
-
-    Args:
-        within, threshold, search_every: of the filter, which keeps its own where that is None.
-    """
-    matcher = SequenceMatcher(length, (1.0,) if speeds is None else speeds)
-    if filter and length > 1:
-        raise InputError(f"--sequence {length} and --filter; expected one or the other")
-    if speeds is not None and length == 1:
-        raise InputError(f"--speeds {speeds} without --sequence; expected --sequence T with them")
-    if moves is not None and not filter:
-        raise InputError(f"--moves {moves} without --filter; expected both")
-    if search_every is not None and not filter:
-        raise InputError(f"--search_every {search_every} without --filter; expected both")
-    if filter:
-        settings: dict[str, Any] = {"moves": moves, "search_every": search_every}
-        given = {name: value for name, value in settings.items() if value is not None}
-        chosen = PlaceFilter(within=within, **given)
-        chosen.threshold = chosen.threshold if threshold is None else threshold
-        return chosen
-    return None if length == 1 else matcher
-
-
-def _set_seed(model: DejaVu, seed: int) -> None:
-    """The command's seed for a whitening that is to be learned and has none of its own."""
-    if model.whitening is not None and not model.whitening.fixed and not model.map.places:
-        model.whitening.seed = model.whitening.seed or seed
-
-
-def _with_second(
-    model: DejaVu, reference: Traverse, second: str | None, truth: str | None, query: Traverse | None = None
-) -> tuple[Traverse, Views | None]:
-    """The reference, and the second traverse that whitening learns from."""
-    if second is None:
-        if truth is not None:
-            raise InputError(f"--second_truth {truth} is of no traverse; expected --second SOURCE with it")
-        return reference, None
-    traverse = open_source(second)
-    if query is not None and _same_as(traverse, [query]):
-        raise InputError(f"--second {second} is the query itself; expected a third traverse, or none")
-    reference = model.resample(reference, progress=True, shape=model.frame_shape)
-    with _truth_by("--second_truth"):
-        return reference, growth.second_traverse(model, reference, traverse, truth)
-
-
-def _with_calibration(
-    model: DejaVu,
-    reference: Traverse,
-    source: str | None,
-    truth: str | None,
-    query: Traverse | None,
-    second: str | None,
-) -> tuple[Traverse, Views | None]:
-    """The reference, and the traverse that its map is calibrated by."""
-    if source in UNREAD:
-        if truth is not None:
-            seen = f"--calibration_truth {truth} is of no traverse"
-            raise InputError(f"{seen}; expected --calibration SOURCE with it")
-        return reference, None
-    traverse = open_source(str(source))
-    if second is not None and _same_as(traverse, [open_source(second)]):
-        raise InputError(f"--calibration {source} is that of --second; expected a further traverse")
-    same = _same_as(traverse, [*parts_of(source_of(reference)), *([] if query is None else [query])])
-    if same is not None:
-        raise InputError(f"--calibration {source} is {same.name} itself; expected another traverse")
-    reference = model.resample(reference, model.step, True, model.frame_shape)
-    traverse = model.fit(traverse, reference.frame_shape)
-    model.describer.check_sizes(reference, traverse)
-    with _truth_by("--calibration_truth"):
-        return reference, growth.associate(model, reference, traverse, truth)
-
-
-@contextmanager
-def _truth_by(option: str) -> Iterator[None]:
-    """What is refused within names the option that a truth would be given by."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(str(error).replace("or a truth that", f"or {option}, which")) from error
-
-
-def _check_calibration(model: DejaVu, traverse: Traverse, calibration: str | None, told: str) -> None:
-    """Refuse a precision that nothing can be calibrated for; `told` is how a message names it."""
-    if model.precision is not None and len(traverse.frame_shape) != 3 and calibration is None:
-        seen = f"{told} and {traverse.name}, which has no frames to calibrate by"
-        raise InputError(f"{seen}; expected --calibration SOURCE, or --threshold in place of the precision")
-
-
-def _check_average(
-    average: str | None, truth: str | None, sources: Sequence[str], calibration: str | None
-) -> None:
-    """Refuse to average a traverse with itself, or to calibrate by what a map has been averaged with."""
-    if average is None:
-        if truth is not None:
-            raise InputError(f"--average_truth {truth} is of no traverse; expected --average SOURCE with it")
-        return
-    traverse = open_source(average)
-    if _same_as(traverse, [open_source(one) for one in sources]):
-        raise InputError(f"--average {average} is what is learned; expected another traverse of its places")
-    if calibration not in UNREAD and _same_as(traverse, [open_source(str(calibration))]):
-        raise InputError(f"--calibration {calibration} is that of --average; expected a further traverse")
-
-
-def _same_as(traverse: Traverse, others: Iterable[Traverse]) -> Traverse | None:
-    """The first of others that has the name of a traverse, however its path is written."""
-    name = Path(traverse.name).resolve()
-    return next((other for other in others if Path(other.name).resolve() == name), None)
-
-
-def _check_accepting(
-    threshold: float | None,
-    precision: float | None,
-    sequence: SequenceModel | None,
-    distractors: object = None,
-) -> None:
-    """Refuse at once what does not go with a precision, or with anything else that needs probabilities."""
-    if threshold is not None and precision is not None:
-        raise InputError(f"--threshold {threshold:g} and --precision {precision:g}; expected one of them")
-    check_precision(precision)
-    if isinstance(sequence, PlaceFilter):
-        together = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""
-    else:
-        together = f"--sequence {sequence.length}" if isinstance(sequence, SequenceMatcher) else ""
-    for name, value in (("--precision", precision), ("--distractors", distractors)):
-        if together and value:
-            why = "probabilities are of single queries and of a filter that searches all places each time"
-            raise InputError(f"{together} and {name} {value}: {why}; expected one of the two options")
-
-
-def _accept_by(model: DejaVu, threshold: float | None, precision: float | None) -> None:
-    """What a model accepts from now on, where one of the two is given."""
-    if threshold is not None or precision is not None:
-        model.threshold, model.precision = threshold, precision
 
 
 def _print_steps(traverse: Traverse) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import inspect
 import pydoc
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import is_dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, NoReturn, get_args, get_origin
+from typing import Any, Literal, NoReturn, cast, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
@@ -238,33 +239,60 @@ def command_parser(name: str, function: Callable[..., None], program: str = "dej
     Args:
         function: its positional parameters are positional arguments, optional ones where they have a default,
             its keyword-only ones are options, and `Args:` of its docstring has their help. Those annotated
-            `Sequence` take any number of words, or, without a default, at least one.
+            `Sequence` take any number of words, or, without a default, at least one. Those of a
+            dataclass are options likewise.
     """
-    text = docstring_parser.parse(inspect.getdoc(function) or "")
-    helps = {one.arg_name: one.description for one in text.params}
-    parser = Parser(prog=f"{program} {name}", description=text.description)
+    text, helps = described(function)
+    parser = Parser(prog=f"{program} {name}", description=text)
     for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if key == COMMAND:
             continue
         if key == MODEL:
             add_model(parser)
-            continue
-        keyword, default = parameter.kind is parameter.KEYWORD_ONLY, parameter.default
-        settings: dict[str, Any] = {"help": helps[key]}
-        if parameter.annotation is bool:
-            settings["action"] = "store_true"
-        elif get_origin(parameter.annotation) is Sequence:
-            settings |= {"type": get_args(parameter.annotation)[0], "nargs": "+"}
-            settings |= {} if default is parameter.empty else {"nargs": "*", "default": list(default)}
+        elif is_dataclass(options := parameter.annotation):
+            for one in inspect.signature(cast(type, options), eval_str=True).parameters.values():
+                add_option(parser, one.replace(kind=one.KEYWORD_ONLY), described(cast(type, options))[1])
         else:
-            settings["type"] = parameter.annotation
-            if default is not parameter.empty:
-                settings["default"] = default
-                settings |= {} if keyword else {"nargs": "?"}
-            elif keyword:
-                settings["required"] = True
-        parser.add_argument(f"--{key}" if keyword else key, **settings)
+            add_option(parser, parameter, helps)
     return parser
+
+
+def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | None]]:
+    """What a docstring says of a function, or of a dataclass and those it extends, and of each argument."""
+    helps: dict[str, str | None] = {}
+    for one in reversed(thing.__mro__ if isinstance(thing, type) else [thing]):
+        text = docstring_parser.parse(inspect.getdoc(one) or "")
+        helps |= {one.arg_name: one.description for one in text.params}
+    return text.description, helps
+
+
+def add_option(parser: Parser, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
+    """An option, or a positional argument, as `command_parser` says."""
+    keyword, default = parameter.kind is parameter.KEYWORD_ONLY, parameter.default
+    settings: dict[str, Any] = {"help": helps[parameter.name]}
+    if parameter.annotation is bool:
+        settings["action"] = "store_true"
+    elif get_origin(parameter.annotation) is Sequence:
+        settings |= {"type": get_args(parameter.annotation)[0], "nargs": "+"}
+        settings |= {} if default is parameter.empty else {"nargs": "*", "default": list(default)}
+    else:
+        settings["type"] = parameter.annotation
+        if default is not parameter.empty:
+            settings["default"] = default
+            settings |= {} if keyword else {"nargs": "?"}
+        elif keyword:
+            settings["required"] = True
+    parser.add_argument(f"--{parameter.name}" if keyword else parameter.name, **settings)
+
+
+def grouped(function: Callable[..., None], arguments: dict[str, Any]) -> dict[str, Any]:
+    """Arguments with those of each of the function's dataclasses as one."""
+    for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
+        if is_dataclass(parameter.annotation):
+            options = cast(type, parameter.annotation)
+            names = inspect.signature(options).parameters
+            arguments[key] = options(**{name: arguments.pop(name) for name in names})
+    return arguments
 
 
 def add_model(parser: Parser) -> None:
@@ -337,7 +365,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
                 seen = f"--whitening {whitening} has its own features"
                 raise UsageError(f"{seen}; expected it or --descriptor {arguments['descriptor']}")
             _take(model, arguments["descriptor"], told, "descriptor")
-    return arguments
+    return grouped(function, arguments)
 
 
 def _of_another_mapper(parser: Parser, words: Sequence[str]) -> str | None:

@@ -24,8 +24,8 @@ from benchmarks.matcher import (
     run_bench,
     write_bench,
 )
+from benchmarks.plots import plot_ratios
 from dejavu_torch.evaluation.report import text_table
-from dejavu_torch.evaluation.score_plots import plot_ratios
 
 
 def small(**options: object) -> list[Row]:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from benchmarks import storage as frontier
 from benchmarks.matcher import MEMORY
+from benchmarks.plots import plot_frontiers
 from benchmarks.quantisers import Kept
 from benchmarks.storage import (
     Contender,
@@ -34,7 +35,6 @@ from benchmarks.storage import (
 )
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.score_plots import plot_frontiers
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.recognition.localizer import Matching
 

@@ -1,0 +1,290 @@
+"""Options that several commands share, with their checks: each field is an option, `Args:` its help."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dejavu_torch import growth
+from dejavu_torch.data.chain import parts_of
+from dejavu_torch.data.source import open_source
+from dejavu_torch.features.views import Views
+from dejavu_torch.model import DejaVu, check_precision
+from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import InputError, SequenceModel, Traverse
+
+NO_CALIBRATION = "none"
+UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
+
+
+@dataclass
+class Sequences:
+    """How consecutive queries are matched together.
+
+    Args:
+        sequence: queries that are matched together, one place after another
+        speeds: of a sequence, places a query, such as '[.8,1,1.25]'; 1 if not given
+        filter: the most probable place given all queries so far; scores and --threshold are -log of its
+            probability
+        moves: of the filter, probabilities of moving by 0, 1, 2, .. places; '[.2,.6,.2]' if not given
+    """
+
+    sequence: int = 1
+    speeds: list[float] | None = None
+    filter: bool = False
+    moves: list[float] | None = None
+
+    def matcher(self, within: int, threshold: float | None) -> SequenceModel | None:
+        """The filter, or a sum over so many queries; None for single queries.
+
+        Args:
+            within, threshold: of the filter, which keeps its own threshold if that is None.
+        """
+        search_every: int | None = getattr(self, "search_every", None)
+        matcher = SequenceMatcher(self.sequence, (1.0,) if self.speeds is None else self.speeds)
+        if self.filter and self.sequence > 1:
+            raise InputError(f"--sequence {self.sequence} and --filter; expected one or the other")
+        if self.speeds is not None and self.sequence == 1:
+            raise InputError(f"--speeds {self.speeds} without --sequence; expected --sequence T with them")
+        settings: dict[str, Any] = {"moves": self.moves, "search_every": search_every}
+        given = {name: value for name, value in settings.items() if value is not None}
+        if not self.filter:
+            for name, value in given.items():
+                raise InputError(f"--{name} {value} without --filter; expected both")
+            return None if self.sequence == 1 else matcher
+        chosen = PlaceFilter(within=within, **given)
+        chosen.threshold = chosen.threshold if threshold is None else threshold
+        return chosen
+
+
+@dataclass
+class Searches(Sequences):
+    """As above, for what need not search all places for each query.
+
+    Args:
+        search_every: of the filter, queries from one search of all places to the next; in between only those
+            near the last place are scored; 1 if not given
+    """
+
+    search_every: int | None = None
+
+
+@dataclass
+class LiveSearches(Searches):
+    """The filter, unless queries are matched another way.
+
+    Args:
+        sequence: frames that are matched together in place of the filter; 1 takes each by itself
+    """
+
+    sequence: int | None = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        self.filter = self.filter or self.sequence is None
+        self.sequence = 1 if self.sequence is None else self.sequence
+
+
+@dataclass
+class Acceptance:
+    """Which matches are accepted.
+
+    Args:
+        threshold: accept a match whose score is below; .inf accepts all
+        precision: accept instead what is at least as probably right, such as .99. Without either, and none in
+            the map, .5 on a calibrated map, else all
+    """
+
+    threshold: float | None = None
+    precision: float | None = None
+
+    def check(self, sequence: SequenceModel | None, distractors: object = None) -> None:
+        """Refuse at once what does not go with a precision, or with what else needs probabilities."""
+        if self.threshold is not None and self.precision is not None:
+            seen = f"--threshold {self.threshold:g} and --precision {self.precision:g}"
+            raise InputError(f"{seen}; expected one of them")
+        check_precision(self.precision)
+        if isinstance(sequence, PlaceFilter):
+            together = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""
+        else:
+            together = f"--sequence {sequence.length}" if isinstance(sequence, SequenceMatcher) else ""
+        for name, value in (("--precision", self.precision), ("--distractors", distractors)):
+            if together and value:
+                why = "probabilities are of single queries and of a filter that searches all places each time"
+                raise InputError(f"{together} and {name} {value}: {why}; expected one of the two options")
+
+    def of(self, model: DejaVu) -> None:
+        """What a model accepts from now on, if one of the two is given."""
+        if self.threshold is not None or self.precision is not None:
+            model.threshold, model.precision = self.threshold, self.precision
+
+
+@dataclass
+class Learning:
+    """What a map is learned with beside its route.
+
+    Args:
+        seed: of the whitening, if it has none of its own, and of the null control
+        second: another traverse of the places, from which whitening learns what a visit changes
+        second_truth: places that it shows, as --truth of `dejavu compare`
+        descriptor: file whose features are taken, as `dejavu train` makes, or a map
+        calibration: a further traverse, which tells how probably answers are right; changed frames of the
+            route if not given, none if "none"
+        calibration_truth: places that it shows, likewise
+        device: what learns: cpu, cuda or cuda:1
+    """
+
+    seed: int = 0
+    second: str | None = None
+    second_truth: str | None = None
+    descriptor: Path | None = None
+    calibration: str | None = None
+    calibration_truth: str | None = None
+    device: str = "cpu"
+
+    @property
+    def files(self) -> list[Any]:
+        """What is read, but for the second traverse."""
+        return [self.second_truth, self.descriptor, self.calibration, self.calibration_truth]
+
+    def seed_whitening(self, model: DejaVu) -> None:
+        """The command's seed for a whitening that is to be learned and has none of its own."""
+        if model.whitening is not None and not model.whitening.fixed and not model.map.places:
+            model.whitening.seed = model.whitening.seed or self.seed
+
+    def with_second(
+        self, model: DejaVu, reference: Traverse, query: Traverse | None = None
+    ) -> tuple[Traverse, Views | None]:
+        """The reference, and the second traverse that whitening learns from."""
+        if self.second is None:
+            if self.second_truth is not None:
+                seen = f"--second_truth {self.second_truth} is of no traverse"
+                raise InputError(f"{seen}; expected --second SOURCE with it")
+            return reference, None
+        traverse = open_source(self.second)
+        if query is not None and same_as(traverse, [query]):
+            seen = f"--second {self.second} is the query itself"
+            raise InputError(f"{seen}; expected a third traverse, or none")
+        reference = model.resample(reference, progress=True, shape=model.frame_shape)
+        with truth_by("--second_truth"):
+            return reference, growth.second_traverse(model, reference, traverse, self.second_truth)
+
+    def with_calibration(
+        self, model: DejaVu, reference: Traverse, query: Traverse | None = None
+    ) -> tuple[Traverse, Views | None]:
+        """The reference, and the traverse that its map is calibrated by."""
+        source, truth = self.calibration, self.calibration_truth
+        if source in UNREAD:
+            if truth is not None:
+                seen = f"--calibration_truth {truth} is of no traverse"
+                raise InputError(f"{seen}; expected --calibration SOURCE with it")
+            return reference, None
+        traverse = open_source(str(source))
+        if self.second is not None and same_as(traverse, [open_source(self.second)]):
+            raise InputError(f"--calibration {source} is that of --second; expected a further traverse")
+        same = same_as(traverse, [*parts_of(source_of(reference)), *([] if query is None else [query])])
+        if same is not None:
+            raise InputError(f"--calibration {source} is {same.name} itself; expected another traverse")
+        reference = model.resample(reference, model.step, True, model.frame_shape)
+        traverse = model.fit(traverse, reference.frame_shape)
+        model.describer.check_sizes(reference, traverse)
+        with truth_by("--calibration_truth"):
+            return reference, growth.associate(model, reference, traverse, truth)
+
+    def check_precision(self, model: DejaVu, traverse: Traverse, told: str) -> None:
+        """Refuse a precision that nothing can be calibrated for; `told` is how a message names it."""
+        if model.precision is not None and len(traverse.frame_shape) != 3 and self.calibration is None:
+            seen = f"{told} and {traverse.name}, which has no frames to calibrate by"
+            raise InputError(
+                f"{seen}; expected --calibration SOURCE, or --threshold in place of the precision"
+            )
+
+
+@dataclass
+class Growth:
+    """What a map is grown by.
+
+    Args:
+        append: map file behind whose places those of the source come; it is written again unless --map names
+            another file
+        average: a further traverse of the source's places, averaged in before they are coded; without a
+            source of those of --append, which are decoded, averaged and coded again at the same step
+        average_truth: which places it shows, as --truth of `dejavu compare`
+    """
+
+    append: Path | None = None
+    average: str | None = None
+    average_truth: str | None = None
+
+    def check(self, sources: Iterable[str], calibration: str | None) -> None:
+        """Refuse to average a traverse with itself, or to calibrate by what a map has been averaged with."""
+        if self.average is None:
+            if self.average_truth is not None:
+                seen = f"--average_truth {self.average_truth} is of no traverse"
+                raise InputError(f"{seen}; expected --average SOURCE with it")
+            return
+        traverse = open_source(self.average)
+        if same_as(traverse, [open_source(one) for one in sources]):
+            seen = f"--average {self.average} is what is learned"
+            raise InputError(f"{seen}; expected another traverse of its places")
+        if calibration not in UNREAD and same_as(traverse, [open_source(str(calibration))]):
+            raise InputError(f"--calibration {calibration} is that of --average; expected a further traverse")
+
+    def visits(self, model: DejaVu, reference: Traverse | None) -> Views:
+        """The further traverse, and which places it shows, of the reference or of the map."""
+        with truth_by("--average_truth"):
+            return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
+
+
+@dataclass
+class Judging:
+    """How answers are judged, and what else a report of them has.
+
+    Args:
+        truth: offset (place = query + offset), csv of query,place[,place...], npz with GThard, or utm:25 for
+            coordinates in image names
+        tolerance: right within this many places, inclusive
+        interpolate: fill in a csv that lists some queries only
+        leave_out: diagnostic of templates, the reference on itself, this many frames to each side left out
+        top: write so many places of each query, no two within the tolerance, a row each with its rank
+        distractors: another route, or several, '[A,B]': how many of its frames are accepted
+        storage_curve: also evaluate maps of other sizes, which takes as long as all the rest
+    """
+
+    truth: str | None = None
+    tolerance: int = 5
+    interpolate: bool = False
+    leave_out: int | None = None
+    top: int | None = None
+    distractors: list[str] | str | None = None
+    storage_curve: bool = False
+
+    def off_map(self, traverses: Iterable[Traverse]) -> list[Traverse]:
+        """The distractors, none of which may be one of the traverses."""
+        given = [self.distractors] if isinstance(self.distractors, str) else self.distractors or []
+        others = [open_source(one) for one in given]
+        for other in others:
+            if same_as(other, traverses):
+                raise InputError(
+                    f"--distractors {other.name} is one of the traverses; expected another route"
+                )
+        return others
+
+
+@contextmanager
+def truth_by(option: str) -> Iterator[None]:
+    """What is refused within names the option that a truth would be given by."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace("or a truth that", f"or {option}, which")) from error
+
+
+def same_as(traverse: Traverse, others: Iterable[Traverse]) -> Traverse | None:
+    """The first of others that has the name of a traverse, however its path is written."""
+    name = Path(traverse.name).resolve()
+    return next((other for other in others if Path(other.name).resolve() == name), None)
