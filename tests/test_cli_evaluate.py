@@ -295,7 +295,6 @@ def test_options_have_the_last_word_wherever_the_config_stands(tmp_path: Path) -
         ("localize a", ["required: source, --out"]),
         ("evaluate", ["required: matches, --truth, --out"]),
         ("reproduce mars --out x", ["'mars'", "aerial", "outdoor", "underground"]),
-        ("bench dance --out x", ["'dance'", "matcher"]),
     ],
 )
 def test_mistakes_are_one_plain_line(

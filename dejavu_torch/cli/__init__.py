@@ -49,7 +49,7 @@ def main(
         process.take_over()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
     try:
-        run(sys.argv[1:] if arguments is None else arguments, program or run_command)
+        run(sys.argv[1:] if arguments is None else arguments, program)
     except SystemExit as error:
         if not error.code:
             _check_output()
@@ -61,10 +61,10 @@ def main(
         process.let_go()
 
 
-def run(given: Sequence[str], program: Callable[[Sequence[str]], None]) -> None:
+def run(given: Sequence[str], program: Callable[[Sequence[str]], None] | None = None) -> None:
     """Run a command line; what it gets wrong is one line on stderr and exit status 2."""
     try:
-        program(given)
+        (program or run_command)(given)
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
         shortage = _shortage(error)
         if shortage is None:

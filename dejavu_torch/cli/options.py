@@ -132,8 +132,8 @@ class Learning:
         second: another traverse of the places, from which whitening learns what a visit changes
         second_truth: places that it shows, as --truth of `dejavu compare`
         descriptor: file whose features are taken, as `dejavu train` makes, or a map
-        calibration: a further traverse, which tells how probably answers are right; changed frames of the
-            route if not given, none if "none"
+        calibration: a further traverse, which tells how probably answers are right, or none; changed frames
+            of the route if not given
         calibration_truth: places that it shows, likewise
         device: what learns: cpu, cuda or cuda:1
     """
@@ -247,10 +247,10 @@ class Judging:
     Args:
         truth: offset (place = query + offset), csv of query,place[,place...], npz with GThard, or utm:25 for
             coordinates in image names
-        tolerance: right within this many places, inclusive
+        tolerance: right within so many places, inclusive
         interpolate: fill in a csv that lists some queries only
-        leave_out: diagnostic of templates, the reference on itself, this many frames to each side left out
-        top: write so many places of each query, no two within the tolerance, a row each with its rank
+        leave_out: of templates, a diagnostic: the reference on itself, without so many frames each side
+        top: write so many places of each query, no two within the tolerance
         distractors: another route, or several, '[A,B]': how many of its frames are accepted
         storage_curve: also evaluate maps of other sizes, which takes as long as all the rest
     """

@@ -143,11 +143,12 @@ def with_made(words: Sequence[str]) -> list[str]:
 
 
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
-    """Help without the list of every class that is installed."""
+    """Help without the list of every class that is installed; an option without a default has none."""
 
     def _expand_help(self, action: Any) -> str:
         text, cut, _ = super()._expand_help(action).partition(", known subclasses: ")
-        return text.replace("<class '", "").replace("'>", "") + (")" if cut else "")
+        text = text.replace("<class '", "").replace("'>", "").replace(" | null, default: null", "")
+        return text + (")" if cut else "")
 
 
 class Parser(jsonargparse.ArgumentParser):
