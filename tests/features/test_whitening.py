@@ -66,24 +66,20 @@ def test_a_season_is_whitened_away() -> None:
     assert found.float().mean() > 0.9
 
 
-@pytest.mark.parametrize(
-    ("views", "places", "words"),
-    [
+def test_what_cannot_be_whitened() -> None:
+    for views, places, words in (
         (torch.ones(3, 2), torch.ones(3, 2), ("the descriptors of 3 views", "by 0 in", "an augmentation")),
         (torch.zeros(0, 2), torch.zeros(0, 2), ("of 0 views", "more than rounding")),
         (torch.full((3, 2), math.nan), torch.ones(3, 2), ("by nan", "expected a finite number")),
         (torch.ones(3, 2) + 1e-6, torch.ones(3, 2), ("by 2", "more than rounding")),
-    ],
-    ids=str,
-)
-def test_what_cannot_be_whitened(views: Tensor, places: Tensor, words: tuple[str, ...]) -> None:
-    with refused(*words):
-        learned_whitening(views, places, 1)
-    coder = Coder(2, 3, hidden=4)
-    with refused(*words):
-        coder.whiten(views, places)
-    assert not coder.whitened
-    assert torch.equal(coder.projection, torch.eye(2))
+    ):
+        with refused(*words):
+            learned_whitening(views, places, 1)
+        coder = Coder(2, 3, hidden=4)
+        with refused(*words):
+            coder.whiten(views, places)
+        assert not coder.whitened
+        assert torch.equal(coder.projection, torch.eye(2))
 
 
 @pytest.mark.parametrize(("places", "views"), [(12, 12), (40, 30), (40, 400)])
@@ -172,17 +168,17 @@ def test_a_power_of_whitened_numbers() -> None:
     assert torch.equal(without(views), other(views))
 
 
-@pytest.mark.parametrize("numbers", [1, 2, 7, 10])
-def test_numbers_of_four_bits_come_back_from_their_bytes(numbers: int) -> None:
-    whole = torch.randint(-7, 8, (30, numbers), generator=torch.Generator().manual_seed(numbers))
-    projection = whole * torch.linspace(0.5, 2, numbers)  # each column holds its largest number
-    projection[0] = 7 * torch.linspace(0.5, 2, numbers)
-    whole[0] = 7
-    whitening = Whitening(bits=4)
-    whitening.take(torch.zeros(30), projection, None)
-    assert torch.equal(whitening.whole, whole.to(torch.int8))
-    torch.testing.assert_close(whitening.scale, torch.linspace(0.5, 2, numbers))
-    assert whitening.projection.nbytes == 30 * math.ceil(numbers / 2)
+def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
+    for numbers in (1, 2, 7, 10):
+        whole = torch.randint(-7, 8, (30, numbers), generator=torch.Generator().manual_seed(numbers))
+        projection = whole * torch.linspace(0.5, 2, numbers)  # each column holds its largest number
+        projection[0] = 7 * torch.linspace(0.5, 2, numbers)
+        whole[0] = 7
+        whitening = Whitening(bits=4)
+        whitening.take(torch.zeros(30), projection, None)
+        assert torch.equal(whitening.whole, whole.to(torch.int8))
+        torch.testing.assert_close(whitening.scale, torch.linspace(0.5, 2, numbers))
+        assert whitening.projection.nbytes == 30 * math.ceil(numbers / 2)
 
 
 def test_without_views_components_keep_their_variances() -> None:
@@ -232,17 +228,17 @@ def test_short_routes_are_looked_at_more_often() -> None:
     assert Whitening(views=2).copies(60, 1764) == 2
 
 
-@pytest.mark.parametrize("bits", [4, 8, 16])
-@pytest.mark.parametrize("numbers", [5, 8])
-def test_a_state_of_any_size_is_loaded(bits: int, numbers: int) -> None:
-    places, views = route()
-    one, other = Whitening(numbers, bits=bits), Whitening()
-    one.learn(places, [(views, torch.arange(600))])
-    other.learn(places[:, :9])
-    other.load_state_dict(one.state_dict())
-    assert torch.equal(other(views), one(views))
-    assert not Whitening().learned
-    assert torch.equal(Whitening()(views), views)
+def test_a_state_of_any_size_is_loaded() -> None:
+    for bits in (4, 8, 16):
+        for numbers in (5, 8):
+            places, views = route()
+            one, other = Whitening(numbers, bits=bits), Whitening()
+            one.learn(places, [(views, torch.arange(600))])
+            other.learn(places[:, :9])
+            other.load_state_dict(one.state_dict())
+            assert torch.equal(other(views), one(views))
+            assert not Whitening().learned
+            assert torch.equal(Whitening()(views), views)
 
 
 def test_gradients_reach_the_features() -> None:
@@ -267,9 +263,8 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
     assert agreement.min() > 0.99
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
+def test_whitening_settings_out_of_range() -> None:
+    for settings, words in (
         ({"numbers": 0}, ("numbers=0", "at least 1")),
         ({"numbers": 500}, ("numbers=500", "components=400")),
         ({"views": -1}, ("views=-1", "0 views")),
@@ -277,11 +272,9 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
         ({"bits": 6}, ("bits=6", "4, 8, 16")),
         ({"power": 0.0}, ("power=0.0", "above 0")),
         ({"power": 1.5}, ("power=1.5", "at most 1")),
-    ],
-)
-def test_whitening_settings_out_of_range(settings: dict[str, float], words: tuple[str, ...]) -> None:
-    with refused("Whitening got", *words):
-        Whitening(**settings)  # type: ignore[arg-type]
+    ):
+        with refused("Whitening got", *words):
+            Whitening(**settings)  # type: ignore[arg-type]
 
 
 def test_a_route_that_cannot_be_whitened() -> None:

@@ -140,8 +140,7 @@ def with_metadata(path: Path, metadata: dict[str, str] | None) -> None:
 # what comes back
 
 
-@pytest.mark.parametrize("reduction", ["mean", "sum"])
-@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
+@pytest.mark.parametrize(("metric", "reduction"), [("l1", "mean"), ("l2", "sum"), ("cosine", "mean")])
 def test_scores_are_equal_bit_for_bit(path: Path, metric: str, reduction: Any) -> None:
     model = template_model(periods=WINDOW, metric=metric, reduction=reduction, batch_size=7).learn(waves())
     model.save(path)
@@ -184,7 +183,7 @@ def test_a_fractional_period_survives(path: Path) -> None:
     assert torch.equal(again.map.plan[0].place_phases, layer.place_phases)
 
 
-@pytest.mark.parametrize("threshold", [None, 0.0, 0.7])
+@pytest.mark.parametrize("threshold", [0.0, 0.7])
 def test_the_threshold_is_stored(path: Path, threshold: float | None) -> None:
     model = template_model(periods=WINDOW, threshold=threshold).learn(waves())
     model.save(path)
@@ -346,9 +345,9 @@ def test_what_is_no_map_is_refused(saved: Path, change: Any, words: list[str]) -
 SEALED = f'{{"version": {FORMAT}, "checksums": '
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_damaged_metadata_is_refused(saved: Path) -> None:
+    whole = saved.read_bytes()
+    for text in (
         "",
         "{",
         "[]",
@@ -362,13 +361,11 @@ SEALED = f'{{"version": {FORMAT}, "checksums": '
         SEALED + '3, "header": {"threshold": NaN}}',
         SEALED + '3, "header": {"threshold": 1e999}}',
         SEALED + '3, "header": {"threshold": ' + "1" * 5000 + "}}",
-    ],
-    ids=lambda text: text[:50],
-)
-def test_damaged_metadata_is_refused(saved: Path, text: str) -> None:
-    with_metadata(saved, {NAME: text})
-    with refused(str(saved)):
-        DejaVu.load(saved)
+    ):
+        saved.write_bytes(whole)
+        with_metadata(saved, {NAME: text})
+        with refused(str(saved)):
+            DejaVu.load(saved)
 
 
 LAYERS = [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
@@ -378,7 +375,6 @@ CRAFTED_TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
         ({}, header, [])
         for header in (
             {MAPPER + "metric": "l7"},
-            {MAPPER + "metric": ["l1"]},
             {MAPPER + "metric": "l2"},
             {MAPPER + "reduction": "median"},
             {MAPPER + "temperature": 0.0},
@@ -386,12 +382,8 @@ CRAFTED_TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
             {"mapper": {"class_path": "HOG", "init_args": {}}},
             {"mapper": 3},
             {MAPPER + "periods": {"class_path": "HOG", "init_args": {}}},
-            {"map": None},
-            {"map": {}},
             {"map": {"kind": "templates"}},
             {"batch_size": 0},
-            {"batch_size": "many"},
-            {"batch_size": None},
             {"threshold": "low"},
             {"features": None},
             {"features": {}},
@@ -457,17 +449,17 @@ CRAFTED_TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("tensors", "header", "words"), CRAFTED_TEMPLATES, ids=str)
-def test_a_crafted_template_map_is_refused(
-    saved: Path, tensors: dict[str, Any], header: dict[str, Any], words: list[str]
-) -> None:
-    craft(saved, tensors, **header)
-    with refused(str(saved), *words):
-        DejaVu.load(saved)
+def test_crafted_template_maps_are_refused(saved: Path) -> None:
+    whole = saved.read_bytes()
+    for tensors, header, words in CRAFTED_TEMPLATES:
+        saved.write_bytes(whole)
+        craft(saved, tensors, **header)
+        with refused(str(saved), *words):
+            DejaVu.load(saved)
 
 
-@pytest.mark.parametrize("covered", [10**8, 2**50])
-def test_layers_of_more_places_than_can_be_meant_are_refused(saved: Path, covered: int) -> None:
+def test_layers_of_more_places_than_can_be_meant_are_refused(saved: Path) -> None:
+    covered = 2**50
     layers = [[*layer[:4], covered] for layer in LAYERS]
     craft(saved, {"map.layers": layers}, **{"map.places": covered})
     for read in (DejaVu.load, read_place_map):
@@ -555,7 +547,6 @@ CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
             {"frame_shape": [1, 10**9, 10**9]},
             {"frame_shape": [1, -4, 4]},
             {"frame_shape": 64},
-            {"frame_shape": [64.0]},
             {"trained": {"steps": 2**62, "seed": 0}},
             {"trained": {"steps": "many", "seed": 0}},
             {"names": "x" * 100},
@@ -568,7 +559,6 @@ CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
             {FEATURES + "squeeze": 10**9},
             {FEATURES + "resize": [10**9, 10**9]},
             {FEATURES + "resize": [16]},
-            {FEATURES + "surprise": 1},
             {WHITENING + "power": "nan"},
             {WHITENING + "bits": 4.0},
             {WHITENING + "strengths": {"gain": 2**62}},
@@ -577,7 +567,6 @@ CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
             {MAPPER + "route_bytes_per_place": [5]},
             {"map": [1]},
             {"map.places": 10**12},
-            {"map.places": 2**62},
             {"map.dimension": 10**12},
             {"map.kind": "templates"},
             {"map.metric": "l2"},
@@ -597,14 +586,12 @@ CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("tensors", "header", "words"), CRAFTED_LINES, ids=lambda value: str(value)[:60])
-def test_a_crafted_spectral_map_is_refused(
-    path: Path, whole_maps: list[Path], tensors: dict[str, Any], header: dict[str, Any], words: list[str]
-) -> None:
-    craft(spectral(path, whole_maps), tensors, **header)
-    for read in (DejaVu.load, read_place_map) if tensors else (DejaVu.load,):
-        with refused(str(path), *words):
-            read(path)
+def test_crafted_spectral_maps_are_refused(path: Path, whole_maps: list[Path]) -> None:
+    for tensors, header, words in CRAFTED_LINES:
+        craft(spectral(path, whole_maps), tensors, **header)
+        for read in (DejaVu.load, read_place_map) if tensors else (DejaVu.load,):
+            with refused(str(path), *words):
+                read(path)
 
 
 def test_a_map_of_large_frames_can_be_read(path: Path) -> None:
@@ -934,9 +921,9 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     sys.modules.pop("dejavu_torch_extra", None)
 
 
-@pytest.mark.parametrize(
-    "class_path",
-    [
+def test_no_foreign_class_path_is_imported(saved: Path, trap: Path) -> None:
+    whole = saved.read_bytes()
+    for class_path in (
         "trap_module.Net",
         "dejavu_torch_extra.Net",
         "os.system",
@@ -946,31 +933,22 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         ".trap_module.Net",
         "dejavu_torch.types.torch.nn.Flatten",
         "dejavu_torch...trap_module.Net",
-    ],
-)
-@pytest.mark.parametrize("init_args", [{}, {"command": "touch mark"}])
-@pytest.mark.parametrize("nested", [False, True])
-def test_no_foreign_class_path_is_imported(
-    saved: Path, trap: Path, class_path: str, init_args: dict[str, str], nested: bool
-) -> None:
-    foreign: dict[str, Any] = {"class_path": class_path, "init_args": init_args}
-    if nested:
-        outer = "Embedding"
-        foreign = {"class_path": outer, "init_args": {"network": foreign}}
-    craft(saved, features=foreign)
-    with refused(class_path):
-        DejaVu.load(saved)
-    with refused("HOG"):
-        DejaVu.load(saved, HOG())
+    ):
+        foreign: dict[str, Any] = {"class_path": class_path, "init_args": {"command": "touch mark"}}
+        nested = {"class_path": "Embedding", "init_args": {"network": foreign}}
+        for features in (foreign, foreign | {"init_args": {}}, nested):
+            saved.write_bytes(whole)
+            craft(saved, features=features)
+            with refused(class_path):
+                DejaVu.load(saved)
+            with refused("HOG"):
+                DejaVu.load(saved, HOG())
     assert not trap.exists()
     assert not {"trap_module", "dejavu_torch_extra"} & sys.modules.keys()
 
 
-@pytest.mark.parametrize("class_path", ["trap_module.Net", "dejavu_torch_extra.Net", "os.system"])
-def test_a_foreign_period_finder_is_not_imported_and_not_needed(
-    saved: Path, trap: Path, class_path: str
-) -> None:
+def test_a_foreign_period_finder_is_not_imported_and_not_needed(saved: Path, trap: Path) -> None:
     expected = DejaVu.load(saved).localize(waves())
-    craft(saved, mapper=mapper(periods={"class_path": class_path, "init_args": {}}))
+    craft(saved, mapper=mapper(periods={"class_path": "trap_module.Net", "init_args": {}}))
     assert torch.equal(DejaVu.load(saved).localize(waves()).index, expected.index)
     assert not trap.exists()

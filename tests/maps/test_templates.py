@@ -76,9 +76,9 @@ def test_convention_1_the_mask_is_zero_outside_the_half_open_chunk() -> None:
     assert mu.tolist() == [[1.0], [2.0]]
 
 
-@pytest.mark.parametrize("dtype", [None, torch.float64, torch.bool])
-def test_mask_dtype(dtype: torch.dtype | None) -> None:
-    assert phase_mask(5, 2, dtype=dtype).dtype == (dtype or torch.float32)
+def test_mask_dtype() -> None:
+    for dtype in (None, torch.float64, torch.bool):
+        assert phase_mask(5, 2, dtype=dtype).dtype == (dtype or torch.float32)
 
 
 @given(reference.routes())
@@ -98,13 +98,13 @@ def test_templates_are_means_under_the_mask(route: reference.Route) -> None:
         torch.testing.assert_close(mu, total / mask.sum(1, keepdim=True).clamp(min=1), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("period", [3, 8, 31])
-def test_a_perfectly_periodic_traverse_is_reproduced(period: int) -> None:
-    cycle = torch.randint(-64, 65, (period, 4)).double() / 64
-    values = cycle.repeat(5, 1)[: 4 * period + 2]
-    (mu,) = PhaseTemplates()(values, [whole(period, len(values), (0, 1, 2, 3))])
-    assert torch.equal(mu, cycle)
-    assert torch.equal(mu[torch.arange(len(values)) % period], values)
+def test_a_perfectly_periodic_traverse_is_reproduced() -> None:
+    for period in (3, 8, 31):
+        cycle = torch.randint(-64, 65, (period, 4)).double() / 64
+        values = cycle.repeat(5, 1)[: 4 * period + 2]
+        (mu,) = PhaseTemplates()(values, [whole(period, len(values), (0, 1, 2, 3))])
+        assert torch.equal(mu, cycle)
+        assert torch.equal(mu[torch.arange(len(values)) % period], values)
 
 
 def test_a_rational_period_is_reproduced_too() -> None:
@@ -186,9 +186,8 @@ def test_a_plan_without_layers_has_no_templates() -> None:
     assert PhaseTemplates()(torch.rand(5, 2), ()) == ()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_masks_that_make_no_sense_are_refused() -> None:
+    for arguments, message in (
         ({"period": Fraction(5, 2)}, r"period 5/2 and no phases; expected phases"),
         ({"period": 3, "stop": 11}, r"chunk \[0, 11\); expected it inside 10 frames"),
         ({"period": 3, "start": 5, "stop": 5}, r"covers \[5, 5\); expected 0 <= start < stop"),
@@ -196,29 +195,24 @@ def test_a_plan_without_layers_has_no_templates() -> None:
         ({"period": 0}, r"period 0 .*expected period > 0"),
         ({"period": -3, "phases": 3}, r"period -3 .*expected period > 0"),
         ({"period": 3, "phases": 0}, r"0 phases; expected .*phases >= 1"),
-    ],
-)
-def test_masks_that_make_no_sense_are_refused(arguments: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        phase_mask(10, **arguments)
+    ):
+        with pytest.raises(InputError, match=message):
+            phase_mask(10, **arguments)
 
 
-@pytest.mark.parametrize("features", [(), (1, 0), (0, 0), (-1, 2)])
-def test_layers_name_each_feature_once_in_order(features: tuple[int, ...]) -> None:
-    with pytest.raises(InputError, match=r"feature indices must be .*increasing"):
-        whole(3, 10, features)
+def test_layers_name_each_feature_once_in_order() -> None:
+    for features in ((), (1, 0), (0, 0), (-1, 2)):
+        with pytest.raises(InputError, match=r"feature indices must be .*increasing"):
+            whole(3, 10, features)
 
 
-@pytest.mark.parametrize(
-    ("layer", "message"),
-    [
+def test_a_layer_beyond_the_traverse_is_refused() -> None:
+    for layer, message in (
         (whole(3, stop=11), r"covers \[0, 11\) and feature 0; expected it inside 10 places of 2 features"),
         (whole(3, 10, (0, 2)), r"feature 2; expected it inside 10 places of 2 features"),
-    ],
-)
-def test_a_layer_beyond_the_traverse_is_refused(layer: FrequencyLayer, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        PhaseTemplates()(torch.rand(10, 2), [layer])
+    ):
+        with pytest.raises(InputError, match=message):
+            PhaseTemplates()(torch.rand(10, 2), [layer])
 
 
 def test_phases_of_a_turn_may_have_unequal_lengths() -> None:

