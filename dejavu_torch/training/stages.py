@@ -52,6 +52,7 @@ class Task(Protocol):
     log_temperature: nn.Parameter
     losses: Objective
     views: Views | None
+    views_drawn_at: Tensor | None
     places: Tensor | None
 
     @property
@@ -332,9 +333,17 @@ def _trainable(module: nn.Module) -> list[nn.Parameter]:
 
 
 def describe_views(task: Task) -> Views:
-    """Descriptors of all training frames of known places, under several augmentations of each."""
-    room = NUMBERS // len(_coder(embedding_of(task)).mean)
-    descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
+    """Descriptors of all training frames of known places, under several augmentations of each.
+
+    A run that is resumed draws those of the first one again.
+    """
+    room, again = NUMBERS // len(_coder(embedding_of(task)).mean), task.views_drawn_at is not None
+    with torch.random.fork_rng(devices=[], enabled=again):
+        if task.views_drawn_at is None:
+            task.views_drawn_at = torch.get_rng_state()
+        else:
+            torch.set_rng_state(task.views_drawn_at)
+        descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
     return Views(torch.cat(descriptors), torch.cat(positives))
 
 

@@ -33,11 +33,12 @@ from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.chance import LastLosses
 from dejavu_torch.training.checkpoint import (
     CheckpointFiles,
+    check_random,
     check_resumable,
     read_checkpoint,
     taking_over,
 )
-from dejavu_torch.training.datamodule import FEW, Batch, RouteData, as_frames
+from dejavu_torch.training.datamodule import FEW, Batch, Clips, RouteData, as_frames
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.processes import average_gradients, averaged, share, shared_statistics
@@ -61,6 +62,8 @@ TEMPERATURE = 0.03  # of `log_posterior` at the start
 DESCRIPTOR = 0.4  # of the steps of a training whose descriptor gets a code
 MAP = "dejavu.map."  # ahead of the names of the map's tensors in a checkpoint
 WHITENING = "dejavu.whitening."
+FEATURES = "dejavu.features."
+RANDOM = "random"  # numbers of a training, in a checkpoint
 CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
 NETWORK = "network."  # of any Embedding
 
@@ -190,6 +193,9 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
         self.held_before: list[int] | None = None  # stretches, of the training that a checkpoint comes from
         self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
+        self.before: dict[str, Tensor] = {}  # the step: state of the random numbers, buffers of the backbone
+        self.views_drawn_at: Tensor | None = None  # and ahead of the views
+        self.replayed: dict[str, Any] | None = None  # random numbers that a resumed run goes on with
         self._callbacks: list[pl.Callback] = []
 
     @property
@@ -279,7 +285,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.dejavu.features = HOG()  # has nothing to store
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
         # a further training describes its own frames
-        self.began, self.views, self.places = 0, None, None
+        self.began, self.views, self.places, self.views_drawn_at = 0, None, None, None
         self.last = LastLosses()
 
     def _say_few(self) -> None:
@@ -399,6 +405,9 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Refuse what cannot be resumed; callbacks that watch a figure wait for the last stage."""
         if self.resumed is not None:
             check_resumable(self.resumed, self.trainer)
+            self.replayed = self.resumed.get(RANDOM)
+            if self.replayed is not None:
+                self.data.replayed = (self.replayed["order"], self.replayed["done"])
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
             self.trainer.callbacks = [  # type: ignore[attr-defined]
@@ -414,6 +423,8 @@ class PlaceRecognitionTask(pl.LightningModule):
 
         A map that is made of the features does not outlast them.
         """
+        if self.replayed is not None:
+            self._replay(self.replayed)
         if self.made and self.map.places:
             self.dejavu.load_state_dict(self._unmade(), strict=False)
         if not self.in_last_stage and self.global_step >= self._stop():
@@ -421,6 +432,8 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.trainer.strategy.setup_optimizers(self.trainer)
             if self.in_last_stage:
                 self.trainer.callbacks = self._callbacks
+        buffers = self.dejavu.features.named_buffers()
+        self.before = {name: buffer.clone() for name, buffer in buffers} | {RANDOM: torch.get_rng_state()}
 
     def on_train_epoch_start(self) -> None:
         """Find the layers anew where it is time to."""
@@ -544,6 +557,13 @@ class PlaceRecognitionTask(pl.LightningModule):
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
         checkpoint |= {"routes": self._routes(), "held": self.held}
+        checkpoint[RANDOM] = self._random()
+        if (
+            checkpoint[RANDOM] is not None and self._in_step()
+        ):  # running statistics may have followed its batch
+            for name, before in self.before.items():
+                if f"{FEATURES}{name}" in checkpoint["state_dict"]:
+                    checkpoint["state_dict"][f"{FEATURES}{name}"] = before
         if self.made:
             checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
 
@@ -567,6 +587,9 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.resumed = checkpoint
             if self.trainer.state.fn != "fit":
                 checkpoint.pop("loops", None)  # nothing goes on
+            elif checkpoint.get(RANDOM) is not None:
+                check_random(checkpoint[RANDOM])
+                self.views_drawn_at = checkpoint[RANDOM]["views"]
         self.routes = checkpoint.get("routes", [])
         if not isinstance(self.routes, list) or not all(isinstance(one, list) for one in self.routes):
             raise InputError(
@@ -586,6 +609,45 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both; expected a "
                 "checkpoint of the same settings"
             )
+
+    def _random(self) -> dict[str, Any] | None:
+        """What a resumed run needs to draw the same numbers, on a CPU; None where no training runs.
+
+        now: the state of the random numbers behind the last whole step. order: that ahead of the order of the
+        present epoch, of whose batches so many are done. views: that ahead of `describe_views`.
+        """
+        clips = self._clips()
+        if clips is None or clips.drawn_at is None or not self.before:
+            return None
+        now, done = (
+            self.before[RANDOM] if self._in_step() else torch.get_rng_state(),
+            self._progress().processed,
+        )
+        in_epoch = done < self.trainer.num_training_batches
+        order, done = (clips.drawn_at, done) if in_epoch else (now, 0)
+        return {"now": now, "order": order, "done": done, "views": self.views_drawn_at}
+
+    def _replay(self, random: dict[str, Any]) -> None:
+        """Go on with the random numbers of a checkpoint, at the first step behind it."""
+        clips, now = self._clips(), random["now"]
+        if clips is not None and clips.replayed is not None:
+            clips.replayed = None
+            now = clips.drawn_to if torch.equal(now, random["order"]) else now  # an epoch began
+        torch.set_rng_state(now)
+        self.replayed = None
+
+    def _clips(self) -> Clips | None:
+        clips = getattr(self._trainer and self.trainer.train_dataloader, "sampler", None)
+        return clips if isinstance(clips, Clips) else None
+
+    def _progress(self) -> Any:
+        """Of the batches of this epoch."""
+        return self.trainer.fit_loop.epoch_loop.batch_progress.current
+
+    def _in_step(self) -> bool:
+        """Whether a step has begun and is not over."""
+        progress = self._progress()
+        return bool(progress.processed < progress.ready)
 
     def _check_finite(self, state: dict[str, Any]) -> None:
         """Refuse NaN and infinity, but for buffers of the backbone, such as a mask."""
