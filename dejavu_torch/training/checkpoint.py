@@ -215,28 +215,6 @@ def check_resumable(checkpoint: dict[str, Any], trainer: pl.Trainer) -> None:
         check_moments(optimizer, state["state"])
 
 
-def check_random(random: Any) -> None:
-    """Refuse what is no state of the random numbers of a training.
-
-    Raises:
-        InputError: what is missing, of another type, or no state of torch's.
-    """
-    states, done = ("now", "order", "views"), random.get("done") if isinstance(random, dict) else None
-    whole = isinstance(done, int) and not isinstance(done, bool) and 0 <= done < MOST
-    try:
-        if not whole or random.keys() != {*states, "done"}:
-            raise TypeError("other entries")
-        for name in states:
-            if random[name] is not None or name != "views":
-                torch.Generator().set_state(random[name])
-    except (TypeError, RuntimeError) as error:
-        told = one_line(error)[:80]
-        raise InputError(
-            f"the checkpoint cannot be resumed: its random numbers are no state of torch's ({told}); "
-            f"{EXPECTED}"
-        ) from error
-
-
 def check_alike(given: Any, own: Any, where: str) -> None:
     """Refuse a state whose keys, lengths or types are not those of one's own.
 

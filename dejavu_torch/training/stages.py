@@ -48,11 +48,10 @@ class Task(Protocol):
     dejavu: DejaVu
     made: bool
     gives_way: bool
-    frozen: list[nn.Module]
+    frozen: set[str]
     log_temperature: nn.Parameter
     losses: Objective
     views: Views | None
-    views_drawn_at: Tensor | None
     places: Tensor | None
 
     @property
@@ -242,9 +241,8 @@ class CodeStage(Stage):
 
     def begin(self, task: Task) -> None:
         if has_descriptor(task.dejavu.features):
-            network = embedding_of(task).network
-            if not any(module is network for module in task.frozen):
-                task.frozen.append(network.eval())
+            task.frozen.add("network")
+            embedding_of(task).network.eval()
             task.views = describe_views(task) if task.views is None else task.views
         if not task.dejavu.map.places:
             task.relearn()
@@ -333,17 +331,9 @@ def _trainable(module: nn.Module) -> list[nn.Parameter]:
 
 
 def describe_views(task: Task) -> Views:
-    """Descriptors of all training frames of known places, under several augmentations of each.
-
-    A run that is resumed draws those of the first one again.
-    """
-    room, again = NUMBERS // len(_coder(embedding_of(task)).mean), task.views_drawn_at is not None
-    with torch.random.fork_rng(devices=[], enabled=again):
-        if task.views_drawn_at is None:
-            task.views_drawn_at = torch.get_rng_state()
-        else:
-            torch.set_rng_state(task.views_drawn_at)
-        descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
+    """Descriptors of all training frames of known places, under several augmentations of each."""
+    room = NUMBERS // len(_coder(embedding_of(task)).mean)
+    descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
     return Views(torch.cat(descriptors), torch.cat(positives))
 
 

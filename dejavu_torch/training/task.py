@@ -33,15 +33,14 @@ from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.chance import LastLosses
 from dejavu_torch.training.checkpoint import (
     CheckpointFiles,
-    check_random,
     check_resumable,
     read_checkpoint,
     taking_over,
 )
-from dejavu_torch.training.datamodule import FEW, Batch, Clips, RouteData, as_frames
+from dejavu_torch.training.datamodule import FEW, Batch, RouteData, as_frames
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.training.processes import average_gradients, averaged, share, shared_statistics
+from dejavu_torch.training.processes import average_gradients, averaged, share
 from dejavu_torch.training.stages import (
     CodeStage,
     RateStage,
@@ -62,8 +61,6 @@ TEMPERATURE = 0.03  # of `log_posterior` at the start
 DESCRIPTOR = 0.4  # of the steps of a training whose descriptor gets a code
 MAP = "dejavu.map."  # ahead of the names of the map's tensors in a checkpoint
 WHITENING = "dejavu.whitening."
-FEATURES = "dejavu.features."
-RANDOM = "random"  # numbers of a training, in a checkpoint
 CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
 NETWORK = "network."  # of any Embedding
 
@@ -175,7 +172,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.dejavu = DejaVu(backbone, whitening, mapper, batch_size=batch_size, preprocess=preprocess)
         if start is not None:
             start_from(backbone, start)
-        self.frozen = [module.eval() for module in freeze_parts(backbone, freeze or [], batch_norm)]
+        self.frozen = freeze_parts(backbone, freeze or [], batch_norm)
+        self.train()
         temperature = mapper.temperature if isinstance(mapper, TemplateMapper) else None
         self.log_temperature = nn.Parameter(torch.tensor(math.log(temperature or TEMPERATURE)))
         self.feature_weights, self.refresh = feature_weights, refresh
@@ -193,9 +191,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
         self.held_before: list[int] | None = None  # stretches, of the training that a checkpoint comes from
         self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
-        self.before: dict[str, Tensor] = {}  # the step: state of the random numbers, buffers of the backbone
-        self.views_drawn_at: Tensor | None = None  # and ahead of the views
-        self.replayed: dict[str, Any] | None = None  # random numbers that a resumed run goes on with
         self._callbacks: list[pl.Callback] = []
 
     @property
@@ -282,10 +277,10 @@ class PlaceRecognitionTask(pl.LightningModule):
             )
         if reference.values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")
-            self.dejavu.features = HOG()  # has nothing to store
+            self.dejavu.features, self.frozen = HOG(), set()  # has nothing to store
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
         # a further training describes its own frames
-        self.began, self.views, self.places, self.views_drawn_at = 0, None, None, None
+        self.began, self.views, self.places = 0, None, None
         self.last = LastLosses()
 
     def _say_few(self) -> None:
@@ -405,9 +400,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Refuse what cannot be resumed; callbacks that watch a figure wait for the last stage."""
         if self.resumed is not None:
             check_resumable(self.resumed, self.trainer)
-            self.replayed = self.resumed.get(RANDOM)
-            if self.replayed is not None:
-                self.data.replayed = (self.replayed["order"], self.replayed["done"])
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
             self.trainer.callbacks = [  # type: ignore[attr-defined]
@@ -423,8 +415,6 @@ class PlaceRecognitionTask(pl.LightningModule):
 
         A map that is made of the features does not outlast them.
         """
-        if self.replayed is not None:
-            self._replay(self.replayed)
         if self.made and self.map.places:
             self.dejavu.load_state_dict(self._unmade(), strict=False)
         if not self.in_last_stage and self.global_step >= self._stop():
@@ -432,8 +422,6 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.trainer.strategy.setup_optimizers(self.trainer)
             if self.in_last_stage:
                 self.trainer.callbacks = self._callbacks
-        buffers = self.dejavu.features.named_buffers()
-        self.before = {name: buffer.clone() for name, buffer in buffers} | {RANDOM: torch.get_rng_state()}
 
     def on_train_epoch_start(self) -> None:
         """Find the layers anew where it is time to."""
@@ -445,8 +433,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
-        with shared_statistics(self.dejavu.features):
-            total, parts, left_out = self.stage.losses(self, batch)
+        total, parts, left_out = self.stage.losses(self, batch)
         figures = averaged(torch.stack([total, *parts.values()]).detach())
         parts = dict(zip(parts, figures[1:], strict=True))
         if not figures[0].isfinite():
@@ -480,14 +467,13 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_after_backward(self) -> None:
         """The gradients of all processes, ahead of their scaling and clipping."""
-        for optimizer in self.trainer.optimizers:
-            average_gradients(p for group in optimizer.param_groups for p in group["params"])
+        average_gradients(self.trainer.optimizers, self.dejavu.features)
 
     def train(self, mode: bool = True) -> PlaceRecognitionTask:
         """As nn.Module's, but what is frozen keeps its running statistics."""
         super().train(mode)
-        for module in self.frozen:
-            module.eval()
+        for name in self.frozen:
+            self.dejavu.features.get_submodule(name).eval()
         return self
 
     def teardown(self, stage: str) -> None:
@@ -557,13 +543,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
         checkpoint |= {"routes": self._routes(), "held": self.held}
-        checkpoint[RANDOM] = self._random()
-        if (
-            checkpoint[RANDOM] is not None and self._in_step()
-        ):  # running statistics may have followed its batch
-            for name, before in self.before.items():
-                if f"{FEATURES}{name}" in checkpoint["state_dict"]:
-                    checkpoint["state_dict"][f"{FEATURES}{name}"] = before
         if self.made:
             checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
 
@@ -587,9 +566,6 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.resumed = checkpoint
             if self.trainer.state.fn != "fit":
                 checkpoint.pop("loops", None)  # nothing goes on
-            elif checkpoint.get(RANDOM) is not None:
-                check_random(checkpoint[RANDOM])
-                self.views_drawn_at = checkpoint[RANDOM]["views"]
         self.routes = checkpoint.get("routes", [])
         if not isinstance(self.routes, list) or not all(isinstance(one, list) for one in self.routes):
             raise InputError(
@@ -609,45 +585,6 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both; expected a "
                 "checkpoint of the same settings"
             )
-
-    def _random(self) -> dict[str, Any] | None:
-        """What a resumed run needs to draw the same numbers, on a CPU; None where no training runs.
-
-        now: the state of the random numbers behind the last whole step. order: that ahead of the order of the
-        present epoch, of whose batches so many are done. views: that ahead of `describe_views`.
-        """
-        clips = self._clips()
-        if clips is None or clips.drawn_at is None or not self.before:
-            return None
-        now, done = (
-            self.before[RANDOM] if self._in_step() else torch.get_rng_state(),
-            self._progress().processed,
-        )
-        in_epoch = done < self.trainer.num_training_batches
-        order, done = (clips.drawn_at, done) if in_epoch else (now, 0)
-        return {"now": now, "order": order, "done": done, "views": self.views_drawn_at}
-
-    def _replay(self, random: dict[str, Any]) -> None:
-        """Go on with the random numbers of a checkpoint, at the first step behind it."""
-        clips, now = self._clips(), random["now"]
-        if clips is not None and clips.replayed is not None:
-            clips.replayed = None
-            now = clips.drawn_to if torch.equal(now, random["order"]) else now  # an epoch began
-        torch.set_rng_state(now)
-        self.replayed = None
-
-    def _clips(self) -> Clips | None:
-        clips = getattr(self._trainer and self.trainer.train_dataloader, "sampler", None)
-        return clips if isinstance(clips, Clips) else None
-
-    def _progress(self) -> Any:
-        """Of the batches of this epoch."""
-        return self.trainer.fit_loop.epoch_loop.batch_progress.current
-
-    def _in_step(self) -> bool:
-        """Whether a step has begun and is not over."""
-        progress = self._progress()
-        return bool(progress.processed < progress.ready)
 
     def _check_finite(self, state: dict[str, Any]) -> None:
         """Refuse NaN and infinity, but for buffers of the backbone, such as a mask."""
@@ -752,8 +689,8 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
 
 def freeze_parts(
     backbone: nn.Module, prefixes: Sequence[str], batch_norm: Literal["train", "frozen"]
-) -> list[nn.Module]:
-    """Take the gradient from parameters; return the modules whose running statistics have to stay.
+) -> set[str]:
+    """Take the gradient from parameters; return the names of modules whose running statistics have to stay.
 
     Args:
         prefixes: parameters whose names begin with one of these are frozen; "" is all of them.
@@ -772,12 +709,12 @@ def freeze_parts(
             )
         for parameter in chosen:
             parameter.requires_grad_(False)
-    return [
-        module
+    return {
+        name
         for name, module in backbone.named_modules()
         if getattr(module, "running_mean", None) is not None  # follows the batches without any gradient
         and (batch_norm == "frozen" or any(f"{name}.".startswith(prefix) for prefix in prefixes))
-    ]
+    }
 
 
 def warm_up(steps: int) -> int:
