@@ -18,11 +18,18 @@ from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.training.chance import phase_chance, place_chance
 from dejavu_torch.training.datamodule import Batch, RouteData, StoredFrames, as_frames
-from dejavu_torch.training.losses import Losses, Objective, place_cross_entropy
+from dejavu_torch.training.losses import (
+    STEP,
+    Losses,
+    Objective,
+    bands_of,
+    coded_proxies,
+    phase_chance,
+    place_chance,
+    place_cross_entropy,
+)
 from dejavu_torch.training.processes import noise_like, own_part, own_random
-from dejavu_torch.training.rate import STEP, bands_of, coded_proxies
 from dejavu_torch.types import InputError
 
 ROUNDS = 10  # views of each training frame, for whitening and code

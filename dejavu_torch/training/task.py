@@ -30,7 +30,6 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.training.chance import LastLosses
 from dejavu_torch.training.checkpoint import (
     CheckpointFiles,
     check_resumable,
@@ -38,7 +37,7 @@ from dejavu_torch.training.checkpoint import (
     taking_over,
 )
 from dejavu_torch.training.datamodule import FEW, Batch, RouteData, as_frames
-from dejavu_torch.training.losses import Objective
+from dejavu_torch.training.losses import LastLosses, Objective
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.processes import average_gradients, averaged, share
 from dejavu_torch.training.stages import (

@@ -20,8 +20,7 @@ from dejavu_torch import RouteData, SpectralMapper, Whitening
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import Transform, from_spectrum, spectrum
-from dejavu_torch.training.losses import laplace_bits
-from dejavu_torch.training.rate import bands_of, coded_proxies
+from dejavu_torch.training.losses import bands_of, coded_proxies, laplace_bits
 from dejavu_torch.training.stages import DescriptorStage
 from dejavu_torch.training.task import PlaceRecognitionTask
 
