@@ -45,12 +45,12 @@ from dejavu_torch.training.stages import (
     RateStage,
     Stage,
     Views,
-    WhiteningStage,
     coded_places,
     has_descriptor,
     make_map,
     stages_of,
     stored_features,
+    whitens,
 )
 from dejavu_torch.types import InputError, Plan, Training
 
@@ -65,52 +65,48 @@ NETWORK = "network."  # of any Embedding
 
 
 class PlaceRecognitionTask(pl.LightningModule):
-    """A `DejaVu` model that is trained: its features are made to repeat with the periods of its layers.
+    """A `DejaVu` model in training: its features learn to repeat with the periods of its layers.
 
-    The map's templates start as the phase means of the untrained features (eq. 1) and are parameters from
-    then on. Periods are exact numbers and never get a gradient: they are imposed, or found anew in the
-    features every few epochs. A training is a list of stages, see `stages_of`; most backbones have one.
+    The templates of the map start as the phase means of the untrained features (eq. 1) and then are
+    parameters. Periods never get a gradient: they are imposed, or found anew every few epochs. Of an
+    `Embedding` with a hidden layer the descriptor is trained first, then its code, see `stages_of`.
 
-    Any other map, such as a spectral one, is not trained: all steps train the descriptor, and the map is made
-    of it in closed form wherever one is needed. The descriptor is the backbone's output; of an `Embedding`
-    with a hidden layer the code is left out.
+    Any other map, such as a spectral one, is not trained: all steps train the descriptor, without the code of
+    an `Embedding`, and the map is made of it in closed form.
 
     Args:
-        backbone: nn.Module (B,C,H,W) -> (B,D); None is `SmallCNN` with its defaults.
-        mapper: makes the map; the temperature of a TemplateMapper is where the trained one starts, 0.03 where
-            it is None. None is `TemplateMapper(ImposedPeriods(), temperature=0.03)`.
-        whitening: of the descriptor, ahead of a map that is made of it; it learns from views under the
-            training's augmentation and of the second traverse, its `strengths` count for nothing. None and
-            "none" are as in `DejaVu`, but None is "none" with a `rate`: whitening would mix the features.
+        backbone: nn.Module (B,C,H,W) -> (B,D); None is `SmallCNN()`.
+        mapper: makes the map; its temperature is where that of templates starts, 0.03 if it is None. None is
+            `TemplateMapper(ImposedPeriods())`.
+        whitening: of the descriptor, if the map is made of it. It learns from views under the training's
+            augmentation and of the second traverse; its `strengths` are not used. None and "none" are as in
+            `DejaVu`, but None is "none" with a `rate`: whitening would mix the features.
         preprocess: as in `DejaVu`.
-        feature_weights: learn what a difference in each feature counts, at least 0.
-        descriptor: share of the steps in which the network of an `Embedding` with a hidden layer learns its
-            descriptor, ahead of the code.
+        feature_weights: learn a weight of each feature, at least 0; of templates, as the next and
+            `refresh` and `losses`.
+        descriptor: share of the steps in which an `Embedding` with a hidden layer learns its descriptor.
         start: a map file of the same backbone, whose weights to start from.
-        freeze: parameters of the backbone whose names begin with one of these stay as they are, and
-            so do the running statistics below; "" is all of it.
-        batch_norm: "train" lets BatchNorm follow the batches, which hold frames from all over the route;
-            "frozen" keeps its running statistics, as pretrained networks and few frames want.
-        refresh: epochs after which the layers are found anew, and templates start over from the phase means;
-            0 never.
-        losses: which losses count, and how much. Like feature_weights, descriptor and refresh it is of
-            templates alone.
-        rate: what a bit per place of the map counts beside the cross-entropy of the place, in nats; of maps
-            that are made of the descriptor alone. With it the descriptor learns to be made of few
-            frequencies, see `coded_proxies`.
+        freeze: beginnings of names of parameters that stay as they are, with their running statistics; "" is
+            all of the backbone.
+        batch_norm: "train" lets BatchNorm follow the batches; "frozen" keeps its running statistics, as
+            pretrained networks and few frames want.
+        refresh: epochs after which layers are found anew and templates restart as phase means; 0 never.
+        losses: which losses count, and how much.
+        rate: weight of a bit per place of the map beside the cross-entropy of the place, in nats; of maps
+            made of the descriptor, which then consists of few frequencies, see `coded_proxies`.
         lr: highest learning rate of AdamW; it rises over the first tenth of a stage's steps and falls to 0.
         weight_decay: of weights that are multiplied with something, not of biases, templates and the like.
-        batch_size: frames in memory at a time where features are made without gradients.
+        batch_size: frames in memory at a time if features are made without gradients.
         weight_bits: of each weight of the backbone in the map file, 8 or 32, as of `DejaVu`. Training and
             checkpoints have 32; a map that is made of a descriptor, validation and test see rounded ones.
 
-    Convention: what watches a figure, `EarlyStopping` or a `ModelCheckpoint` with `monitor`, begins with the
-        last stage, and so does validation: figures of two stages do not compare.
+    Convention: `EarlyStopping`, a `ModelCheckpoint` with `monitor`, and validation begin with the last stage:
+        figures of two stages do not compare.
 
     Raises:
         InputError: settings out of range; a backbone that gives no (B,D); a loss that is not finite; a
             checkpoint of other settings.
-        NothingLearned: an InputError; the mean loss of 100 steps behind the rise of the learning rate, or of
+        NothingLearned: an InputError; the mean loss of 100 steps after the rise of the learning rate, or of
             the last 100 of a stage, is that of a guess.
     """
 
@@ -180,8 +176,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.lr, self.weight_decay, self.weight_bits = lr, weight_decay, weight_bits
         self.gives_way = False  # whether bytes per place that a short route cannot meet are raised
         self.stages = nn.ModuleList(stages_of(backbone, descriptor, self.made, rate))
-        self.index = 0  # of the stage
-        self.began = 0  # the step at which it began
+        self.index, self.began = 0, 0  # the stage, and the step at which it began
         self.last = LastLosses()  # of the stage
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
         self.places: Tensor | None = None  # its descriptors of the reference
@@ -227,10 +222,8 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     @property
     def frame_size(self) -> tuple[int, int] | None:
-        """(height, width) that frames may be stored in: what the backbone resizes them to anyway.
-
-        None where it does not, or where a contrast is evened ahead of it, at the frames' own size.
-        """
+        """(height, width) to which the backbone resizes frames, so that they may be stored in it; None if it
+        does not, or a contrast is evened before, at the frames' own size."""
         return None if self.dejavu.preprocess.contrast else getattr(self.dejavu.features, "resize", None)
 
     @property
@@ -268,8 +261,8 @@ class PlaceRecognitionTask(pl.LightningModule):
                 "those of the map of one route; expected model.rate 0, or one route"
             )
         still = not self.data.augmentation.acts and self.data.sources["second"] is None
-        whitens = any(isinstance(one, WhiteningStage) for one in self.stages)
-        if still and (whitens or (self.made and self.dejavu.whitening is not None)):
+        whitened = self.dejavu.whitening is not None if self.made else whitens(self.dejavu.features)
+        if still and whitened:
             raise InputError(
                 "data.augmentation changes nothing and there is no data.second: nothing shows the whitening "
                 f"what two visits differ in; expected one of them{', or model.whitening none' * self.made}"
@@ -295,10 +288,7 @@ class PlaceRecognitionTask(pl.LightningModule):
     # the map
 
     def relearn(self) -> None:
-        """Layers and templates anew from the present features of the reference (section III-A).
-
-        The first features are made in training mode, so that running statistics are gathered.
-        """
+        """The map anew from the present features of the reference (section III-A)."""
         if self.made:
             with in_bits(self.dejavu.features, self.weight_bits):
                 make_map(self)
@@ -309,6 +299,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
 
     def _start_templates(self) -> None:
+        """The first features are made in training mode, so that running statistics are gathered."""
         first, weights = not self.route.places, self.route.weights
         with in_mode(self, first):
             if has_descriptor(self.dejavu.features):
@@ -359,11 +350,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         return model
 
     def require_map(self) -> None:
-        """Refuse a training that is in a stage without a map.
-
-        Raises:
-            InputError: naming the stage.
-        """
+        """Refuse a training that is in a stage without a map."""
         if not self.in_last_stage:
             raise InputError(
                 f"the training is in stage {self.index + 1} of {len(self.stages)}, "
@@ -373,14 +360,13 @@ class PlaceRecognitionTask(pl.LightningModule):
     # training
 
     def configure_optimizers(self) -> Any:
-        """Begin the stage; stages without steps are over at once. The optimizer is of its parameters."""
+        """Begin the stage, or the next where it has no steps. The optimizer is of its parameters."""
         steps = float(self.trainer.estimated_stepping_batches)
         if not math.isfinite(steps):
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
-        self.stage.begin(self)
-        while self._stop() <= self.began and not self.in_last_stage:
+        if self._stop() <= self.began and not self.in_last_stage:
             self._advance(self.began)
-            self.stage.begin(self)
+        self.stage.begin(self)
         return adamw_of(self.stage.trained(self), self.lr, self.weight_decay, self._stop() - self.began)
 
     def _stop(self) -> int:
@@ -410,10 +396,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.resumed = None
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Where the steps of a stage are over, the next one begins, with its own optimizer.
-
-        A map that is made of the features does not outlast them.
-        """
+        """Drop a map of the features before; begin the next stage if the steps of this one are over."""
         if self.made and self.map.places:
             self.dejavu.load_state_dict(self._unmade(), strict=False)
         if not self.in_last_stage and self.global_step >= self._stop():
@@ -444,14 +427,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         if self.global_step - self.began >= warm_up(self._stop() - self.began):
             self.last.add(parts)
         self.log_dict({f"train/{name}": part for name, part in parts.items()})
-        self.log(
-            "train/left_out",
-            float(left_out),
-            reduce_fx="sum",
-            on_step=False,
-            on_epoch=True,
-            sync_dist=self.trainer.world_size > 1,
-        )
+        several = self.trainer.world_size > 1
+        self.log("train/left_out", left_out, on_step=False, on_epoch=True, reduce_fx="sum", sync_dist=several)
         self.log("train/loss", figures[0], prog_bar=True)
         return total
 
@@ -522,13 +499,11 @@ class PlaceRecognitionTask(pl.LightningModule):
     def load_from_checkpoint(  # type: ignore[override]
         cls, checkpoint_path: str | Path, *, weights_only: bool = True, **settings: Any
     ) -> PlaceRecognitionTask:
-        """A task with the weights of a checkpoint.
-
-        Lightning's own also takes settings from the checkpoint, and for that imports what it names.
+        """A task with the weights of a checkpoint; Lightning's own would import what the file names.
 
         Args:
-            weights_only: accepted, as Lightning has it; no code of a checkpoint is ever run.
-            settings: those of the constructor that the checkpoint was trained with.
+            weights_only: ignored; no code of a checkpoint is ever run.
+            settings: of the constructor, as in the training.
 
         Raises:
             InputError: a damaged checkpoint, or one of other settings.
@@ -657,10 +632,8 @@ def _layers(plan: Plan) -> str:
 
 
 def start_from(backbone: nn.Module, path: str | Path) -> None:
-    """Give a backbone the weights that a map file holds.
-
-    Of a whitened descriptor its code is left out, which is of the other route, and of any dimension. Where an
-    `Embedding` gives the descriptor itself, here or there, its network is all that is taken.
+    """Give a backbone the weights of a map file, without the code of a whitened descriptor, which is of its
+    route; only the network if an `Embedding` gives the descriptor itself, here or there.
 
     Raises:
         InputError: no map file, or one of another backbone.
