@@ -27,7 +27,7 @@ from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.precision import has_bf16
+from dejavu_torch.training.export import has_bf16
 from dejavu_torch.training.task import PlaceRecognitionTask
 from dejavu_torch.types import InputError, Traverse
 

@@ -29,14 +29,11 @@ from dejavu_torch.data.output import check_output_folder, make_output_folder, re
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.training.chance import NothingLearned
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport
-from dejavu_torch.training.precision import has_bf16
-from dejavu_torch.training.steps import StepBar
+from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport, StepBar, better, has_bf16
+from dejavu_torch.training.losses import NothingLearned
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
-from dejavu_torch.training.worth import better
 from dejavu_torch.types import InputError
 
 RANGES = {  # of numbers that Lightning takes as they are, and fails on later

@@ -16,7 +16,6 @@ import pytorch_lightning as pl
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor
-from torch.optim import Optimizer
 
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import make_output_folder, whole_file
@@ -189,22 +188,20 @@ def check_resumable(checkpoint: dict[str, Any], trainer: pl.Trainer) -> None:
     Raises:
         InputError: naming what differs from the state that the trainer has itself.
     """
-    own = {
-        "loops": trainer.fit_loop.state_dict(),
-        "optimizer_states": [optimizer.state_dict() for optimizer in trainer.optimizers],
-        "lr_schedulers": [config.scheduler.state_dict() for config in trainer.lr_scheduler_configs],
-    }
     loops = checkpoint.get("loops")
     given = checkpoint | {"loops": loops.get("fit_loop") if isinstance(loops, dict) else None}
-    for key, state in own.items():
-        check_alike(given.get(key), state, key)
-    progress = given["loops"]["epoch_loop.automatic_optimization.optim_progress"]
-    steps = progress["optimizer"]["step"]["total"]["completed"]
-    if steps != checkpoint["global_step"]:
+    check_alike(given["loops"], trainer.fit_loop.state_dict(), "loops")
+    steps = given["loops"]["epoch_loop.automatic_optimization.optim_progress"]["optimizer"]["step"]
+    if steps["total"]["completed"] != checkpoint["global_step"]:
         raise InputError(
-            f"the checkpoint is of step {checkpoint['global_step']}, its loops are at {steps}; {EXPECTED}"
+            f"the checkpoint is of step {checkpoint['global_step']}, its loops are at "
+            f"{steps['total']['completed']}; {EXPECTED}"
         )
-    for optimizer, state in zip(trainer.optimizers, checkpoint["optimizer_states"], strict=True):
+    schedules = [config.scheduler.state_dict() for config in trainer.lr_scheduler_configs]
+    check_alike(given.get("lr_schedulers"), schedules, "lr_schedulers")
+    states = given.get("optimizer_states")
+    check_alike(states, [optimizer.state_dict() for optimizer in trainer.optimizers], "optimizer_states")
+    for optimizer, state in zip(trainer.optimizers, states or [], strict=True):
         for group, mine in zip(state["param_groups"], optimizer.param_groups, strict=True):
             other = [name for name in group if name not in FREE and group[name] != mine[name]]
             if other:
@@ -212,42 +209,30 @@ def check_resumable(checkpoint: dict[str, Any], trainer: pl.Trainer) -> None:
                     f"the checkpoint cannot be resumed: {other[0]} of its optimizer is "
                     f"{str(group[other[0]])[:80]}, in this run {str(mine[other[0]])[:80]}"
                 )
-        check_moments(optimizer, state["state"])
-
-
-def check_random(random: Any) -> None:
-    """Refuse what is no state of the random numbers of a training.
-
-    Raises:
-        InputError: what is missing, of another type, or no state of torch's.
-    """
-    states, done = ("now", "order", "views"), random.get("done") if isinstance(random, dict) else None
-    whole = isinstance(done, int) and not isinstance(done, bool) and 0 <= done < MOST
-    try:
-        if not whole or random.keys() != {*states, "done"}:
-            raise TypeError("other entries")
-        for name in states:
-            if random[name] is not None or name != "views":
-                torch.Generator().set_state(random[name])
-    except (TypeError, RuntimeError) as error:
-        told = one_line(error)[:80]
-        raise InputError(
-            f"the checkpoint cannot be resumed: its random numbers are no state of torch's ({told}); "
-            f"{EXPECTED}"
-        ) from error
+        if isinstance(optimizer, torch.optim.Adam):
+            parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+            for index, moments in state["state"].items():
+                known = type(index) is int and 0 <= index < len(parameters)
+                like = parameters[index].detach() if known else torch.zeros(())
+                own = {"step": torch.zeros(()), "exp_avg": like, "exp_avg_sq": like} if known else None
+                check_alike(moments, own, f"the optimizer's state of parameter {index}")
 
 
 def check_alike(given: Any, own: Any, where: str) -> None:
-    """Refuse a state whose keys, lengths or types are not those of one's own.
+    """Refuse other keys, lengths, shapes or types than those of one's own, and numbers out of range.
 
     An empty dict of one's own is filled as the training goes, and takes any.
     """
     numbers = {type(given), type(own)} == {int, float}
-    same = type(given) is type(own) or numbers
+    same = numbers or type(given) is type(own) or (isinstance(given, Tensor) and isinstance(own, Tensor))
     if same and isinstance(own, dict) and own:
         same = given.keys() == own.keys()
     elif same and isinstance(own, (list, tuple)):
         same = len(given) == len(own)
+    elif same and isinstance(own, Tensor):
+        lowest = -MOST if where.endswith("exp_avg") else 0
+        same = given.shape == own.shape and given.is_floating_point()
+        same = same and bool(((given >= lowest) & (given < MOST)).all())
     elif same and isinstance(own, (int, float)):
         same = 0 <= given < MOST
     if not same:
@@ -255,31 +240,6 @@ def check_alike(given: Any, own: Any, where: str) -> None:
     parts = own if isinstance(own, dict) else range(len(own)) if isinstance(own, (list, tuple)) else ()
     for part in parts:
         check_alike(given[part], own[part], f"{where}.{part}")
-
-
-def check_moments(optimizer: Optimizer, state: dict[Any, Any]) -> None:
-    """Refuse what an optimizer remembers of other parameters.
-
-    Raises:
-        InputError: a shape that is not of the parameter, or a number out of range.
-    """
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    adam = {"step", "exp_avg", "exp_avg_sq"} if isinstance(optimizer, torch.optim.Adam) else None
-    for index, values in state.items():
-        known = type(index) is int and 0 <= index < len(parameters) and isinstance(values, dict)
-        if not known or (adam is not None and values.keys() != adam):
-            raise InputError(
-                f"the checkpoint cannot be resumed: its optimizer is not of this run; {EXPECTED}"
-            )
-        for name, value in values.items():
-            lowest = 0.0 if name in ("step", "exp_avg_sq") else -MOST
-            shape = torch.Size() if name == "step" else parameters[index].shape
-            fits = isinstance(value, Tensor) and value.shape == shape and value.is_floating_point()
-            if not fits or not bool(((value >= lowest) & (value < MOST)).all()):
-                raise InputError(
-                    f"the checkpoint cannot be resumed: {name} of parameter {index} of its optimizer is no "
-                    f"{tuple(shape)} of numbers in range; {EXPECTED}"
-                )
 
 
 @contextmanager

@@ -104,9 +104,6 @@ class Clips(DistributedSampler[list[int]]):
         self.runs, self.lengths, self.clip = runs, [len(run) for run in runs], clip
         # which Lightning leaves alone
         super().__init__(cast(Any, range(sum(self.lengths))), processes, process)
-        self.drawn_at: Tensor | None = None  # the state of the random numbers ahead of the present order
-        self.drawn_to: Tensor | None = None  # and behind it
-        self.replayed: tuple[Tensor, int] | None = None  # such a state, and batches of it that are done
         every = sum(length // clip for length in self.lengths)
         self.clips = min(batch_size // clip, every) // processes  # of a process's part of a batch
         if not self.clips:
@@ -118,18 +115,6 @@ class Clips(DistributedSampler[list[int]]):
         return sum(length // self.clip for length in self.lengths) // (self.clips * self.num_replicas)
 
     def __iter__(self) -> Iterator[list[int]]:
-        if self.replayed is None:
-            self.drawn_at = torch.get_rng_state()
-            yield from self._drawn()
-            return
-        self.drawn_at, done = self.replayed
-        with torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(self.drawn_at)
-            batches = self._drawn()
-            self.drawn_to = torch.get_rng_state()
-        yield from batches[done:]
-
-    def _drawn(self) -> list[list[int]]:
         starts = []
         for run in self.runs:
             left_over = int(torch.randint(len(run) % self.clip + 1, ()))
@@ -138,7 +123,7 @@ class Clips(DistributedSampler[list[int]]):
         order = order[torch.randperm(len(order))]
         frames = order[:, None] + torch.arange(self.clip)
         batches = frames.split(self.clips * self.num_replicas)[: len(self)]  # an incomplete one is left out
-        return [batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches]
+        return iter([batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches])
 
 
 class RouteData(LightningDataModule):
@@ -232,7 +217,6 @@ class RouteData(LightningDataModule):
         self.velocity, self.held_out = velocity, held_out
         self.routes: list[Traverse] = []  # at even steps, where there is `velocity`
         self.sets: dict[str, StoredFrames] = {}
-        self.replayed: tuple[Tensor, int] | None = None  # of the next `train_dataloader`, see `Clips`
         self._wanted: tuple[int, int] | None = None  # size of the stored frames, where it makes them smaller
 
     def _one_each(self, name: str, given: Any) -> list[Any]:
@@ -422,9 +406,7 @@ class RouteData(LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Frames of the reference and of the second traverse, as they are stored; this process's part."""
-        loader = self.training_batches(*self._processes)
-        cast(Clips, loader.sampler).replayed, self.replayed = self.replayed, None
-        return loader
+        return self.training_batches(*self._processes)
 
     @property
     def _processes(self) -> tuple[int, int]:

@@ -1,28 +1,40 @@
-"""What a training leaves: its last checkpoint, and the map file that every other command reads."""
+"""What runs beside a training: progress, checkpoints, and at the end the map and what it is worth."""
 
 from __future__ import annotations
 
+import copy
 import logging
+import sys
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
-from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint
+from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar
+from tqdm import tqdm
 
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
+from dejavu_torch.evaluation.baselines import hog_baselines
+from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
+from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.localizer import SINGLE
 from dejavu_torch.training.datamodule import FEW, RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
-from dejavu_torch.training.worth import beside_untrained
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Match, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
+TRAINED, HOG, UNTRAINED = "the trained map", "HOG of all frames", "the untrained map"
+LINES, APART = 10, 60.0  # lines of a training without a terminal, and seconds between two at most
+CPU_FLAGS = Path("/proc/cpuinfo")
+FAST = {"avx512_bf16", "amx_bf16", "bf16"}  # the last one of ARM
 
 log = logging.getLogger("dejavu_torch")
 
@@ -181,3 +193,121 @@ def best_checkpoint(trainer: pl.Trainer) -> str | None:
                 return callback.best_model_path
             log.warning("%s was never measured: the map is of the last step", callback.monitor)
     return None
+
+
+def beside_untrained(
+    model: DejaVu, reference: Traverse, query: Traverse, truth: GroundTruth, tolerance: int
+) -> dict[str, Scores]:
+    """Scores of a trained map, of HOG of all frames, and of the spectral map of whitened HOG.
+
+    The untrained map is that of `DejaVu()`, by the model's own mapper where this is not of templates: of as
+    many route bytes. What cannot be made of these frames is left out, with a warning.
+
+    Args:
+        model: with its map, on any device. reference, query: resampled where the model is.
+        truth: the places of the queries. tolerance: places within which one is right.
+
+    Returns:
+        By name, the trained map first; nothing where no query has a known place.
+    """
+    if len(query.frame_shape) == 3:
+        query = fitted(query, reference.frame_shape)
+    trained = fitted(query, model.frame_shape or ()) if len(query.frame_shape) == 3 else query
+    found = {TRAINED: _match(model, trained)}
+    hog = hog_baselines(reference, query, model.batch_size, tolerance)
+    found |= {HOG: hog["hog"].found} if hog else {}
+    mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
+    try:
+        preprocess = Preprocess(size=model.preprocess.size)
+        untrained = DejaVu(mapper=mapper, batch_size=model.batch_size, preprocess=preprocess)
+        reference = untrained.fit(reference)
+        untrained.learn(reference)
+        if len(query.frame_shape) == 3:
+            query = fitted(query, reference.frame_shape)
+        found[UNTRAINED] = _match(untrained, query)
+    except InputError as error:
+        log.warning("no untrained map to compare with: %s", error)
+    scores = {name: contend(name, match, truth, tolerance).scores for name, match in found.items()}
+    return {name: one for name, one in scores.items() if one is not None}
+
+
+def better(scores: Mapping[str, Scores]) -> list[str]:
+    """Names of what has a larger AUC than the first of them.
+
+    Example:
+        >>> from types import SimpleNamespace as S
+        >>> better({"the trained map": S(auc=0.5), "HOG": S(auc=0.7), "the untrained map": S(auc=0.4)})
+        ['HOG']
+    """
+    (_, first), *others = scores.items()
+    return [name for name, one in others if one.auc > first.auc]
+
+
+def _match(model: DejaVu, query: Traverse) -> Match:
+    return model.localize_descriptors(model.extract_all(query), SINGLE).renumbered(model.map.table.scored)
+
+
+class StepBar(ProgressBar):
+    """Shows steps of all, the loss and the time left on stderr."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shown = True
+        self.bar: tqdm[Any] | None = None
+        self.total = self.began = self.told = 0
+        self.since = self.told_at = 0.0
+
+    def disable(self) -> None:
+        """See Lightning's, as is the next."""
+        self.shown = False
+
+    def enable(self) -> None:
+        self.shown = True
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Begin at the step that a checkpoint brought."""
+        self.total, self.began = int(trainer.estimated_stepping_batches), trainer.global_step
+        self.told, self.since = self.began, time.monotonic()
+        self.told_at = self.since
+        if self.shown and sys.stderr.isatty():
+            self.bar = tqdm(
+                desc="training", total=self.total, initial=self.began, unit=" steps", file=sys.stderr
+            )
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        """Tell where it is time to."""
+        step, now = trainer.global_step, time.monotonic()
+        if self.bar is not None:
+            self.bar.update(step - self.bar.n)
+            if now - self.told_at > 1:
+                self.told_at = now
+                self.bar.set_postfix_str(f"loss {self._loss(trainer):.3g}", refresh=False)
+            return
+        due = (step - self.told) * LINES >= self.total or now - self.told_at >= APART
+        if self.shown and (due or step == self.total) and step > self.told:
+            self.told, self.told_at = step, now
+            left = (now - self.since) * (self.total - step) / (step - self.began)
+            told = f"step {step} of {self.total}, loss {self._loss(trainer):.3g}"
+            tqdm.write(f"dejavu: training: {told}, {tqdm.format_interval(left)} left", file=sys.stderr)
+
+    def _loss(self, trainer: pl.Trainer) -> float:
+        return float(trainer.callback_metrics.get("train/loss", float("nan")))
+
+    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Leave the bar as it stands."""
+        if self.bar is not None:
+            self.bar.close()
+            self.bar = None
+
+
+def has_bf16() -> bool:
+    """Whether the processor multiplies numbers of 16 bits (bfloat16) itself; elsewhere they are slower.
+
+    Known on Linux; False elsewhere.
+    """
+    try:
+        text = CPU_FLAGS.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
+    lines = (line for line in text.splitlines() if line.lower().startswith(("flags", "features")))
+    return bool(FAST & set(next(lines, "").split()))

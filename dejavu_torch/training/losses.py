@@ -1,18 +1,26 @@
-"""Cross-entropy of the place and of each layer's phase: float32 at least, 0 where nothing counts."""
+"""Losses of places, phases and bits, float32 at least, 0 if nothing counts; and those of a blind guess."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from dejavu_torch.maps.quantisation import quantise
+from dejavu_torch.maps.spectrum import Transform, from_spectrum
 from dejavu_torch.maps.template_map import TemplateMap, weight_per_feature
 from dejavu_torch.training.processes import mean_of_all
 from dejavu_torch.types import InputError, Plan
+
+STEP = 0.5  # of the lines' RMS, at the start
+PER_OCTAVE = 2  # bands of frequency that have a width of their own
+LEAST = 1e-24  # of the lines' mean square: the root of 0 has no gradient
+LAST, BELOW = 100, 0.98  # steps, and the share of chance, or of what was before, that is less than it
 
 
 class PlaceLoss(NamedTuple):
@@ -198,3 +206,128 @@ def _check_places(places: Tensor, scores: Tensor) -> None:
     if scores.ndim != 2 or places.ndim != 2 or len(places) != len(scores) or places.dtype != torch.int64:
         seen = f"scores {tuple(scores.shape)} and places {tuple(places.shape)} {places.dtype}"
         raise InputError(f"the loss got {seen}; expected (Q,N) and (Q,R) int64")
+
+
+class Coded(NamedTuple):
+    """proxies: (W,K), whose length means nothing. bits: scalar, what their lines take in all."""
+
+    proxies: Tensor
+    bits: Tensor
+
+
+def bands_of(lines: int, transform: Transform = "dft") -> Tensor:
+    """The band of frequencies of each line of a spectrum, half an octave wide; 0 is the mean alone.
+
+    Shape: -> (lines,) int64.
+
+    Example:
+        >>> bands_of(9)
+        tensor([0, 3, 3, 5, 5, 6, 6, 7, 7])
+    """
+    line = torch.arange(lines)
+    half_cycles = line if transform == "dct" else (line + 1) // 2 * 2
+    return ((half_cycles.clamp(min=1).double().log2() * PER_OCTAVE).long() + 1) * (half_cycles > 0)
+
+
+def coded_proxies(
+    lines: Tensor, log_step: Tensor, log_widths: Tensor, transform: Transform = "dft", noise: bool = True
+) -> Coded:
+    """A proxy for each stretch of a route, rebuilt from the quantised lines of their spectra over the route.
+
+    A network whose descriptors follow the proxies learns features of few frequencies, as a `SpectralMap` of
+    few bytes holds them. All arguments are learned: lines, the step that they are coded in, and an entropy
+    model, the widths of a Laplace distribution of the levels.
+
+    Args:
+        lines: of any RMS, see `spectrum`; W stretches, at least 2.
+        log_step: of the step, beside an RMS of 1.
+        log_widths: in steps, for each band (`bands_of`) and feature, in this order.
+        transform: of the lines.
+        noise: whether the bits are those of levels with uniform noise in place of the rounding error.
+
+    Shape: (W,K), scalar, (bands * K,) -> Coded.
+
+    Convention: rounding is that of the map (`quantise`), whose gradient passes straight through.
+
+    Source: Ballé, Laparra and Simoncelli, ICLR 2017, for the bits; Minnen and Singh, ICIP 2020, for noise in
+        the bits and rounding in what is rebuilt.
+
+    Raises:
+        InputError: shapes that do not fit.
+
+    Example:
+        >>> lines, widths = torch.randn(40, 8), torch.zeros(8 * (bands_of(40).max() + 1))
+        >>> coded = coded_proxies(lines, torch.tensor(-0.7), widths)
+        >>> coded.proxies.shape, bool(coded.bits > 0)
+        (torch.Size([40, 8]), True)
+    """
+    if lines.ndim != 2 or len(lines) < 2 or not lines.shape[1]:
+        raise InputError(f"the lines are {tuple(lines.shape)}; expected (W,K), at least 2 stretches")
+    band = bands_of(len(lines), transform).to(lines.device)
+    expected = (int(band.max()) + 1) * lines.shape[1]
+    if tuple(log_widths.shape) != (expected,):
+        raise InputError(f"the widths are {tuple(log_widths.shape)}; expected ({expected},)")
+    wanted = lines / lines.square().mean().clamp(min=LEAST).sqrt() / log_step.exp()
+    levels = wanted + (quantise(wanted.detach(), 1.0) - wanted).detach()
+    noisy = wanted + torch.rand(wanted.shape, dtype=wanted.dtype).to(wanted) - 0.5 if noise else wanted
+    widths = log_widths.exp().unflatten(0, (-1, lines.shape[1]))[band]
+    return Coded(from_spectrum(levels.T, transform).T, laplace_bits(noisy, widths).sum())
+
+
+class NothingLearned(InputError):
+    """The losses of a training have stayed at chance."""
+
+
+def place_chance(places: int, tolerance: int) -> float:
+    """The least `place_cross_entropy` of one answer to all queries of a route, log(N / (2 tolerance + 1)).
+
+    Example:
+        >>> round(place_chance(2697, 5), 2)
+        5.5
+    """
+    return max(0.0, math.log(places / (2 * tolerance + 1)))
+
+
+def phase_chance(plan: Plan) -> float:
+    """The least `phase_cross_entropy` likewise: the mean entropy of a layer's phases along the route."""
+    entropies = []
+    for layer in plan:
+        share = torch.bincount(layer.phase(torch.arange(layer.start, layer.stop))).double()
+        share = share[share > 0] / share.sum()
+        entropies.append(float(-(share * share.log()).sum()))
+    return sum(entropies) / len(entropies)
+
+
+class LastLosses:
+    """The losses of the last `LAST` steps of a stage, behind its warm-up."""
+
+    def __init__(self) -> None:
+        self.last: deque[dict[str, Tensor]] = deque(maxlen=LAST)
+        self.learned = False
+
+    def add(self, parts: Mapping[str, Tensor]) -> None:
+        """Those of a step, by name."""
+        self.last.append(dict(parts))
+
+    def check(self, chance: Mapping[str, float]) -> None:
+        """Refuse losses none of which is below chance or still falling. Nothing is known before `LAST` steps.
+
+        Args:
+            chance: of each loss that tells places apart, by name.
+
+        Raises:
+            NothingLearned: naming both.
+        """
+        if len(self.last) < LAST or not chance:
+            return
+        losses = {name: torch.stack([parts[name] for parts in self.last]) for name in chance}
+        halves = {name: one.view(2, -1).mean(1).tolist() for name, one in losses.items()}
+        self.learned = any(sum(halves[name]) / 2 <= BELOW * guess for name, guess in chance.items())
+        falling = any(late < BELOW * early for early, late in halves.values())
+        if self.learned or falling or min(chance.values()) == 0:
+            return
+        means = {name: sum(one) / 2 for name, one in halves.items()}
+        seen = ", ".join(
+            f"the {name} loss is {mean:.3g} (chance {chance[name]:.3g})" for name, mean in means.items()
+        )
+        raise NothingLearned(f"nothing is learned: over the last {LAST} steps {seen}")

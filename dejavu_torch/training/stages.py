@@ -1,4 +1,4 @@
-"""The stages of a training: a descriptor that tells places apart, its whitening, and each place's code."""
+"""The stages of a training: a descriptor that tells places apart, and a code that repeats with periods."""
 
 from __future__ import annotations
 
@@ -18,11 +18,18 @@ from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.training.chance import phase_chance, place_chance
 from dejavu_torch.training.datamodule import Batch, RouteData, StoredFrames, as_frames
-from dejavu_torch.training.losses import Losses, Objective, place_cross_entropy
+from dejavu_torch.training.losses import (
+    STEP,
+    Losses,
+    Objective,
+    bands_of,
+    coded_proxies,
+    phase_chance,
+    place_chance,
+    place_cross_entropy,
+)
 from dejavu_torch.training.processes import noise_like, own_part, own_random
-from dejavu_torch.training.rate import STEP, bands_of, coded_proxies
 from dejavu_torch.types import InputError
 
 ROUNDS = 10  # views of each training frame, for whitening and code
@@ -48,11 +55,10 @@ class Task(Protocol):
     dejavu: DejaVu
     made: bool
     gives_way: bool
-    frozen: list[nn.Module]
+    frozen: set[str]
     log_temperature: nn.Parameter
     losses: Objective
     views: Views | None
-    views_drawn_at: Tensor | None
     places: Tensor | None
 
     @property
@@ -76,7 +82,7 @@ class Task(Protocol):
 
 
 class Stage(nn.Module):
-    """One part of a training. The task runs them one behind the other, each with an optimizer of its own.
+    """One part of a training, with an optimizer of its own.
 
     Args:
         share: of the steps of the whole training; the last stage takes the steps that are left.
@@ -98,7 +104,7 @@ class Stage(nn.Module):
 
     def losses(self, task: Task, batch: Batch) -> Losses:
         """The losses of a batch."""
-        raise NotImplementedError(f"{type(self).__name__} takes no steps")
+        raise NotImplementedError
 
     def chance(self, task: Task) -> dict[str, float]:
         """The least that each loss can be without a look at the frames, of those that tell places apart."""
@@ -183,9 +189,10 @@ class DescriptorStage(Stage):
         return Losses(found.loss, {"descriptor": found.loss}, found.left_out)
 
     def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
-        given = state.get(f"{prefix}proxies")
-        if given is not None:  # however many there are
-            self.proxies = nn.Parameter(torch.empty_like(given, device=self.proxies.device))
+        for name in self._parameters.keys() & {"proxies", "log_widths"}:
+            given = state.get(prefix + name)
+            if given is not None:  # however many there are
+                setattr(self, name, nn.Parameter(torch.empty_like(given, device=self.proxies.device)))
         super()._load_from_state_dict(state, prefix, *args)
 
 
@@ -217,35 +224,23 @@ class RateStage(DescriptorStage):
         total = place.total + self.rate * task.progress * per_place
         return Losses(total, place.parts | {"bits": per_place}, place.left_out)
 
-    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
-        given = state.get(f"{prefix}log_widths")
-        if given is not None:
-            self.log_widths = nn.Parameter(torch.empty_like(given, device=self.log_widths.device))
-        super()._load_from_state_dict(state, prefix, *args)
-
-
-class WhiteningStage(Stage):
-    """The descriptor is whitened by what the augmentation and a second traverse change in it; no steps."""
-
-    def end(self, task: Task) -> None:
-        task.views = describe_views(task)
-        shown = place_descriptors(task)[task.views.positives[:, 0]]
-        _coder(embedding_of(task)).whiten(task.views.descriptors, shown)
-
 
 class CodeStage(Stage):
     """Features learn to repeat with the periods of the map's layers, together with its templates.
 
-    A whitened descriptor stays as it is: views of all training frames are described once, and the code behind
-    it is learned from them. Of any other backbone the whole is trained, on augmented frames.
+    A descriptor is first whitened by what the augmentation and a second traverse change in it, and then kept:
+    views of all training frames are described once, and the code is learned from them. Any other backbone is
+    trained as a whole, on augmented frames.
     """
 
     def begin(self, task: Task) -> None:
         if has_descriptor(task.dejavu.features):
-            network = embedding_of(task).network
-            if not any(module is network for module in task.frozen):
-                task.frozen.append(network.eval())
-            task.views = describe_views(task) if task.views is None else task.views
+            task.frozen.add("network")
+            embedding_of(task).network.eval()
+            task.views = describe_views(task)
+            if whitens(task.dejavu.features):
+                shown = place_descriptors(task)[task.views.positives[:, 0]]
+                _coder(embedding_of(task)).whiten(task.views.descriptors, shown)
         if not task.dejavu.map.places:
             task.relearn()
 
@@ -279,9 +274,8 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: 
     """The stages that a backbone needs.
 
     Where the map is made of the descriptor, that is all that is learned. For a map that is trained an
-    `Embedding` with a hidden layer learns its descriptor, which is whitened, and then its code. A network
-    without parameters to train, such as HOG, is whitened at once; a whitened one, as another map brings, is
-    left alone. Other backbones have the last stage only.
+    `Embedding` with a hidden layer learns its descriptor, then its code. A network without parameters to
+    train, such as HOG, a whitened one, as another map brings, and other backbones have the last stage only.
 
     Args:
         descriptor: share of the steps in which a descriptor is learned.
@@ -290,16 +284,19 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: 
     """
     if made:
         return [RateStage(rate)] if rate else [DescriptorStage()]
-    if not isinstance(backbone, Embedding) or backbone.coder is None or backbone.coder.whitened:
-        return [CodeStage()]
-    if not _trainable(backbone.network):
-        return [WhiteningStage(), CodeStage()]
-    return [DescriptorStage(descriptor), WhiteningStage(), CodeStage()]
+    if whitens(backbone) and _trainable(network_of(backbone)):
+        return [DescriptorStage(descriptor), CodeStage()]
+    return [CodeStage()]
 
 
 def has_descriptor(backbone: nn.Module) -> bool:
     """Whether a backbone is an `Embedding` whose code is learned from a whitened descriptor."""
     return isinstance(backbone, Embedding) and backbone.coder is not None
+
+
+def whitens(backbone: nn.Module) -> bool:
+    """Whether the descriptor of a backbone is still to be whitened."""
+    return has_descriptor(backbone) and not bool(_coder(cast(Embedding, backbone)).whitened)
 
 
 def embedding_of(task: Task) -> Embedding:
@@ -333,17 +330,9 @@ def _trainable(module: nn.Module) -> list[nn.Parameter]:
 
 
 def describe_views(task: Task) -> Views:
-    """Descriptors of all training frames of known places, under several augmentations of each.
-
-    A run that is resumed draws those of the first one again.
-    """
-    room, again = NUMBERS // len(_coder(embedding_of(task)).mean), task.views_drawn_at is not None
-    with torch.random.fork_rng(devices=[], enabled=again):
-        if task.views_drawn_at is None:
-            task.views_drawn_at = torch.get_rng_state()
-        else:
-            torch.set_rng_state(task.views_drawn_at)
-        descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
+    """Descriptors of all training frames of known places, under several augmentations of each."""
+    room = NUMBERS // len(_coder(embedding_of(task)).mean)
+    descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
     return Views(torch.cat(descriptors), torch.cat(positives))
 
 

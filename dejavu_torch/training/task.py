@@ -30,29 +30,27 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.training.chance import LastLosses
 from dejavu_torch.training.checkpoint import (
     CheckpointFiles,
-    check_random,
     check_resumable,
     read_checkpoint,
     taking_over,
 )
-from dejavu_torch.training.datamodule import FEW, Batch, Clips, RouteData, as_frames
-from dejavu_torch.training.losses import Objective
+from dejavu_torch.training.datamodule import FEW, Batch, RouteData, as_frames
+from dejavu_torch.training.losses import LastLosses, Objective
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.training.processes import average_gradients, averaged, share, shared_statistics
+from dejavu_torch.training.processes import average_gradients, averaged, share
 from dejavu_torch.training.stages import (
     CodeStage,
     RateStage,
     Stage,
     Views,
-    WhiteningStage,
     coded_places,
     has_descriptor,
     make_map,
     stages_of,
     stored_features,
+    whitens,
 )
 from dejavu_torch.types import InputError, Plan, Training
 
@@ -62,59 +60,53 @@ TEMPERATURE = 0.03  # of `log_posterior` at the start
 DESCRIPTOR = 0.4  # of the steps of a training whose descriptor gets a code
 MAP = "dejavu.map."  # ahead of the names of the map's tensors in a checkpoint
 WHITENING = "dejavu.whitening."
-FEATURES = "dejavu.features."
-RANDOM = "random"  # numbers of a training, in a checkpoint
 CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
 NETWORK = "network."  # of any Embedding
 
 
 class PlaceRecognitionTask(pl.LightningModule):
-    """A `DejaVu` model that is trained: its features are made to repeat with the periods of its layers.
+    """A `DejaVu` model in training: its features learn to repeat with the periods of its layers.
 
-    The map's templates start as the phase means of the untrained features (eq. 1) and are parameters from
-    then on. Periods are exact numbers and never get a gradient: they are imposed, or found anew in the
-    features every few epochs. A training is a list of stages, see `stages_of`; most backbones have one.
+    The templates of the map start as the phase means of the untrained features (eq. 1) and then are
+    parameters. Periods never get a gradient: they are imposed, or found anew every few epochs. Of an
+    `Embedding` with a hidden layer the descriptor is trained first, then its code, see `stages_of`.
 
-    Any other map, such as a spectral one, is not trained: all steps train the descriptor, and the map is made
-    of it in closed form wherever one is needed. The descriptor is the backbone's output; of an `Embedding`
-    with a hidden layer the code is left out.
+    Any other map, such as a spectral one, is not trained: all steps train the descriptor, without the code of
+    an `Embedding`, and the map is made of it in closed form.
 
     Args:
-        backbone: nn.Module (B,C,H,W) -> (B,D); None is `SmallCNN` with its defaults.
-        mapper: makes the map; the temperature of a TemplateMapper is where the trained one starts, 0.03 where
-            it is None. None is `TemplateMapper(ImposedPeriods(), temperature=0.03)`.
-        whitening: of the descriptor, ahead of a map that is made of it; it learns from views under the
-            training's augmentation and of the second traverse, its `strengths` count for nothing. None and
-            "none" are as in `DejaVu`, but None is "none" with a `rate`: whitening would mix the features.
+        backbone: nn.Module (B,C,H,W) -> (B,D); None is `SmallCNN()`.
+        mapper: makes the map; its temperature is where that of templates starts, 0.03 if it is None. None is
+            `TemplateMapper(ImposedPeriods())`.
+        whitening: of the descriptor, if the map is made of it. It learns from views under the training's
+            augmentation and of the second traverse; its `strengths` are not used. None and "none" are as in
+            `DejaVu`, but None is "none" with a `rate`: whitening would mix the features.
         preprocess: as in `DejaVu`.
-        feature_weights: learn what a difference in each feature counts, at least 0.
-        descriptor: share of the steps in which the network of an `Embedding` with a hidden layer learns its
-            descriptor, ahead of the code.
+        feature_weights: learn a weight of each feature, at least 0; of templates, as the next and
+            `refresh` and `losses`.
+        descriptor: share of the steps in which an `Embedding` with a hidden layer learns its descriptor.
         start: a map file of the same backbone, whose weights to start from.
-        freeze: parameters of the backbone whose names begin with one of these stay as they are, and
-            so do the running statistics below; "" is all of it.
-        batch_norm: "train" lets BatchNorm follow the batches, which hold frames from all over the route;
-            "frozen" keeps its running statistics, as pretrained networks and few frames want.
-        refresh: epochs after which the layers are found anew, and templates start over from the phase means;
-            0 never.
-        losses: which losses count, and how much. Like feature_weights, descriptor and refresh it is of
-            templates alone.
-        rate: what a bit per place of the map counts beside the cross-entropy of the place, in nats; of maps
-            that are made of the descriptor alone. With it the descriptor learns to be made of few
-            frequencies, see `coded_proxies`.
+        freeze: beginnings of names of parameters that stay as they are, with their running statistics; "" is
+            all of the backbone.
+        batch_norm: "train" lets BatchNorm follow the batches; "frozen" keeps its running statistics, as
+            pretrained networks and few frames want.
+        refresh: epochs after which layers are found anew and templates restart as phase means; 0 never.
+        losses: which losses count, and how much.
+        rate: weight of a bit per place of the map beside the cross-entropy of the place, in nats; of maps
+            made of the descriptor, which then consists of few frequencies, see `coded_proxies`.
         lr: highest learning rate of AdamW; it rises over the first tenth of a stage's steps and falls to 0.
         weight_decay: of weights that are multiplied with something, not of biases, templates and the like.
-        batch_size: frames in memory at a time where features are made without gradients.
+        batch_size: frames in memory at a time if features are made without gradients.
         weight_bits: of each weight of the backbone in the map file, 8 or 32, as of `DejaVu`. Training and
             checkpoints have 32; a map that is made of a descriptor, validation and test see rounded ones.
 
-    Convention: what watches a figure, `EarlyStopping` or a `ModelCheckpoint` with `monitor`, begins with the
-        last stage, and so does validation: figures of two stages do not compare.
+    Convention: `EarlyStopping`, a `ModelCheckpoint` with `monitor`, and validation begin with the last stage:
+        figures of two stages do not compare.
 
     Raises:
         InputError: settings out of range; a backbone that gives no (B,D); a loss that is not finite; a
             checkpoint of other settings.
-        NothingLearned: an InputError; the mean loss of 100 steps behind the rise of the learning rate, or of
+        NothingLearned: an InputError; the mean loss of 100 steps after the rise of the learning rate, or of
             the last 100 of a stage, is that of a guess.
     """
 
@@ -175,7 +167,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.dejavu = DejaVu(backbone, whitening, mapper, batch_size=batch_size, preprocess=preprocess)
         if start is not None:
             start_from(backbone, start)
-        self.frozen = [module.eval() for module in freeze_parts(backbone, freeze or [], batch_norm)]
+        self.frozen = freeze_parts(backbone, freeze or [], batch_norm)
+        self.train()
         temperature = mapper.temperature if isinstance(mapper, TemplateMapper) else None
         self.log_temperature = nn.Parameter(torch.tensor(math.log(temperature or TEMPERATURE)))
         self.feature_weights, self.refresh = feature_weights, refresh
@@ -183,8 +176,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.lr, self.weight_decay, self.weight_bits = lr, weight_decay, weight_bits
         self.gives_way = False  # whether bytes per place that a short route cannot meet are raised
         self.stages = nn.ModuleList(stages_of(backbone, descriptor, self.made, rate))
-        self.index = 0  # of the stage
-        self.began = 0  # the step at which it began
+        self.index, self.began = 0, 0  # the stage, and the step at which it began
         self.last = LastLosses()  # of the stage
         self.views: Views | None = None  # what the code of a whitened descriptor is learned from
         self.places: Tensor | None = None  # its descriptors of the reference
@@ -193,9 +185,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
         self.held_before: list[int] | None = None  # stretches, of the training that a checkpoint comes from
         self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
-        self.before: dict[str, Tensor] = {}  # the step: state of the random numbers, buffers of the backbone
-        self.views_drawn_at: Tensor | None = None  # and ahead of the views
-        self.replayed: dict[str, Any] | None = None  # random numbers that a resumed run goes on with
         self._callbacks: list[pl.Callback] = []
 
     @property
@@ -233,10 +222,8 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     @property
     def frame_size(self) -> tuple[int, int] | None:
-        """(height, width) that frames may be stored in: what the backbone resizes them to anyway.
-
-        None where it does not, or where a contrast is evened ahead of it, at the frames' own size.
-        """
+        """(height, width) to which the backbone resizes frames, so that they may be stored in it; None if it
+        does not, or a contrast is evened before, at the frames' own size."""
         return None if self.dejavu.preprocess.contrast else getattr(self.dejavu.features, "resize", None)
 
     @property
@@ -274,18 +261,18 @@ class PlaceRecognitionTask(pl.LightningModule):
                 "those of the map of one route; expected model.rate 0, or one route"
             )
         still = not self.data.augmentation.acts and self.data.sources["second"] is None
-        whitens = any(isinstance(one, WhiteningStage) for one in self.stages)
-        if still and (whitens or (self.made and self.dejavu.whitening is not None)):
+        whitened = self.dejavu.whitening is not None if self.made else whitens(self.dejavu.features)
+        if still and whitened:
             raise InputError(
                 "data.augmentation changes nothing and there is no data.second: nothing shows the whitening "
                 f"what two visits differ in; expected one of them{', or model.whitening none' * self.made}"
             )
         if reference.values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")
-            self.dejavu.features = HOG()  # has nothing to store
+            self.dejavu.features, self.frozen = HOG(), set()  # has nothing to store
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
         # a further training describes its own frames
-        self.began, self.views, self.places, self.views_drawn_at = 0, None, None, None
+        self.began, self.views, self.places = 0, None, None
         self.last = LastLosses()
 
     def _say_few(self) -> None:
@@ -301,10 +288,7 @@ class PlaceRecognitionTask(pl.LightningModule):
     # the map
 
     def relearn(self) -> None:
-        """Layers and templates anew from the present features of the reference (section III-A).
-
-        The first features are made in training mode, so that running statistics are gathered.
-        """
+        """The map anew from the present features of the reference (section III-A)."""
         if self.made:
             with in_bits(self.dejavu.features, self.weight_bits):
                 make_map(self)
@@ -315,6 +299,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
 
     def _start_templates(self) -> None:
+        """The first features are made in training mode, so that running statistics are gathered."""
         first, weights = not self.route.places, self.route.weights
         with in_mode(self, first):
             if has_descriptor(self.dejavu.features):
@@ -365,11 +350,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         return model
 
     def require_map(self) -> None:
-        """Refuse a training that is in a stage without a map.
-
-        Raises:
-            InputError: naming the stage.
-        """
+        """Refuse a training that is in a stage without a map."""
         if not self.in_last_stage:
             raise InputError(
                 f"the training is in stage {self.index + 1} of {len(self.stages)}, "
@@ -379,14 +360,13 @@ class PlaceRecognitionTask(pl.LightningModule):
     # training
 
     def configure_optimizers(self) -> Any:
-        """Begin the stage; stages without steps are over at once. The optimizer is of its parameters."""
+        """Begin the stage, or the next where it has no steps. The optimizer is of its parameters."""
         steps = float(self.trainer.estimated_stepping_batches)
         if not math.isfinite(steps):
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
-        self.stage.begin(self)
-        while self._stop() <= self.began and not self.in_last_stage:
+        if self._stop() <= self.began and not self.in_last_stage:
             self._advance(self.began)
-            self.stage.begin(self)
+        self.stage.begin(self)
         return adamw_of(self.stage.trained(self), self.lr, self.weight_decay, self._stop() - self.began)
 
     def _stop(self) -> int:
@@ -405,9 +385,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Refuse what cannot be resumed; callbacks that watch a figure wait for the last stage."""
         if self.resumed is not None:
             check_resumable(self.resumed, self.trainer)
-            self.replayed = self.resumed.get(RANDOM)
-            if self.replayed is not None:
-                self.data.replayed = (self.replayed["order"], self.replayed["done"])
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
             self.trainer.callbacks = [  # type: ignore[attr-defined]
@@ -419,12 +396,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.resumed = None
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Where the steps of a stage are over, the next one begins, with its own optimizer.
-
-        A map that is made of the features does not outlast them.
-        """
-        if self.replayed is not None:
-            self._replay(self.replayed)
+        """Drop a map of the features before; begin the next stage if the steps of this one are over."""
         if self.made and self.map.places:
             self.dejavu.load_state_dict(self._unmade(), strict=False)
         if not self.in_last_stage and self.global_step >= self._stop():
@@ -432,8 +404,6 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.trainer.strategy.setup_optimizers(self.trainer)
             if self.in_last_stage:
                 self.trainer.callbacks = self._callbacks
-        buffers = self.dejavu.features.named_buffers()
-        self.before = {name: buffer.clone() for name, buffer in buffers} | {RANDOM: torch.get_rng_state()}
 
     def on_train_epoch_start(self) -> None:
         """Find the layers anew where it is time to."""
@@ -445,8 +415,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
-        with shared_statistics(self.dejavu.features):
-            total, parts, left_out = self.stage.losses(self, batch)
+        total, parts, left_out = self.stage.losses(self, batch)
         figures = averaged(torch.stack([total, *parts.values()]).detach())
         parts = dict(zip(parts, figures[1:], strict=True))
         if not figures[0].isfinite():
@@ -458,14 +427,8 @@ class PlaceRecognitionTask(pl.LightningModule):
         if self.global_step - self.began >= warm_up(self._stop() - self.began):
             self.last.add(parts)
         self.log_dict({f"train/{name}": part for name, part in parts.items()})
-        self.log(
-            "train/left_out",
-            float(left_out),
-            reduce_fx="sum",
-            on_step=False,
-            on_epoch=True,
-            sync_dist=self.trainer.world_size > 1,
-        )
+        several = self.trainer.world_size > 1
+        self.log("train/left_out", left_out, on_step=False, on_epoch=True, reduce_fx="sum", sync_dist=several)
         self.log("train/loss", figures[0], prog_bar=True)
         return total
 
@@ -480,14 +443,13 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_after_backward(self) -> None:
         """The gradients of all processes, ahead of their scaling and clipping."""
-        for optimizer in self.trainer.optimizers:
-            average_gradients(p for group in optimizer.param_groups for p in group["params"])
+        average_gradients(self.trainer.optimizers, self.dejavu.features)
 
     def train(self, mode: bool = True) -> PlaceRecognitionTask:
         """As nn.Module's, but what is frozen keeps its running statistics."""
         super().train(mode)
-        for module in self.frozen:
-            module.eval()
+        for name in self.frozen:
+            self.dejavu.features.get_submodule(name).eval()
         return self
 
     def teardown(self, stage: str) -> None:
@@ -537,13 +499,11 @@ class PlaceRecognitionTask(pl.LightningModule):
     def load_from_checkpoint(  # type: ignore[override]
         cls, checkpoint_path: str | Path, *, weights_only: bool = True, **settings: Any
     ) -> PlaceRecognitionTask:
-        """A task with the weights of a checkpoint.
-
-        Lightning's own also takes settings from the checkpoint, and for that imports what it names.
+        """A task with the weights of a checkpoint; Lightning's own would import what the file names.
 
         Args:
-            weights_only: accepted, as Lightning has it; no code of a checkpoint is ever run.
-            settings: those of the constructor that the checkpoint was trained with.
+            weights_only: ignored; no code of a checkpoint is ever run.
+            settings: of the constructor, as in the training.
 
         Raises:
             InputError: a damaged checkpoint, or one of other settings.
@@ -557,13 +517,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         stages = [type(stage).__name__ for stage in self.stages]
         checkpoint |= {"stages": stages, "stage": self.index, "began": self.began, "trained": self._trained()}
         checkpoint |= {"routes": self._routes(), "held": self.held}
-        checkpoint[RANDOM] = self._random()
-        if (
-            checkpoint[RANDOM] is not None and self._in_step()
-        ):  # running statistics may have followed its batch
-            for name, before in self.before.items():
-                if f"{FEATURES}{name}" in checkpoint["state_dict"]:
-                    checkpoint["state_dict"][f"{FEATURES}{name}"] = before
         if self.made:
             checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
 
@@ -587,9 +540,6 @@ class PlaceRecognitionTask(pl.LightningModule):
             self.resumed = checkpoint
             if self.trainer.state.fn != "fit":
                 checkpoint.pop("loops", None)  # nothing goes on
-            elif checkpoint.get(RANDOM) is not None:
-                check_random(checkpoint[RANDOM])
-                self.views_drawn_at = checkpoint[RANDOM]["views"]
         self.routes = checkpoint.get("routes", [])
         if not isinstance(self.routes, list) or not all(isinstance(one, list) for one in self.routes):
             raise InputError(
@@ -609,45 +559,6 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both; expected a "
                 "checkpoint of the same settings"
             )
-
-    def _random(self) -> dict[str, Any] | None:
-        """What a resumed run needs to draw the same numbers, on a CPU; None where no training runs.
-
-        now: the state of the random numbers behind the last whole step. order: that ahead of the order of the
-        present epoch, of whose batches so many are done. views: that ahead of `describe_views`.
-        """
-        clips = self._clips()
-        if clips is None or clips.drawn_at is None or not self.before:
-            return None
-        now, done = (
-            self.before[RANDOM] if self._in_step() else torch.get_rng_state(),
-            self._progress().processed,
-        )
-        in_epoch = done < self.trainer.num_training_batches
-        order, done = (clips.drawn_at, done) if in_epoch else (now, 0)
-        return {"now": now, "order": order, "done": done, "views": self.views_drawn_at}
-
-    def _replay(self, random: dict[str, Any]) -> None:
-        """Go on with the random numbers of a checkpoint, at the first step behind it."""
-        clips, now = self._clips(), random["now"]
-        if clips is not None and clips.replayed is not None:
-            clips.replayed = None
-            now = clips.drawn_to if torch.equal(now, random["order"]) else now  # an epoch began
-        torch.set_rng_state(now)
-        self.replayed = None
-
-    def _clips(self) -> Clips | None:
-        clips = getattr(self._trainer and self.trainer.train_dataloader, "sampler", None)
-        return clips if isinstance(clips, Clips) else None
-
-    def _progress(self) -> Any:
-        """Of the batches of this epoch."""
-        return self.trainer.fit_loop.epoch_loop.batch_progress.current
-
-    def _in_step(self) -> bool:
-        """Whether a step has begun and is not over."""
-        progress = self._progress()
-        return bool(progress.processed < progress.ready)
 
     def _check_finite(self, state: dict[str, Any]) -> None:
         """Refuse NaN and infinity, but for buffers of the backbone, such as a mask."""
@@ -721,10 +632,8 @@ def _layers(plan: Plan) -> str:
 
 
 def start_from(backbone: nn.Module, path: str | Path) -> None:
-    """Give a backbone the weights that a map file holds.
-
-    Of a whitened descriptor its code is left out, which is of the other route, and of any dimension. Where an
-    `Embedding` gives the descriptor itself, here or there, its network is all that is taken.
+    """Give a backbone the weights of a map file, without the code of a whitened descriptor, which is of its
+    route; only the network if an `Embedding` gives the descriptor itself, here or there.
 
     Raises:
         InputError: no map file, or one of another backbone.
@@ -752,8 +661,8 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
 
 def freeze_parts(
     backbone: nn.Module, prefixes: Sequence[str], batch_norm: Literal["train", "frozen"]
-) -> list[nn.Module]:
-    """Take the gradient from parameters; return the modules whose running statistics have to stay.
+) -> set[str]:
+    """Take the gradient from parameters; return the names of modules whose running statistics have to stay.
 
     Args:
         prefixes: parameters whose names begin with one of these are frozen; "" is all of them.
@@ -772,12 +681,12 @@ def freeze_parts(
             )
         for parameter in chosen:
             parameter.requires_grad_(False)
-    return [
-        module
+    return {
+        name
         for name, module in backbone.named_modules()
         if getattr(module, "running_mean", None) is not None  # follows the batches without any gradient
         and (batch_norm == "frozen" or any(f"{name}.".startswith(prefix) for prefix in prefixes))
-    ]
+    }
 
 
 def warm_up(steps: int) -> int:

@@ -366,7 +366,7 @@ MUTANTS = [
     ),
     Mutant(
         "The entropy model of a training with a rate has two bands an octave.",
-        "dejavu_torch/training/rate.py",
+        "dejavu_torch/training/losses.py",
         "PER_OCTAVE = 2",
         "PER_OCTAVE = 1",
         ("tests/training/test_rate.py::-k bands",),

@@ -20,7 +20,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with traverses, a config, a user's module, and a training."""
     folder = tmp_path_factory.mktemp("train")
     arrays = {"one": footage(), "two": footage(0.1), "short": footage()[:2], "single": footage()[:1]}
-    arrays |= {"thirty": footage()[:30], "large": footage(side=24)}
+    arrays["large"] = footage(side=24)
     arrays["colour"] = footage()[..., None].expand(-1, -1, -1, 3)
     for name, frames in arrays.items():
         np.save(folder / f"{name}.npy", frames.numpy())

@@ -153,10 +153,6 @@ class Broken(nn.Module):
     def __init__(self) -> None:
         raise RuntimeError("no weights\\nto be had")
 
-class Late(Plain):
-    def forward(self, frames):
-        return super().forward(frames) * (float("nan") if self.calls > 2 else 1.0)
-
 class Hungry(Plain):
     def forward(self, frames):
         if self.calls > 2:

@@ -15,8 +15,14 @@ from small_training import FRAMES, backbone, data_of, new_task, trainer, warned
 
 from dejavu_torch import SpectralMapper
 from dejavu_torch.cli import main
-from dejavu_torch.training.chance import LAST, LastLosses, phase_chance, place_chance
-from dejavu_torch.training.losses import phase_cross_entropy, place_cross_entropy
+from dejavu_torch.training.losses import (
+    LAST,
+    LastLosses,
+    phase_chance,
+    phase_cross_entropy,
+    place_chance,
+    place_cross_entropy,
+)
 from dejavu_torch.training.task import PlaceRecognitionTask
 from dejavu_torch.types import FrequencyLayer
 
@@ -27,7 +33,7 @@ ALIKE = torch.full((FRAMES, 16, 16), 128, dtype=torch.uint8)
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Losses of fewer steps tell."""
-    monkeypatch.setattr("dejavu_torch.training.chance.LAST", FEW)
+    monkeypatch.setattr("dejavu_torch.training.losses.LAST", FEW)
 
 
 def task_of(kind: str) -> PlaceRecognitionTask:

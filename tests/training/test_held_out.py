@@ -19,8 +19,7 @@ from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.training import export
-from dejavu_torch.training.export import LastCheckpoint
-from dejavu_torch.training.worth import UNTRAINED, beside_untrained
+from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, beside_untrained
 
 FRAMES = 320
 MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map

@@ -71,19 +71,6 @@ def test_the_place_loss_is_the_literal_one(rows: list[tuple[list[float], list[in
     assert (gradient[scores.isposinf()] == 0).all()
 
 
-def test_equal_scores_give_the_logarithm_of_the_share() -> None:
-    scores = torch.full((2, 100), 3.0)
-    loss, left_out = place_cross_entropy(scores, torch.tensor([[50, -1], [0, 99]]), 5, 0.1)
-    close(loss, (math.log(100 / 11) + math.log(100 / 12)) / 2, 1e-6)
-    assert left_out == 0
-
-
-def test_the_place_loss_of_a_batch_is_the_mean_of_its_queries() -> None:
-    scores, places = normal(6, 30), torch.randint(0, 30, (6, 2))
-    alone = [place_cross_entropy(scores[q, None], places[q, None], 2, 0.5).loss for q in range(6)]
-    close(place_cross_entropy(scores, places, 2, 0.5).loss, torch.stack(alone).mean())
-
-
 def test_gradients_of_the_place_loss_reach_scores_and_temperature() -> None:
     scores, temperature = normal(3, 8, grad=True), torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     places, gap = torch.tensor([[1, 6], [4, -1], [-1, -1]]), torch.arange(8) == 2

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,10 +10,7 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from pytorch_lightning import LightningModule, Trainer
 from torch import Tensor
-from torch.utils.data import DataLoader
-from torchmetrics import MetricCollection
 
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.curves import Scores, evaluate
@@ -83,22 +78,6 @@ def test_it_is_evaluate_on_all_data_whatever_the_batches(batches: list[Any], tol
         assert all(value.isnan() for value in figures.values())
 
 
-def test_by_hand() -> None:
-    metric = PlaceRecognition(tolerance=0)
-    metric.update(Match(torch.tensor([3]), torch.tensor([0.1]), torch.tensor([True])), torch.tensor([[3]]))
-    two = Match(torch.tensor([4, -1]), torch.tensor([0.2, INF]), torch.tensor([True, False]))
-    metric.update(two, torch.tensor([[5, 3], [6, -1]]))
-    figures = {name: round(value.item(), 6) for name, value in metric.compute().items()}
-    assert figures == {
-        "auc": 0.0,  # both points lie at recall 1/3
-        "auc_reported": 0.125,  # from (1/3, 1) to (1/2, 1/2)
-        "recall_at_100_precision": round(1 / 3, 6),
-        "recall_at_100_precision_reported": round(1 / 3, 6),
-        "precision_at_100_recall": 0.5,
-        "recall_at_1": round(1 / 3, 6),
-    }
-
-
 def test_close_scores_in_double_precision_stay_apart() -> None:
     index, score = torch.tensor([0, 1]), torch.tensor([1.0, 1.0 + 1e-12], dtype=torch.float64)
     match = Match(index, score, score.isfinite())
@@ -118,14 +97,6 @@ def test_reset_forgets() -> None:
     assert same(metric.compute(), evaluate(*second, tolerance=1))
 
 
-def test_calling_it_evaluates_the_batch_and_adds_it() -> None:
-    first, second = some(), some()
-    metric = fed(first)
-    assert same(metric.compute(), evaluate(*first, tolerance=1))
-    assert same(metric(*second), evaluate(*second, tolerance=1))
-    assert same(metric.compute(), fed_scores(first, second))
-
-
 def fed_scores(*batches: tuple[Match, Tensor]) -> Scores:
     """`evaluate` of the batches joined by hand."""
     matches, truths = zip(*batches, strict=True)
@@ -133,13 +104,6 @@ def fed_scores(*batches: tuple[Match, Tensor]) -> Scores:
     rows = [torch.nn.functional.pad(truth, (0, width - truth.shape[1]), value=-1) for truth in truths]
     joined = Match(*(torch.cat(column) for column in zip(*matches, strict=True)))
     return evaluate(joined, torch.cat(rows), tolerance=1)
-
-
-def test_merged_states_are_one() -> None:
-    first, second = some(rights=1), some(rights=4)
-    metric = fed(first)
-    metric.merge_state(fed(second))
-    assert same(metric.compute(), fed_scores(first, second))
 
 
 @pytest.mark.parametrize("elsewhere", [(), (some(30, 3),), (some(30, 3), some(5, 1))], ids=len)
@@ -168,54 +132,6 @@ def test_a_process_that_saw_nothing_sends_what_the_others_send() -> None:
 
     fed(dist_sync_fn=concatenate, distributed_available_fn=lambda: True).compute()
     assert sent == [(1, torch.float64)] * 3
-
-
-def test_it_survives_a_pickle_a_copy_and_a_checkpoint() -> None:
-    metric = fed(some(), some(rights=3))
-    expected = metric.compute()
-    metric.persistent(True)
-    restored = PlaceRecognition(tolerance=1)
-    restored.persistent(True)
-    restored.load_state_dict(metric.state_dict())
-    for other in (pickle.loads(pickle.dumps(metric)), copy.deepcopy(metric), restored):
-        other._computed = None  # what was kept, not what was computed
-        assert other.compute() == expected
-    assert PlaceRecognition(tolerance=1).state_dict() == {}
-
-
-def test_in_a_collection_the_figures_stand_by_name() -> None:
-    batch = some()
-    assert same(MetricCollection(PlaceRecognition(0))(*batch), evaluate(*batch, tolerance=0))
-
-
-class Validated(LightningModule):
-    """Logs as a task does."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.metric = PlaceRecognition(1)
-
-    def validation_step(self, batch: Any, index: int) -> None:
-        self.metric.update(*batch)
-
-    def on_validation_epoch_end(self) -> None:
-        self.log_dict(self.metric.compute())
-        self.metric.reset()
-
-
-def test_a_trainer_logs_it() -> None:
-    batches = [some(), some(rights=3)]
-    trainer = Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
-    logged = trainer.validate(Validated(), DataLoader(batches, batch_size=None), verbose=False)[0]
-    scores = fed_scores(*batches)
-    assert logged == pytest.approx(scores._asdict())
-
-
-def test_higher_is_better_and_gradients_stop() -> None:
-    match, truth = some()
-    metric = fed((match._replace(score=match.score.requires_grad_()), truth))
-    assert metric.higher_is_better
-    assert not any(value.requires_grad for value in metric.compute().values())
 
 
 def test_errors() -> None:

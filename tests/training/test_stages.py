@@ -1,4 +1,4 @@
-"""The stages of a training, the descriptor, its whitening and its code: what is trained when, what stays."""
+"""The stages of a training, the descriptor and its code: what is trained when, what stays."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from dejavu_torch import HOG, DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.stages import CodeStage, DescriptorStage, WhiteningStage
+from dejavu_torch.training.stages import CodeStage, DescriptorStage
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 STILL = {name: 0.0 for name in ("rotation", "scale", "gamma", "illumination", "blur", "occlusion", "noise")}
 STILL |= {name: (0.0, 0.0) for name in ("colour", "shift", "exposure")}  # type: ignore[dict-item]
-ALL = [DescriptorStage, WhiteningStage, CodeStage]
+ALL = [DescriptorStage, CodeStage]
 
 
 def coded(**settings: Any) -> Embedding:
@@ -174,7 +174,7 @@ def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path, steps: int) -> None:
     on = trainer(tmp_path / "again", resumed, max_steps=10, enable_checkpointing=True)
     on.fit(again, data_of(), ckpt_path=part(tmp_path, steps), weights_only=True)
     assert on.global_step == 10
-    assert (again.index, again.began) == (2, 5)
+    assert (again.index, again.began) == (1, 5)
     assert resumed.rates == pytest.approx(whole.rates[steps:])
     assert resumed.states[0]["linear.whitened"] == (steps >= 5)
     assert {n.partition(".")[0] for n in changed(resumed.states[-3:])} == {"linear", "standardise"}
@@ -192,9 +192,9 @@ def test_a_checkpoint_is_loaded_whatever_the_tolerance(tmp_path: Path, steps: in
         running.validate(evaluated, data_of(tolerance=4), ckpt_path=path, verbose=False, weights_only=True)
         assert evaluated.in_last_stage
         return
-    with refused("stage 1 of 3, DescriptorStage", "no map yet"):
+    with refused("stage 1 of 2, DescriptorStage", "no map yet"):
         running.validate(evaluated, data_of(tolerance=4), ckpt_path=path, verbose=False, weights_only=True)
-    with refused("stage 1 of 3, DescriptorStage"):
+    with refused("stage 1 of 2, DescriptorStage"):
         task.deployed()
 
 
@@ -254,7 +254,7 @@ def test_a_frozen_network_is_shown_every_frame_once_and_every_view_once(tmp_path
     task = staged(backbone=coded(network=network, resize=(8, 8), kept=4), freeze=["network"], refresh=refresh)
     tried = network.shown
     stages = [type(stage) for stage in task.stages]
-    assert stages == [WhiteningStage, CodeStage]
+    assert stages == [CodeStage]
     trainer(tmp_path, max_steps=6, limit_val_batches=0).fit(task, data_of(validation=None))
     assert task.views is not None
     frames = len(task.data.sets["reference"])

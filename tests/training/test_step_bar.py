@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from dejavu_torch.training import steps
-from dejavu_torch.training.steps import StepBar
+from dejavu_torch.training import export
+from dejavu_torch.training.export import StepBar
 
 
 class Terminal(io.StringIO):
@@ -26,7 +26,7 @@ def shown(
     """What a training writes whose every second batch ends a step, each a second long."""
     clock = iter(range(10**6))
     monkeypatch.setattr(
-        steps, "time", SimpleNamespace(monotonic=lambda: seconds.get("batch", 0.5) * next(clock))
+        export, "time", SimpleNamespace(monotonic=lambda: seconds.get("batch", 0.5) * next(clock))
     )
     monkeypatch.setattr(sys, "stderr", stream)
     trainer: Any = SimpleNamespace(

@@ -109,12 +109,6 @@ def test_a_validation_changes_nothing_in_training(tmp_path: Path) -> None:
     assert torch.equal(*maps)
 
 
-def test_bf16_trains_and_exports_float32(tmp_path: Path) -> None:
-    model = fit(tmp_path, new_task(feature_weights=True), data_of(), precision="bf16-mixed")
-    kinds = {t.dtype for t in model.state_dict().values() if isinstance(t, Tensor) and t.is_floating_point()}
-    assert kinds == {torch.float32}
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

@@ -268,12 +268,6 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
     )
 
 
-def test_a_spectral_map_without_whitening(folder: Path, tmp_path: Path) -> None:
-    chosen = ["--model.mapper", "SpectralMapper", "--model.whitening", "none"]
-    train("fit", *chosen, "--trainer.default_root_dir", tmp_path)
-    assert DejaVu.load(tmp_path / "map.safetensors").whitening is None
-
-
 def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:
     options = [
         "--trainer.max_steps",
@@ -390,21 +384,6 @@ def test_a_trial_run_leaves_an_earlier_run_as_it_is(
 def contents(folder: Path) -> dict[str, bytes]:
     kept = [folder / "map.safetensors", *(folder / "checkpoints").iterdir()]
     return {path.name: path.read_bytes() for path in kept}
-
-
-def test_a_run_without_batches_leaves_no_map(
-    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    train("fit", "--trainer.limit_train_batches", 0, "--trainer.default_root_dir", tmp_path)
-    assert "no step was taken: no map is written" in warned(caplog)
-    assert not (tmp_path / "map.safetensors").exists()
-
-
-def test_a_run_that_is_over_warns(folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    last = folder / "run" / "checkpoints" / "last.ckpt"
-    train("fit", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path)
-    (line,) = [line for line in warned(caplog) if line.startswith("nothing was trained")]
-    assert "step 4 is reached" in line
 
 
 def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
