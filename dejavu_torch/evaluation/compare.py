@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +22,6 @@ from dejavu_torch.data.ground_truth import (
     ground_truth_in_places,
     offset_of,
 )
-from dejavu_torch.evaluation import storage
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import baselines_of, hog_baselines, seqslam_baseline
 from dejavu_torch.evaluation.contenders import Contender, contend, lengths_beside
@@ -32,6 +31,7 @@ from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.score_plots import Stored
+from dejavu_torch.evaluation.storage import noise_over_map, storage_curve
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
@@ -93,7 +93,6 @@ def compare(
     top: int = 1,
     calibration: Views | Literal["none"] | None = None,
     distractors: Sequence[Traverse] = (),
-    storage_curve: bool = False,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -119,73 +118,90 @@ def compare(
         calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a map that is
             learned by changed frames of the reference, "none" does not.
         distractors: routes that are not on the map: how many of their frames are accepted.
-        storage_curve: also code the descriptors of a spectral map at other sizes and evaluate each, which
-            takes as long as all the rest.
         progress: show progress bars on a terminal.
 
     Raises:
         InputError: bad input of any of the stages, or a map of another number of places.
     """
-    model, seconds = DejaVu() if model is None else model, defaultdict[str, float](float)
+    model = DejaVu() if model is None else model
+    itself = reference is query
+    reference, query = as_traverse(reference), as_traverse(query)
     _check_arguments(model, truth, tolerance, leave_out, interpolate)
-    has_map, itself = model.map.places > 0, reference is query
     check_candidates(top, tolerance)
-    # read
-    work = "describe" if has_map else "learn"
-    reference = model.fit(as_traverse(reference), model.frame_shape if has_map else None)
-    query = model.fit(as_traverse(query), reference.frame_shape)
+    has_map = model.map.places > 0
+    reference = model.fit(reference, model.frame_shape if has_map else None)
+    query = model.fit(query, reference.frame_shape)
     features = model.describer.check_sizes(reference, query)
+    seconds: dict[str, float] = defaultdict(float)
+    work = "describe" if has_map else "learn"
     with timed(seconds, work):
         reference = model.resample(reference, model.step if has_map else None, progress)
     with timed(seconds, "localize"):
         query = model.resample(query, getattr(reference, "step", None), progress)
-    check_candidates(top, tolerance, reference.length)  # before the long work, as the next
-    find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
-    lengths_known = reference.length is not None and query.length is not None
-    known = find_truth() if lengths_known else None
+    check_candidates(top, tolerance, reference.length)  # before the long work
     if sequence is not None and reference.length is not None:
         sequence.check(None, reference.length)
+    find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
+    lengths_known = reference.length is not None and query.length is not None
+    known = find_truth() if lengths_known else None  # one that does not fit is refused before the long work
     if itself or (reference.name == query.name != UNNAMED):
         log.warning(
             "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
         )
-    # learn
     with timed(seconds, work):
         places = _described(model, reference, second, tolerance, progress)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration)
         model.matching(sequence)
-    # match
     with timed(seconds, "localize"):
         model.check_queries(query.frame_shape, features, query.name)
         queries = model.extract_all(query, "describing the query" if progress else None)
-        candidates, matching = _matched(model, queries, sequence, top, tolerance)
-    off_map = _off_map(model, distractors, sequence)
-    # judge
+        if sequence is not None:
+            sequence.check(len(queries), model.map.places)
+        ranks = max(top, min(max(RANKS), model.map.places))
+        matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
+        wanted = model.matching(sequence)._replace(lengths=matching.lengths, k=ranks, radius=tolerance)
+        candidates = model.localize_descriptors(queries, wanted)
+    match = candidates.map(lambda column: column[:, 0])
+    off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
+    if distractors and not off_map:
+        log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
     model.cpu()  # baselines, null and pictures take their numbers one by one
+    places, queries = places.cpu(), queries.cpu()
     if not lengths_known:
         known = find_truth(len(places), len(queries))
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
-    match = candidates.map(lambda column: column[:, 0])
-    run = Localization(
-        model, reference, query, places.cpu(), queries.cpu(), match, known, tolerance, matching
-    )
-    # baselines
+    run = Localization(model, reference, query, places, queries, match, known, tolerance, matching)
     contenders = _contenders(run, match, seed, leave_out, progress)
-    if known is not None:
-        contenders |= {key: _learned_beside(run, *other) for key, other in (others or {}).items()}
-    curve = _storage_curve(run, contenders["map"], seed, progress) if storage_curve else None
-    # report
-    pictures = draw_pictures(run, contenders, curve)
+    for key, (name, other) in (others or {}).items():
+        if known is not None:
+            contenders[key] = _learned_beside(run, name, other)
+    scored = contenders["map"].scores is not None
+    storage, noise = _at_other_sizes(run, seed, progress) if scored else (None, {})
+    pictures = draw_pictures(run, contenders, storage)
     pictures |= draw_reliability(run.scored, known, tolerance)
     carried = all(source_of(one).place is not None for one in (reference, query))
-    stated = describe_ground_truth(truth, interpolate, carried), offset_of(truth, carried)
     facts = {
-        **_map_facts(model.summary(), run.reference_features),
+        **_map_facts(model.summary(), places),
         **_run_facts(run, seconds),
-        **_noise_facts(run, contenders["map"], seed),
-        **_truth_facts(run, candidates, off_map, *stated),
+        **noise,
+        **evaluation_facts(
+            of_shown_frames(match, model.map),
+            known,
+            tolerance,
+            model.map.positions,
+            describe_ground_truth(truth, interpolate, carried),
+        ),
+        **own_facts(
+            match._replace(index=model.map.frame_of(match.index)),
+            run.query_frames,
+            tolerance,
+            known is not None,
+            offset_of(truth, carried),
+        ),
+        **candidate_facts(model.map.table.scored(candidates.index), known, tolerance),
+        **rejection_facts(run.scored, known, tolerance, off_map),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
     return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run, candidates)
@@ -207,29 +223,11 @@ def _described(
     return places
 
 
-def _matched(
-    model: DejaVu, queries: Tensor, sequence: SequenceModel | None, top: int, tolerance: int
-) -> tuple[Match, Matching]:
-    """The best places of each query, and how they were matched."""
-    if sequence is not None:
-        sequence.check(len(queries), model.map.places)
-    ranks = max(top, min(max(RANKS), model.map.places))
-    matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
-    wanted = model.matching(sequence)._replace(lengths=matching.lengths, k=ranks, radius=tolerance)
-    return model.localize_descriptors(queries, wanted), matching
-
-
-def _off_map(
-    model: DejaVu, distractors: Sequence[Traverse], sequence: SequenceModel | None
-) -> dict[str, Tensor]:
-    """Probabilities (n,) of what is found for frames that are not on the map, by their routes' names."""
-    if distractors and not model.matching(sequence).platt:
-        log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
-        return {}
-    found = {}
-    for one in distractors:
-        features = model.extract_all(Fitted(one, model.frame_shape or ()))
-        found[one.name] = cast(Tensor, model.localize_descriptors(features, sequence).probability)
+def _probability(model: DejaVu, traverse: Traverse, sequence: SequenceModel | None) -> Tensor:
+    """Of what is found for frames that are not on the map, (n,)."""
+    frames = Fitted(traverse, model.frame_shape or ())
+    found = model.localize_descriptors(model.extract_all(frames), sequence).probability
+    assert found is not None
     return found
 
 
@@ -326,41 +324,16 @@ def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
     return _contend(run, name, found, other)
 
 
-def _storage_curve(
-    run: Localization, ours: Contender, seed: int, progress: bool
-) -> dict[str, list[Stored]] | None:
-    scored = ours.scores is not None and isinstance(run.model.map, SpectralMap)
-    return storage.storage_curve(run, seed=seed, progress=progress) if scored else None
-
-
-def _noise_facts(run: Localization, ours: Contender, seed: int) -> dict[str, float]:
-    """What report.json holds of the smoothness of a spectral map of one chunk."""
+def _at_other_sizes(
+    run: Localization, seed: int, progress: bool
+) -> tuple[dict[str, list[Stored]] | None, dict[str, float]]:
+    """The storage curve of a spectral map, and what report.json holds of its smoothness."""
     route = run.model.map
-    if ours.scores is None or not isinstance(route, SpectralMap) or len(route.chunks) > 1:
-        return {}
-    return {"noise_over_map": storage.noise_over_map(route, run.reference_features, seed)}
-
-
-def _truth_facts(
-    run: Localization,
-    candidates: Match,
-    off_map: Mapping[str, Tensor],
-    stated: str,
-    offset: int | None,
-) -> dict[str, Any]:
-    """What report.json holds of the answers, beside the truth where there is one.
-
-    Args:
-        stated: where the truth comes from. offset: place - query, where it is one.
-    """
-    route, match, known, tolerance = run.model.map, run.match, run.truth, run.tolerance
-    own = match._replace(index=route.frame_of(match.index))
-    return {
-        **evaluation_facts(of_shown_frames(match, route), known, tolerance, route.positions, stated),
-        **own_facts(own, run.query_frames, tolerance, known is not None, offset),
-        **candidate_facts(route.table.scored(candidates.index), known, tolerance),
-        **rejection_facts(run.scored, known, tolerance, off_map),
-    }
+    if not isinstance(route, SpectralMap):
+        return None, {}
+    storage = storage_curve(run, seed=seed, progress=progress)
+    whole = len(route.chunks) == 1
+    return storage, {"noise_over_map": noise_over_map(route, run.reference_features, seed)} if whole else {}
 
 
 def _is_plain_hog(model: DejaVu) -> bool:

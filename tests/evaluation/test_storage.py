@@ -29,9 +29,7 @@ def route(seed: int) -> Tensor:
 @pytest.fixture(scope="module")
 def result() -> Comparison:
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
-    return compare(
-        ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=2, storage_curve=True
-    )
+    return compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=2)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +65,7 @@ def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, rep
 def test_each_budget_is_evaluated_at_every_length() -> None:
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    found = compare(*pair, "0", model=model, tolerance=2, storage_curve=True, sequence=SequenceMatcher(5))
+    found = compare(*pair, "0", model=model, tolerance=2, sequence=SequenceMatcher(5))
     storage = found.report.as_json()["storage"]
     for key in ("map", "null", "interpolated"):
         for one in storage[key]:
