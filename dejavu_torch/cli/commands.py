@@ -75,7 +75,8 @@ def run_demo(
     paper = paper_model()
     named = [recipe_of(one.mapper) for one in (model, paper)]
     others = {"paper": ("the paper to the letter", paper)} if named[0] != named[1] else {}
-    result = compare(reference, query, model=model, seed=seed, second=views, others=others, progress=True)
+    asked: dict[str, Any] = {"seed": seed, "others": others, "storage_curve": True}
+    result = compare(reference, query, model=model, second=views, progress=True, **asked)
     _publish(result, out, "dejavu demo: the built-in route", command)
     tries = (
         [
@@ -394,6 +395,7 @@ def run_compare(
     calibration: str | None = None,
     calibration_truth: str | None = None,
     distractors: list[str] | str | None = None,
+    storage_curve: bool = False,
     device: str = "cpu",
     model: DejaVu,
     command: str,
@@ -423,6 +425,7 @@ def run_compare(
         calibration: as of `dejavu learn`; a third traverse
         calibration_truth: which places it shows, as --truth
         distractors: another route, or a list of several, '[A,B]': how many of its frames are accepted
+        storage_curve: also code the descriptors at several sizes, for AUC over bytes; as in `dejavu demo`
         device: as of `dejavu learn`
     """
     from dejavu_torch.evaluation.compare import compare
@@ -477,6 +480,7 @@ def run_compare(
         top=1 if top is None else top,
         calibration="none" if calibration == NO_CALIBRATION else known,
         distractors=strange,
+        storage_curve=storage_curve,
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map, top)

@@ -23,7 +23,7 @@ from dejavu_torch.types import InputError, Match
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
 
 
-def storage_curve(
+def coded_at_sizes(
     run: Localization, budgets: Sequence[float] = BUDGETS, seed: int = 0, progress: bool = False
 ) -> dict[str, list[Stored]]:
     """The run's descriptors coded anew at several budgets, each evaluated with the run's queries.

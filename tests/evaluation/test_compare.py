@@ -375,7 +375,8 @@ def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.Monk
     for sequence in (None, SequenceMatcher(21), PlaceFilter()):
         asked.clear()
         model = DejaVu(whitening="none")
-        compare(ArrayTraverse(passing(1)), ArrayTraverse(passing(2)), "0", model=model, sequence=sequence)
+        pair = ArrayTraverse(passing(1)), ArrayTraverse(passing(2))
+        compare(*pair, "0", model=model, sequence=sequence, storage_curve=True)
         totals.append(sum(asked))
     assert len(set(totals)) == 1
     assert totals[0] > 64 * 10
