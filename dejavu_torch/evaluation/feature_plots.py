@@ -42,10 +42,6 @@ def edges_seen(
 ) -> tuple[Tensor, Tensor]:
     """The edges that HOG features respond to, as line segments, and how many of the features share each.
 
-    Args:
-        features: indices. size: (height, width) of the frames that HOG saw, in pixels, after its resize.
-        orientations, cell, block: as HOG has them.
-
     Shape: (F,) int64 -> (E,2,2) end points (x, y) in pixels, where (0, 0) is the middle of the first pixel;
         (E,) int64, in how many (overlapping) blocks the features have this cell and orientation.
 
@@ -81,12 +77,6 @@ def plot_spectrogram(
     unit: str,
 ) -> Plot:
     """One feature through time, and its spectrogram, a column a chunk (figure 3 of the paper).
-
-    Args:
-        values: (N,) the feature. spectra: its spectrum in each chunk, power (K,1).
-        kept: for each chunk the periods kept; they are marked. shortest: the shortest period shown.
-        feature: its number.
-        borders: (N+1,) see `FrameTable.borders`. unit: of the periods.
 
     Convention: where chunks overlap, each column ends where the next begins.
     """
@@ -126,10 +116,6 @@ def plot_spectrogram(
 def plot_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int, unit: str) -> Plot:
     """How alike a feature is to itself some places later (figure 1 (c) of the paper).
 
-    Args:
-        values: (n,) the feature along one chunk. periods: those the map keeps of it.
-        feature: its number. unit: of the periods.
-
     Convention: the biased autocorrelation of the feature minus its mean, 1 at lag 0.
     """
     figure, axis = canvas(3)
@@ -155,14 +141,6 @@ def plot_templates(
     thick: str = "their mean",
 ) -> Plot:
     """The places of equal phase averaged into templates (figure 4 of the paper).
-
-    Args:
-        layer: its features and period.
-        values: (n,) one feature at the places of the layer's chunk.
-        templates: (P,F) of the layer.
-        chosen: position of that feature among the layer's.
-        unit: of the period.
-        thick: what the templates are, for the title.
 
     Convention: of more than 100 cycles every k-th is drawn. Of more than 64 features those are drawn that
         vary most from phase to phase; rows are ordered by where in the cycle they are high, each from
@@ -210,11 +188,6 @@ def plot_features(
     block: int = 2,
 ) -> Plot:
     """HOG features that take part in a layer, on a frame of the route (figures 15 and 16 of the paper).
-
-    Args:
-        frame: (C,H,W) as HOG sees it, preprocessed and resized; shown from its darkest to its brightest
-            value where these lie outside [0,1]. layers: one picture each.
-        orientations, cell, block: as HOG has them.
 
     Convention: each is drawn as the edge it responds to, across its gradient; the stronger the line, the
         more of the overlapping blocks have this cell and orientation in the layer.

@@ -29,11 +29,7 @@ BLUE = COLOURS["map"]
 
 
 def plot_chunks(plan: Plan, borders: Tensor, unit: str) -> Plot:
-    """Chunks along the route and the periods found in each; the wider a bar, the more features.
-
-    Args:
-        borders: (N+1,) see `FrameTable.borders`. unit: of the periods.
-    """
+    """Chunks along the route and the periods found in each; the wider a bar, the more features."""
     figure, axis = canvas(3.6)
     axis.set(xlim=(0, int(borders[-1])), xlabel=PLACE, ylabel=f"period ({unit})")
     if not plan:
@@ -67,9 +63,6 @@ def plot_chunks(plan: Plan, borders: Tensor, unit: str) -> Plot:
 def plot_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) -> Plot:
     """Layers of one chunk and their phases along it (figure 2 of the paper).
 
-    Args:
-        borders: (N+1,) see `FrameTable.borders`. unit: of the periods.
-
     Convention: one row a layer, those of most features, by period; the colour is the phase, so that a
     column of colours is what names a place.
     """
@@ -97,15 +90,7 @@ def plot_activations(
     strip: Tensor | None = None,
     rates: ActivationRates | None = None,
 ) -> Plot:
-    """Scores of one query over a chunk: two layers, and all layers fused (figure 17 of the paper).
-
-    Args:
-        layers: two layers of one chunk. scores: for each (n,) eq. 3 at the chunk's places.
-        fused: (n,) eq. 4 at the same places. query: number of the query frame.
-        borders: (N+1,) see `FrameTable.borders`. places: the right places of the query, marked.
-        strip: (C,H,n) one image column for each frame of the chunk, drawn above; None leaves it out.
-        rates: how often each is right, written above it; None leaves it out.
-    """
+    """Scores of one query over a chunk: two layers, and all layers fused (figure 17 of the paper)."""
     names = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
     texts = [""] * (len(layers) + 1)
     if rates is not None:
@@ -128,14 +113,7 @@ def plot_answers(
     strip: Tensor | None = None,
     sharey: bool = False,
 ) -> Plot:
-    """Scores of one query over the places [start, stop), a row for each way to score them.
-
-    Args:
-        curves: title, scores (n,) and colour of each. query: number of the query frame.
-        borders: (N+1,) see `FrameTable.borders`. places: the right places of the query, marked.
-        strip: (C,H,n) one image column for each frame of the chunk, drawn above; None leaves it out.
-        sharey: one scale for all rows.
-    """
+    """Scores of one query over the places [start, stop), a row for each way to score them."""
     where, begin, end = borders[start:stop], int(borders[start]), int(borders[stop])
     above = strip is not None
     figure, rows = canvas(

@@ -12,11 +12,7 @@ from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, LETTERS, WIDTH, Pl
 
 
 def plot_ground(frame: Tensor, corners: Sequence[Sequence[float]], patch: Tensor) -> Plot:
-    """Where on a frame ground is taken to be, and how it looks from above.
-
-    Args:
-        frame: (C,H,W) in [0,1]. corners: (x, y) in fractions of the frame. patch: (1,h,w) in [0,1].
-    """
+    """Where on a frame ground is taken to be, and how it looks from above."""
     height, width = frame.shape[-2:]
     figure, (left, right) = canvas(0.65 * WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
     show_frame(left, frame, "the ground in a frame")
@@ -27,12 +23,7 @@ def plot_ground(frame: Tensor, corners: Sequence[Sequence[float]], patch: Tensor
 
 
 def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:
-    """How fast the ground moves along traverses, and at which steps it is sampled (section IV-B).
-
-    Args:
-        distances: name -> (N,) pixels of ground travelled at each frame, one or two.
-        step: pixels from one place to the next.
-    """
+    """How fast the ground moves along traverses, and at which steps it is sampled (section IV-B)."""
     figure, axes = canvas(1 + 1.4 * len(distances), len(distances), squeeze=False, sharey=True)
     for axis, (name, travelled), colour in zip(axes.flat, distances.items(), LAYERS, strict=False):
         axis.plot(torch.arange(1, len(travelled)), travelled.diff(), color=colour, linewidth=0.8)

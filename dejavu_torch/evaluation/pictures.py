@@ -123,16 +123,7 @@ def draw_pictures(
     contenders: Mapping[str, Contender],
     storage: Mapping[str, Sequence[Stored]] | None = None,
 ) -> dict[str, Picture]:
-    """Every picture that can be drawn: one that needs ground truth, frames or layers is left out without.
-
-    Args:
-        contenders: by key, ours under `map`. storage: likewise, each at several sizes.
-
-    Returns:
-        Of pairs, coverage, scores, posterior, pr, auc, storage, sequences, ground, velocity, then of a
-        template map chunks, spectrogram, templates, features and activations, of a spectral one spectrum and
-        components, those that can be drawn, in this order.
-    """
+    """Every picture that can be drawn: one that needs ground truth, frames or layers is left out without."""
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
     pictures |= draw_scores(run) | draw_posterior(run)
@@ -276,11 +267,7 @@ def draw_posterior(run: Localization) -> dict[str, Picture]:
 
 
 def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
-    """Precision-recall curves, and their areas side by side; nothing where no contender has a curve.
-
-    Args:
-        tolerance: with its unit.
-    """
+    """Precision-recall curves, and their areas side by side; nothing where no contender has a curve."""
     # leave_out has other queries
     curves = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
     pictures = {}
@@ -305,11 +292,7 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
 def draw_storage(
     contenders: Mapping[str, Contender], storage: Mapping[str, Sequence[Stored]], tolerance: str
 ) -> dict[str, Picture]:
-    """Areas over bytes; nothing where there are none.
-
-    Args:
-        contenders: those that store all frames are drawn across. tolerance: with its unit.
-    """
+    """Areas over bytes; nothing where there are none."""
     names = {
         "map": "this map",
         "null": "null: the same in shuffled order",
@@ -345,12 +328,7 @@ def draw_storage(
 def draw_sequences(
     contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
 ) -> dict[str, Picture]:
-    """Areas over the number of queries matched together; nothing where single ones are.
-
-    Args:
-        contenders: by key, ours under `map`. coded: our descriptors at several sizes.
-        places: of the map. tolerance: with its unit.
-    """
+    """Areas over the number of queries matched together; nothing where single ones are."""
     lines = {
         key: Areas(one.name, {T: scores.auc for T, scores in one.sequences.items()})
         for key, one in distinct(contenders).items()

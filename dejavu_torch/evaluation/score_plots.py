@@ -78,11 +78,7 @@ class Length(NamedTuple):
 
 
 def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
-    """Precision against recall, a line for each contender that has a curve (figures 8 to 10 of the paper).
-
-    Args:
-        contenders: by key, which gives the colour; HOG is dashed, nulls are dotted.
-    """
+    """Precision against recall, a line for each contender that has a curve (figures 8 to 10 of the paper)."""
     names = {key: label(one.name) for key, one in contenders.items()}
     for key, one in contenders.items():
         silent = one.curve is not None and len(one.curve.recall) == 0
@@ -153,12 +149,7 @@ def plot_storage(
     levels: Mapping[str, tuple[str, float]],
     title: str = "",
 ) -> Plot:
-    """Area under the precision-recall curve over the bytes that a route takes.
-
-    Args:
-        curves: by key, which gives the colour: name and points. levels: by key: name and area of what takes
-            far more, a line across.
-    """
+    """Area under the precision-recall curve over the bytes that a route takes."""
     figure, axis = canvas(3.4 + 1.1 * LINE * (len(curves) + len(levels)))
     for key, (name, area) in levels.items():
         axis.axhline(area, color=colour_of(key), linestyle=_LINES.get(key, "--"), linewidth=1.2, label=name)
@@ -183,10 +174,6 @@ def plot_storage(
 
 def plot_sequences(lines: Mapping[str, Areas], coded: Sequence[Areas], title: str = "") -> Plot:
     """Area under the precision-recall curve over the number of queries matched together.
-
-    Args:
-        lines: by key, which gives the colour, the map first; HOG is dashed, nulls are dotted.
-        coded: the map at other sizes, thin lines in its colour with marks of their own.
 
     Convention: the axis is that of the log odds: from .9 to .99 is as far as from .99 to .999. Areas beyond
         its ends are drawn at them.

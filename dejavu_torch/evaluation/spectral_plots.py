@@ -24,12 +24,7 @@ class Lines(NamedTuple):
 
 
 def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, unit: str) -> Plot:
-    """Spectra of numbers of the descriptor, a row each, with the lines that are kept (figure 3 of the paper).
-
-    Args:
-        features: by the number of the feature.
-        periods: (n,) of the lines. step: of the quantisation. unit: of the periods.
-    """
+    """Spectra of numbers of the descriptor, a row each, with the lines kept (figure 3 of the paper)."""
     figure, axes = canvas(1.1 + 1.15 * len(features), len(features), squeeze=False, sharex=True, sharey=True)
     for axis, (feature, (amplitudes, kept)) in zip(axes[:, 0], features.items(), strict=True):
         size = (amplitudes / step).clamp(min=FAINTEST)
