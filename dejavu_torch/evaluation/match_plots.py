@@ -1,4 +1,4 @@
-"""Pictures of queries and the places reported for them; each returns (figure, axes)."""
+"""Pictures of queries and the places reported for them."""
 
 from __future__ import annotations
 

@@ -16,13 +16,20 @@ from dejavu_torch.evaluation.activation import activation_rates, best_phases, la
 from dejavu_torch.evaluation.components import components
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, distinct
 from dejavu_torch.evaluation.controls import template_map_of
-from dejavu_torch.evaluation.feature_plots import (
+from dejavu_torch.evaluation.map_plots import (
+    Lines,
+    plot_activations,
+    plot_answers,
     plot_autocorrelogram,
+    plot_chunks,
     plot_features,
+    plot_ground,
+    plot_layers,
     plot_spectrogram,
+    plot_spectrum,
     plot_templates,
+    plot_velocity,
 )
-from dejavu_torch.evaluation.map_plots import plot_activations, plot_answers, plot_chunks, plot_layers
 from dejavu_torch.evaluation.match_plots import (
     Row,
     diagonal,
@@ -34,7 +41,6 @@ from dejavu_torch.evaluation.match_plots import (
     posterior_image,
     score_matrix,
 )
-from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
 from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture, label
 from dejavu_torch.evaluation.score_plots import (
     Areas,
@@ -44,7 +50,6 @@ from dejavu_torch.evaluation.score_plots import (
     plot_sequences,
     plot_storage,
 )
-from dejavu_torch.evaluation.spectral_plots import Lines, plot_spectrum
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of, spectrum
@@ -420,18 +425,10 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
 
 
 def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]:
-    """One query's scores with its strongest periods only, and with all; nothing where no period is kept.
-
-    In the longest chunk, and for the query whose right place is nearest to the chunk's middle (without ground
-    truth: the middle query).
-    """
-    chunk, truth, queries = longest_chunk(route), run.truth, run.query_features
+    """One query's scores with its strongest periods only, and with all; nothing where no period is kept."""
+    chunk, queries = longest_chunk(route), run.query_features
     start, stop = route.chunks[chunk]
-    query, places = len(queries) // 2, []
-    if truth is not None:
-        query = nearest_query(truth, (start + stop) / 2)
-        right = truth.positives[query].tolist() if truth.judged[query] else []
-        places = [place for place in right if start <= place < stop]
+    query, places = example_query(run, start, stop)
     sums = components(route, queries[query], chunk)
     if not sums[-1].periods:
         return {}
@@ -548,22 +545,15 @@ def draw_features(run: Localization, route: TemplateMap) -> dict[str, Picture]:
 
 
 def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture]:
-    """Two layers of one chunk answering one query, and their fusion; nothing where no chunk has two layers.
-
-    The chunk and layers of `leading_layers`, and the query whose right place is nearest to the chunk's
-    middle (without ground truth: the middle query).
-    """
+    """Two layers of one chunk answering one query, and all fused; nothing where no chunk has two layers."""
     plan, truth, queries = route.plan, run.truth, run.query_features
     chosen = leading_layers(plan)
     if len(chosen) < 2:
         return {}
     layers = [plan[j] for j in chosen]
     start, stop = layers[0].start, layers[0].stop
-    query, places, rates = len(queries) // 2, [], None
+    (query, places), rates = example_query(run, start, stop), None
     if truth is not None:
-        query = nearest_query(truth, (start + stop) / 2)
-        right = truth.positives[query].tolist() if truth.judged[query] else []
-        places = [place for place in right if start <= place < stop]
         best = [best_phases(route, queries, j) for j in chosen]
         rates = activation_rates(layers, best, run.scored.index, truth, run.tolerance, route.places)
     one = queries[query : query + 1]
@@ -676,6 +666,15 @@ def nearest_query(truth: GroundTruth, place: float) -> int:
     """The query one of whose right places is nearest to a place; the first where none has any."""
     right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.inf)
     return int((right - place).abs().amin(1).argmin())
+
+
+def example_query(run: Localization, start: int, stop: int) -> tuple[int, list[int]]:
+    """The query nearest to the middle of a chunk and its right places there; without truth the middle one."""
+    if run.truth is None:
+        return len(run.query_features) // 2, []
+    query = nearest_query(run.truth, (start + stop) / 2)
+    right = run.truth.positives[query].tolist() if run.truth.judged[query] else []
+    return query, [place for place in right if start <= place < stop]
 
 
 def has_frames(run: Localization) -> bool:

@@ -77,9 +77,6 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
     """The scores as rows of text, the header first; no rows where nothing is scored.
 
     There are bytes only where the number of frames is known.
-
-    Args:
-        every: all scores, and the bytes in total, not only the columns that matter most.
     """
     if not any(one.scores for one in report.shown().values()):
         return []
@@ -218,14 +215,7 @@ def write_report(
     command: str,
     plan: str | None = None,
 ) -> None:
-    """Write report.json, one PNG for each picture, and index.html with all of it inside.
-
-    Args:
-        folder: one that exists, as `report_folder` gives.
-        pictures: by file name without ending, one of `PICTURES`.
-        title: heading of the page. command: what made it.
-        plan: the plan and summary of the map in lines; None where there is no map.
-    """
+    """Write report.json, one PNG for each picture, and index.html with all of it inside."""
     pngs = {name: as_png(picture) for name, picture in pictures.items()}
     for name, data in pngs.items():
         (folder / f"{name}.png").write_bytes(data)
@@ -263,13 +253,7 @@ def write_index(
     title: str,
     command: str,
 ) -> None:
-    """Write index.html over several reports, with one table and one picture, and links to their pages.
-
-    Args:
-        folder: one that exists.
-        rows: of the table, the header first. notes: what a reader should know of it, a line each.
-        pages: what each link says -> where it leads.
-    """
+    """Write index.html over several reports, with one table and one picture, and links to their pages."""
     _write_page(
         folder,
         title=printable(title),

@@ -1,4 +1,4 @@
-"""Pictures of scores: curves, areas, chunk lengths and running times; each returns (figure, axes)."""
+"""Pictures of scores: curves, areas, chunk lengths and running times."""
 
 from __future__ import annotations
 

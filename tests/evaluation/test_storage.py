@@ -107,11 +107,3 @@ def test_without_truth_there_is_no_curve() -> None:
     unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model, storage_curve=True)
     assert "storage" not in unscored.report.as_json()
     assert {"spectrum", "components"} <= unscored.pictures.keys()
-
-
-def test_route_bytes_stand_beside_all_bytes(report: dict[str, Any]) -> None:
-    assert report["route_bytes"] == report["map_bytes"] - report["fixed_bytes"]
-    for key, size in (("uncompressed", PLACES * NUMBERS * 4), ("stride", PLACES // 4 * NUMBERS)):
-        assert report[key]["route_bytes"] == report[key]["bytes"] == size  # nothing to whiten with
-    assert report["interpolated"]["route_bytes"] <= report["route_bytes"]
-    assert "route_bytes" not in report["null"]
