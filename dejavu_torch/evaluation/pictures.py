@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,14 +41,7 @@ from dejavu_torch.evaluation.match_plots import (
     score_matrix,
 )
 from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture, label
-from dejavu_torch.evaluation.score_plots import (
-    Areas,
-    Stored,
-    plot_auc,
-    plot_curves,
-    plot_sequences,
-    plot_storage,
-)
+from dejavu_torch.evaluation.score_plots import Stored, draw_sequences, draw_storage, plot_auc, plot_curves
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of, spectrum
@@ -66,9 +58,6 @@ from dejavu_torch.types import FrequencyLayer, Match, Plan, SequenceModel, Trave
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 EXAMPLES = 4  # places of which the frames of both traverses are shown
-NOTICED = 0.001  # of an area: less is no gain
-SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is shown as well
-ALIKE = 1.1  # times the bytes: sizes whose lines would lie on each other
 STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
 
 
@@ -292,100 +281,6 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
             "counts to its left.",
         )
     return pictures
-
-
-def draw_storage(
-    contenders: Mapping[str, Contender], storage: Mapping[str, Sequence[Stored]], tolerance: str
-) -> dict[str, Picture]:
-    """Areas over bytes; nothing where there are none."""
-    names = {
-        "map": "this map",
-        "null": "null: the same in shuffled order",
-        "interpolated": "keyframes in int8, interpolated",
-    }
-    curves = {key: (names[key], points) for key, points in storage.items() if points}
-    if not curves:
-        return {}
-    levels = {
-        key: (one.name, one.scores.auc)
-        for key in ("uncompressed", "hog")
-        if (one := contenders.get(key)) and one.scores
-    }
-    factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
-    factor = ""
-    if factors:
-        least, most = (f"{limit:.2g}" for limit in (min(factors), max(factors)))
-        times = least if least == most else f"{least} to {most}"
-        factor = f" For the same area the null takes {times} times the bytes of this map."
-    numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
-    return {
-        "storage": Picture(
-            plot_storage(curves, levels, f"right within {tolerance}"),
-            "what more bytes are worth",
-            "The same descriptors coded to several sizes, fixed bytes such as the whitening's not counted: "
-            "this map, which gains from what is smooth and from what repeats; its null, for which nothing is "
-            f"smooth and nothing repeats; keyframes, which gain from what is smooth.{factor}",
-            numbers | {"null_over_map": factors},
-        )
-    }
-
-
-def draw_sequences(
-    contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
-) -> dict[str, Picture]:
-    """Areas over the number of queries matched together; nothing where single ones are."""
-    lines = {
-        key: Areas(one.name, {T: scores.auc for T, scores in one.sequences.items()})
-        for key, one in distinct(contenders).items()
-        if one.sequences
-    }
-    if not lines:
-        return {}
-    shown: dict[float, Areas] = {}
-    if "map" in lines and coded:
-        route_bytes = contenders["map"].route_bytes or 0
-        own = route_bytes / places
-        lines["map"] = lines["map"]._replace(name=f"this map, {own:.3g} route bytes per place")
-        for budget in SHOWN:
-            one = min(coded, key=lambda one: abs(one.route_bytes_per_place - budget))
-            size = one.route_bytes_per_place
-            if all(max(size, other) > ALIKE * min(size, other) for other in (own, *shown)):
-                areas = {T: scores.auc for T, scores in one.sequences.items()}
-                shown[size] = Areas(f"the same in {size:.3g} bytes", areas)
-    return {
-        "sequences": Picture(
-            plot_sequences(lines, list(shown.values()), f"right within {tolerance}"),
-            "what more queries are worth",
-            "One query by itself, and the last T together, their scores added up along constant speeds. From "
-            "0.9 to 0.99 is as far as from 0.99 to 0.999; what is beyond the ends of the axis lies on them.",
-        )
-    }
-
-
-def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:
-    """Bytes of ours, and those at which the others reach the same area, where they do.
-
-    Convention: between two of their points the area grows with the logarithm of the bytes. Ours counts where
-    it is better, by more than .001, than all that takes less.
-
-    Example:
-        >>> others = Stored(4, 0.5, 0.5), Stored(16, 0.9, 0.9)
-        >>> [(ours, theirs)] = equally_good([Stored(1, 0.7, 0.7), Stored(2, 0.95, 0.95)], others)
-        >>> ours, round(theirs, 6)
-        (1, 8.0)
-    """
-    found, best = [], -1.0
-    for one in ours:
-        if one.auc <= best + NOTICED:
-            continue
-        best = one.auc
-        for low, high in pairwise(others):
-            if low.auc <= one.auc <= high.auc and low.auc < high.auc:
-                share = (one.auc - low.auc) / (high.auc - low.auc)
-                sizes = low.route_bytes_per_place, high.route_bytes_per_place
-                found.append((one.route_bytes_per_place, sizes[0] * (sizes[1] / sizes[0]) ** share))
-                break
-    return found
 
 
 def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:

@@ -16,12 +16,10 @@ from dejavu_torch.evaluation.pictures import (
     Localization,
     draw_components,
     draw_pictures,
-    draw_sequences,
     draw_spectrum,
-    draw_storage,
 )
 from dejavu_torch.evaluation.report import PICTURES
-from dejavu_torch.evaluation.score_plots import Stored
+from dejavu_torch.evaluation.score_plots import Stored, draw_sequences, draw_storage
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of
