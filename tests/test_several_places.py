@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import fails, frames, report_of, run
+from command_line import frames, report_of, run
 from footage import QUERY, REFERENCE, camera, everything, footage
 from helpers import Fixed, refused, template_model
 
@@ -74,14 +74,6 @@ def test_the_first_candidate_is_what_localize_finds(
     assert apart.min() > 3
 
 
-def test_behind_the_last_covered_place_there_is_none(model: DejaVu) -> None:
-    index, score, accepted = model.candidates(waves()[:7], 4, apart=30)
-    assert torch.equal(accepted, index >= 0)
-    assert (index[:, -1] == -1).all()
-    assert score[:, -1].isinf().all()
-    assert index.max() < 80
-
-
 def test_numbers_that_cannot_be_are_refused_in_python(model: DejaVu) -> None:
     with refused("91 candidates", "90 places"):
         model.candidates(waves(), 91)
@@ -109,20 +101,6 @@ def test_localize_writes_a_row_for_each_candidate(
     assert [{k: row[k] for k in both} for row in rows[::10]] == [{k: row[k] for k in both} for row in best]
     expected = DejaVu.load(route).candidates(torch.from_numpy(frames(96, 2))[:, None] / 255, 10)
     assert [int(row["place"]) for row in rows] == expected.index.flatten().tolist()
-
-
-def test_threshold_and_count_of_accepted(
-    route: Path, pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run("localize", route, pair[1], "--out", tmp_path / "m.csv", "--top", "3")
-    scores = sorted(float(row["score"]) for row in rows_of(tmp_path / "m.csv"))
-    capsys.readouterr()
-    options = "--top", "3", "--threshold", str(scores[150])
-    run("localize", route, pair[1], "--out", tmp_path / "m.csv", *options)
-    rows = rows_of(tmp_path / "m.csv")
-    assert all((row["accepted"] == "1") == (float(row["score"]) < scores[150]) for row in rows)
-    first = sum(row["accepted"] == "1" for row in rows[::3])
-    assert f"96 queries, {first} accepted" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")
@@ -238,26 +216,3 @@ def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp
 
 
 # what is refused
-
-
-@pytest.mark.parametrize(("top", "words"), [("97", "at most 96"), ("0", "at least 1"), ("-2", "at least 1")])
-def test_numbers_that_cannot_be_are_refused(
-    route: Path,
-    pair: tuple[Path, Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    top: str,
-    words: str,
-) -> None:
-    capsys.readouterr()
-    assert words in fails(capsys, "localize", route, pair[1], "--out", tmp_path / "m.csv", "--top", top)
-    assert words in fails(capsys, "compare", *pair, "--map", route, "--top", top, "--out", tmp_path / "c")
-    assert not list(tmp_path.glob("m.csv*"))
-    assert not (tmp_path / "c" / "report.json").exists()
-
-
-def test_broken_ranks_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "m.csv").write_text("query,place,score,rank\n0,1,0.5,1\n0,9,0.6,3\n")
-    error = fails(capsys, "evaluate", tmp_path / "m.csv", "--truth", "0", "--out", tmp_path / "e")
-    assert "line 3" in error
-    assert "rank 3 of query 0" in error

@@ -114,11 +114,6 @@ def activation_rates(
     For the fusion, the rate is the share of the queries whose reported place is right within the
     tolerance; outside, that is the work of the layers of other chunks. Chance is
     (2 * tolerance + 1) / places, at most 1.
-
-    Args:
-        layers: layers of one chunk. best: for each (Q,) the best phase of each query.
-        index: (Q,) the place reported when all layers are fused.
-        tolerance: places, inclusive. places: N.
     """
     start, stop = layers[0].start, layers[0].stop
     right = torch.where(truth.judged[:, None], truth.positives, -1)

@@ -54,12 +54,7 @@ def told_probable(counts: Mapping[str, int], answers: int) -> str:
 
 
 def next_steps(together: bool, strict: bool) -> list[str]:
-    """What to try on answers that have a probability, in words.
-
-    Args:
-        together: whether queries are matched together already. strict: whether a threshold or precision is
-            given.
-    """
+    """What to try on answers that have a probability, in words."""
     steps = {
         "--filter also uses the preceding queries, if they are consecutive": not together,
         "--precision .9 accepts only answers that are at least that probable": not strict,
@@ -80,10 +75,6 @@ def confident(match: Match) -> Tensor:
 
 def line_of(places: Tensor, queries: Tensor, within: int, fewest: float = FEWEST) -> Line | None:
     """The line of slope one that more than half of some answers lie near, None where there is none.
-
-    Args:
-        places: (n,) int64, the frames found. queries: (n,) int64, the frame of each query. within: frames.
-        fewest: answers that have to lie near it.
 
     Convention: the offset is the median of those in the densest stretch of twice `within`. A line has to have
         twice as many answers as the same places and queries have when paired at random: in few frames, and
@@ -113,17 +104,7 @@ def line_of(places: Tensor, queries: Tensor, within: int, fewest: float = FEWEST
 def own_facts(
     match: Match, queries: Tensor, tolerance: int, scored: bool, offset: int | None = None
 ) -> dict[str, Any]:
-    """What report.json holds of answers by themselves.
-
-    Args:
-        match: its index counts frames of the reference. queries: (Q,) the frame of each query.
-        tolerance: of the report. scored: whether there is a ground truth. offset: that it says, place =
-            query + offset; None for one of another kind.
-
-    Returns:
-        `probably_right`, where there are probabilities, and `line`, where there is one and nothing is scored,
-        or the ground truth is another line.
-    """
+    """What report.json holds of answers by themselves."""
     counts = probable_counts(match)
     facts: dict[str, Any] = {"probably_right": counts} if counts else {}
     if scored and offset is None:

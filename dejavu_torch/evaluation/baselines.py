@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -39,23 +40,6 @@ class Baseline(NamedTuple):
     bytes: int | None = None
     k: int | None = None
     fixed: int = 0
-
-
-class Store(NamedTuple):
-    """Frames that are stored as they are, (N,D), or every `apart`-th of them; the rest as of `Baseline`."""
-
-    name: str
-    frames: Tensor
-    metric: Metric
-    bytes: int
-    k: int
-    fixed: int = 0
-    apart: int = 1
-
-    def matched(self, query: Tensor, matching: Matching, progress: str | None = None) -> Baseline:
-        """What is found for queries (Q,D); see `nearest_frames`."""
-        found = nearest_frames(self.frames, query, self.apart, self.metric, progress, matching)
-        return Baseline(self.name, found, self.bytes, self.k, self.fixed)
 
 
 def nearest_frames(
@@ -132,7 +116,7 @@ def baselines_of(
     progress: bool = False,
     matching: Matching = SINGLE,
 ) -> dict[str, Baseline]:
-    """The baselines and null controls that every report sets beside the map, by their keys in report.json.
+    """The baselines and null controls beside every map, by their keys in report.json.
 
     Args:
         model: with the map. reference: (N,D) its features. query: (Q,D) those of the queries.
@@ -140,11 +124,9 @@ def baselines_of(
         leave_out: also query the reference with itself, see `leave_out_match`.
         progress: show progress bars on a terminal. matching: of all but `leave_out`.
     """
-    stores = (_compact_stores if isinstance(model.map, SpectralMap) else _plain_stores)(
-        model, reference, tolerance
-    )
+    stores = _compact_stores if isinstance(model.map, SpectralMap) else _plain_stores
     text = "baselines: what is stored as it is" if progress else None
-    found = {key: store.matched(query, matching, text) for key, store in stores.items()}
+    found = stores(model, reference, tolerance, partial(_nearest, query, matching, text))
     one = "place" if len(model.map.positions) else "frame"
 
     def null(name: str, same_plan: bool = False) -> Baseline:
@@ -170,50 +152,67 @@ def baselines_of(
     return found
 
 
-def _plain_stores(model: DejaVu, reference: Tensor, tolerance: int) -> dict[str, Store]:
+def _nearest(
+    query: Tensor,
+    matching: Matching,
+    progress: str | None,
+    name: str,
+    frames: Tensor,
+    k: int,
+    bytes: int,
+    *,
+    apart: int = 1,
+    fixed: int = 0,
+    metric: Metric = "l1",
+) -> Baseline:
+    """What is found among every `apart`-th of frames (N,D) that are stored in so many bytes."""
+    found = nearest_frames(frames, query, apart, metric, progress, matching)
+    return Baseline(name, found, bytes + fixed, k, fixed)
+
+
+def _plain_stores(
+    model: DejaVu, reference: Tensor, tolerance: int, nearest: Callable[..., Baseline]
+) -> dict[str, Baseline]:
     """The features that a template map is made of, of all frames and of every k-th."""
-    frames, dimension = reference.shape
-    summary, itemsize = model.summary(), reference.element_size()
+    frames, dimension, itemsize = *reference.shape, reference.element_size()
+    summary = model.summary()
     backbone = summary.fixed.get("backbone", 0)  # frames need it as well
     fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
     coarsest = max(1, 2 * tolerance)
     of = "" if isinstance(model.features, HOG) else "same features, "
     one = "place" if len(model.map.positions) else "frame"
     skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
-    stores = {
+    names = {
         "uncompressed": (f"{of}all {frames} {one}s{skipped}", 1),
         "stride": (f"{of}{every(fair, one)} (at least the map's bytes)", fair),
         "stride_coarsest": (f"{of}{every(coarsest, one)} (2 x tolerance)", coarsest),
     }
     metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
-    return {
-        key: Store(
-            *(name, reference, metric, stride_bytes(frames, dimension, itemsize, k) + backbone, k),
-            fixed=backbone,
-            apart=k,
-        )
-        for key, (name, k) in stores.items()
-    }
+    found = {}
+    for key, (name, k) in names.items():
+        size = stride_bytes(frames, dimension, itemsize, k)
+        found[key] = nearest(name, reference, k, size, apart=k, fixed=backbone, metric=metric)
+    return found
 
 
-def _compact_stores(model: DejaVu, reference: Tensor, tolerance: int) -> dict[str, Store]:
+def _compact_stores(
+    model: DejaVu, reference: Tensor, tolerance: int, nearest: Callable[..., Baseline]
+) -> dict[str, Baseline]:
     """The descriptors that a spectral map codes: all in float, every k-th and interpolated ones in int8."""
     frames, dimension = reference.shape
     summary = model.summary()
     fixed = sum(summary.fixed.get(part, 0) for part in ("backbone", "whitening"))  # all need them
     one = "place" if len(model.map.positions) else "frame"
-    apart, short = max(1, 2 * tolerance), as_int8(reference)
-    between, spaced, keys = interpolated(short, model.map.summary().route_bytes)
-    metric: Metric = "l2" if model.map.metric == "l2" else "cosine"
-
-    def store(name: str, stored: Tensor, numbers: int, k: int, apart: int = 1) -> Store:
-        return Store(name, stored, metric, numbers * dimension + fixed, k, fixed, apart)
-
-    kept = -(-frames // apart)
+    k, short = max(1, 2 * tolerance), as_int8(reference)
+    between, spaced, keys = interpolated(short, summary.route_bytes)
+    nearest = partial(nearest, fixed=fixed, metric="l2" if model.map.metric == "l2" else "cosine")
+    every_float = f"its descriptors of all {frames} {one}s, float"
+    every_kth = f"its descriptors of {every(k, one)}, int8"
+    lines = f"interpolated between {every(spaced, one)}, int8"
     return {
-        "uncompressed": store(f"its descriptors of all {frames} {one}s, float", reference, frames * 4, 1),
-        "stride": store(f"its descriptors of {every(apart, one)}, int8", short, kept, apart, apart),
-        "interpolated": store(f"interpolated between {every(spaced, one)}, int8", between, keys, spaced),
+        "uncompressed": nearest(every_float, reference, 1, stride_bytes(frames, dimension, 4, 1)),
+        "stride": nearest(every_kth, short, k, stride_bytes(frames, dimension, 1, k), apart=k),
+        "interpolated": nearest(lines, between, spaced, keys * dimension),
     }
 
 
@@ -301,11 +300,7 @@ def _described_baselines(
     progress: bool,
     matching: Matching,
 ) -> dict[str, Baseline]:
-    """Every k-th frame of the first of two traverses, described as another model does; by L1.
-
-    Args:
-        what: the features, in words. names: by key, name and k.
-    """
+    """Every k-th frame of the first of two traverses, described as another model does; by L1."""
     if len(traverses[0].frame_shape) != 3:
         return {}
     text = f"baselines: {what}" if progress else None
@@ -315,11 +310,11 @@ def _described_baselines(
         log.info("no %s to compare with: %s", what, error)
         return {}
     (frames, dimension), itemsize = stored.shape, stored.element_size()
-    stores = {
-        key: Store(name, stored, "l1", stride_bytes(frames, dimension, itemsize, k), k, apart=k)
-        for key, (name, k) in names.items()
-    }
-    return {key: store.matched(queries, matching, text) for key, store in stores.items()}
+    found = {}
+    for key, (name, k) in names.items():
+        size = stride_bytes(frames, dimension, itemsize, k)
+        found[key] = _nearest(queries, matching, text, name, stored, k, size, apart=k)
+    return found
 
 
 def every(k: int, one: str) -> str:

@@ -1,4 +1,4 @@
-"""Learn, localize, evaluate, and set it beside the baselines and the null controls."""
+"""Learn, localize and evaluate, beside the baselines and the null controls."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 from dejavu_torch.data.arrays import UNNAMED, as_traverse
 from dejavu_torch.data.fitted import Fitted
 from dejavu_torch.data.ground_truth import (
+    GroundTruth,
     as_ground_truth,
     check_ground_truth,
     describe_ground_truth,
@@ -31,7 +31,7 @@ from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.score_plots import Stored
-from dejavu_torch.evaluation.storage import noise_over_map, storage_curve
+from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
@@ -58,11 +58,10 @@ NEAR = 10  # places within which it should find them, at least
 
 
 class Comparison(NamedTuple):
-    """A comparison's figures and pictures, and the run they are of.
+    """A comparison's figures and pictures, and their run; a notebook shows the scores and two pictures.
 
-    The run's traverses are as they were learned and localized, resampled where the model asks for it; its
-    match and truth count places. candidates: of each query the best places, no two within the tolerance, as
-    many as were wanted or as a score takes. A notebook shows the table of scores and two pictures.
+    The run's traverses are resampled where the model asks for it; its match and truth count places.
+    candidates: of each query the best places, no two within the tolerance.
     """
 
     report: Report
@@ -75,6 +74,35 @@ class Comparison(NamedTuple):
 
     def _repr_html_(self) -> str:
         return as_html(self.report, self.pictures)
+
+
+class _Options(NamedTuple):
+    """What `compare` was asked, as its arguments."""
+
+    truth: str | None
+    tolerance: int
+    leave_out: int | None
+    seed: int
+    interpolate: bool
+    sequence: SequenceModel | None
+    top: int
+    progress: bool
+
+    def text(self, what: str) -> str | None:
+        """Of a progress bar."""
+        return what if self.progress else None
+
+
+class _Pair(NamedTuple):
+    """The traverses as they are learned and localized.
+
+    truth: None before both lengths are known. feature_shape: of the query, None before features are computed.
+    """
+
+    reference: Traverse
+    query: Traverse
+    truth: GroundTruth | None
+    feature_shape: Any
 
 
 def compare(
@@ -93,155 +121,88 @@ def compare(
     top: int = 1,
     calibration: Views | Literal["none"] | None = None,
     distractors: Sequence[Traverse] = (),
+    storage_curve: bool = False,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
 
     Args:
         reference: the traverse to learn. query: a second traverse of the route.
-        truth: see `find_ground_truth`; where neither it nor the sources themselves tell the right places,
-            there are matches and pictures, but neither scores nor baselines.
-        model: settings; None is DejaVu with its defaults. A model that has a map keeps it and is
-            evaluated as it is: the map has to be of this very reference. It learns and localizes on the
-            device that it is on, and is on the CPU afterwards, where all the rest is computed.
-        tolerance: places within which one is right, inclusive.
-        leave_out: also query the reference with itself, leaving out this many frames to each side of
-            the query from every mean; a diagnostic.
+        truth: see `find_ground_truth`. Without one, and where the sources have none, there are matches and
+            pictures, but neither scores nor baselines.
+        model: settings; None is DejaVu with its defaults. A model with a map keeps it and is evaluated as it
+            is: the map has to be of this reference. The model is on the CPU afterwards, where baselines, null
+            and pictures are computed.
+        tolerance: places within which a match is right, inclusive.
+        leave_out: also query the reference with itself, without the frames within this many of the query in
+            any mean; a diagnostic.
         seed: of the shuffle of the null control.
         interpolate: see `find_ground_truth`.
         second: see `DejaVu.describe_reference`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
-            in tables. They are scored by their matches, so only where there is a truth; none of them
-            resamples.
-        sequence: scores consecutive queries together, on the map and on all that it is set beside.
-        top: how many candidates of each query are wanted.
+            in tables. They need a ground truth, and none of them resamples.
+        sequence: matches consecutive queries together, on the map and on all that it is compared with.
+        top: candidates of each query.
         calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a map that is
             learned by changed frames of the reference, "none" does not.
         distractors: routes that are not on the map: how many of their frames are accepted.
+        storage_curve: also code a spectral map at several sizes, see `coded_at_sizes`:
+            the report gets `storage` and its picture. Needs a ground truth.
         progress: show progress bars on a terminal.
 
     Raises:
         InputError: bad input of any of the stages, or a map of another number of places.
     """
     model = DejaVu() if model is None else model
-    itself = reference is query
+    options = _Options(truth, tolerance, leave_out, seed, interpolate, sequence, top, progress)
+    seconds: dict[str, float] = defaultdict(float)
+    work = "describe" if model.map.places else "learn"
+    pair = _read(model, reference, query, options, seconds, work)
+    with timed(seconds, work):
+        places = _learn(model, pair.reference, second, calibration, options)
+    with timed(seconds, "localize"):
+        queries, candidates, matching = _match(model, pair, options)
+    off_map = _match_distractors(model, distractors, sequence)
+    run = _judge(model, pair, places, queries, candidates, matching, options)
+    contenders = _baselines(run, others or {}, options)
+    curve = _storage(run, contenders, options) if storage_curve else None
+    return _report(run, contenders, candidates, off_map, curve, seconds, options)
+
+
+def _read(
+    model: DejaVu,
+    reference: Traverse | Tensor,
+    query: Traverse | Tensor,
+    options: _Options,
+    seconds: dict[str, float],
+    work: str,
+) -> _Pair:
+    """Both traverses, resampled where the model asks for it; what does not fit is refused here."""
+    itself, has_map = reference is query, model.map.places > 0
     reference, query = as_traverse(reference), as_traverse(query)
-    _check_arguments(model, truth, tolerance, leave_out, interpolate)
-    check_candidates(top, tolerance)
-    has_map = model.map.places > 0
+    _check_options(model, options)
     reference = model.fit(reference, model.frame_shape if has_map else None)
     query = model.fit(query, reference.frame_shape)
-    features = model.describer.check_sizes(reference, query)
-    seconds: dict[str, float] = defaultdict(float)
-    work = "describe" if has_map else "learn"
+    feature_shape = model.describer.check_sizes(reference, query)
     with timed(seconds, work):
-        reference = model.resample(reference, model.step if has_map else None, progress)
+        reference = model.resample(reference, model.step if has_map else None, options.progress)
     with timed(seconds, "localize"):
-        query = model.resample(query, getattr(reference, "step", None), progress)
-    check_candidates(top, tolerance, reference.length)  # before the long work
-    if sequence is not None and reference.length is not None:
-        sequence.check(None, reference.length)
-    find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
-    lengths_known = reference.length is not None and query.length is not None
-    known = find_truth() if lengths_known else None  # one that does not fit is refused before the long work
+        query = model.resample(query, getattr(reference, "step", None), options.progress)
+    check_candidates(options.top, options.tolerance, reference.length)
+    if options.sequence is not None and reference.length is not None:
+        options.sequence.check(None, reference.length)
     if itself or (reference.name == query.name != UNNAMED):
         log.warning(
             "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
         )
-    with timed(seconds, work):
-        places = _described(model, reference, second, tolerance, progress)
-        if isinstance(calibration, Views) or (calibration is None and not has_map):
-            calibrate_if_possible(model, reference, calibration)
-        model.matching(sequence)
-    with timed(seconds, "localize"):
-        model.check_queries(query.frame_shape, features, query.name)
-        queries = model.extract_all(query, "describing the query" if progress else None)
-        if sequence is not None:
-            sequence.check(len(queries), model.map.places)
-        ranks = max(top, min(max(RANKS), model.map.places))
-        matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
-        wanted = model.matching(sequence)._replace(lengths=matching.lengths, k=ranks, radius=tolerance)
-        candidates = model.localize_descriptors(queries, wanted)
-    match = candidates.map(lambda column: column[:, 0])
-    off_map = {one.name: _probability(model, one, sequence) for one in distractors if wanted.platt}
-    if distractors and not off_map:
-        log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
-    model.cpu()  # baselines, null and pictures take their numbers one by one
-    places, queries = places.cpu(), queries.cpu()
-    if not lengths_known:
-        known = find_truth(len(places), len(queries))
-    if known is not None:
-        known = ground_truth_in_places(known, model.map.place_of)
-    run = Localization(model, reference, query, places, queries, match, known, tolerance, matching)
-    contenders = _contenders(run, match, seed, leave_out, progress)
-    for key, (name, other) in (others or {}).items():
-        if known is not None:
-            contenders[key] = _learned_beside(run, name, other)
-    scored = contenders["map"].scores is not None
-    storage, noise = _at_other_sizes(run, seed, progress) if scored else (None, {})
-    pictures = draw_pictures(run, contenders, storage)
-    pictures |= draw_reliability(run.scored, known, tolerance)
-    carried = all(source_of(one).place is not None for one in (reference, query))
-    facts = {
-        **_map_facts(model.summary(), places),
-        **_run_facts(run, seconds),
-        **noise,
-        **evaluation_facts(
-            of_shown_frames(match, model.map),
-            known,
-            tolerance,
-            model.map.positions,
-            describe_ground_truth(truth, interpolate, carried),
-        ),
-        **own_facts(
-            match._replace(index=model.map.frame_of(match.index)),
-            run.query_frames,
-            tolerance,
-            known is not None,
-            offset_of(truth, carried),
-        ),
-        **candidate_facts(model.map.table.scored(candidates.index), known, tolerance),
-        **rejection_facts(run.scored, known, tolerance, off_map),
-        **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
-    }
-    return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run, candidates)
+    known = None
+    if reference.length is not None and query.length is not None:
+        known = ground_truth_of(options.truth, reference, query, interpolate=options.interpolate)
+    return _Pair(reference, query, known, feature_shape)
 
 
-def _described(
-    model: DejaVu, reference: Traverse, second: Views | None, tolerance: int, progress: bool
-) -> Tensor:
-    """Descriptors of the reference (N,K), whose map is checked where there is one, and learned otherwise."""
-    text = "describing the reference" if progress else None
-    if not model.map.places:
-        places = model.describe_reference(reference, second, text)
-        model.learn_features(places, reference)
-        return places
-    if reference.length is not None:
-        _check_places(model.map, reference.name, reference.length)
-    places = model.extract_all(reference, text)
-    _check_map(model, places, reference.name, tolerance)
-    return places
-
-
-def _probability(model: DejaVu, traverse: Traverse, sequence: SequenceModel | None) -> Tensor:
-    """Of what is found for frames that are not on the map, (n,)."""
-    frames = Fitted(traverse, model.frame_shape or ())
-    found = model.localize_descriptors(model.extract_all(frames), sequence).probability
-    assert found is not None
-    return found
-
-
-@contextmanager
-def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Add the seconds of a block to what is under a name."""
-    began = time.perf_counter()
-    yield
-    seconds[name] += time.perf_counter() - began
-
-
-def _check_arguments(
-    model: DejaVu, truth: str | None, tolerance: int, leave_out: int | None, interpolate: bool
-) -> None:
+def _check_options(model: DejaVu, options: _Options) -> None:
+    truth, tolerance, leave_out = options[:3]
     for name, value in (("tolerance", tolerance), ("leave_out", leave_out)):
         if value is not None and value < 0:
             raise InputError(f"{name} is {value}; expected at least 0")
@@ -255,12 +216,36 @@ def _check_arguments(
             f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"
         )
     if truth is not None:
-        check_ground_truth(truth, interpolate)
+        check_ground_truth(truth, options.interpolate)
+    check_candidates(options.top, tolerance)
+
+
+def _learn(
+    model: DejaVu,
+    reference: Traverse,
+    second: Views | None,
+    calibration: Views | Literal["none"] | None,
+    options: _Options,
+) -> Tensor:
+    """Descriptors of the reference (N,K), of which the map is learned, or with which it is checked."""
+    text = options.text("describing the reference")
+    has_map = model.map.places > 0
+    if not has_map:
+        places = model.describe_reference(reference, second, text)
+        model.learn_features(places, reference)
+    else:
+        if reference.length is not None:
+            _check_places(model, reference.length, reference.name)
+        places = model.extract_all(reference, text)
+        _check_map(model, places, reference.name, options.tolerance)
+    if isinstance(calibration, Views) or (calibration is None and not has_map):
+        calibrate_if_possible(model, reference, calibration)
+    return places
 
 
 def _check_map(model: DejaVu, features: Tensor, name: str, tolerance: int) -> None:
     """Refuse a map of another number of places, and warn of one that does not find its own reference."""
-    _check_places(model.map, name, len(features))
+    _check_places(model, len(features), name)
     sample = torch.arange(0, len(features), max(1, len(features) // SAMPLED))
     found = (model.localize_descriptors(features[sample]).index - sample).abs() <= max(tolerance, NEAR)
     if found.float().mean() < 0.5 and model.map.summary().covered:
@@ -270,33 +255,80 @@ def _check_map(model: DejaVu, features: Tensor, name: str, tolerance: int) -> No
         )
 
 
-def _check_places(route: PlaceMap, name: str, places: int) -> None:
-    if places != route.places:
+def _check_places(model: DejaVu, places: int, name: str) -> None:
+    if places != model.map.places:
         raise InputError(
-            f"{name} gives {places} places, the map holds {route.places}; "
+            f"{name} gives {places} places, the map holds {model.map.places}; "
             "expected the reference that it was made of"
         )
 
 
-def of_shown_frames(match: Match, route: PlaceMap) -> Match:
-    """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
-    return match._replace(index=route.table.scored(match.index))
+def _match(model: DejaVu, pair: _Pair, options: _Options) -> tuple[Tensor, Match, Matching]:
+    """Descriptors of the queries (Q,K), their candidates on the map, and how all others are matched."""
+    sequence, query = options.sequence, pair.query
+    rule = model.matching(sequence)
+    model.check_queries(query.frame_shape, pair.feature_shape, query.name)
+    queries = model.extract_all(query, options.text("describing the query"))
+    if sequence is not None:
+        sequence.check(len(queries), model.map.places)
+    ranks = max(options.top, min(max(RANKS), model.map.places))
+    matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
+    rule = rule._replace(lengths=matching.lengths, k=ranks, radius=options.tolerance)
+    return queries, model.localize_descriptors(queries, rule), matching
 
 
-def _contenders(
-    run: Localization, found: Match, seed: int, leave_out: int | None, progress: bool
+def _match_distractors(
+    model: DejaVu, distractors: Sequence[Traverse], sequence: SequenceModel | None
+) -> dict[str, Tensor]:
+    """By name, the probability of what is found for each frame of other routes, (n,)."""
+    if distractors and not model.matching(sequence).platt:
+        log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
+        return {}
+    found = {}
+    for one in distractors:
+        descriptors = model.extract_all(Fitted(one, model.frame_shape or ()))
+        probability = model.localize_descriptors(descriptors, sequence).probability
+        assert probability is not None
+        found[one.name] = probability
+    return found
+
+
+def _judge(
+    model: DejaVu,
+    pair: _Pair,
+    places: Tensor,
+    queries: Tensor,
+    candidates: Match,
+    matching: Matching,
+    options: _Options,
+) -> Localization:
+    """The run: all of it on the CPU, its ground truth in places."""
+    model.cpu()
+    places, queries, known = places.cpu(), queries.cpu(), pair.truth
+    if pair.reference.length is None or pair.query.length is None:
+        lengths = len(places), len(queries)
+        known = ground_truth_of(
+            options.truth, pair.reference, pair.query, *lengths, interpolate=options.interpolate
+        )
+    if known is not None:
+        known = ground_truth_in_places(known, model.map.place_of)
+    match = candidates.map(lambda column: column[:, 0])
+    traverses = pair.reference, pair.query
+    return Localization(model, *traverses, places, queries, match, known, options.tolerance, matching)
+
+
+def _baselines(
+    run: Localization, others: Mapping[str, tuple[str, DejaVu]], options: _Options
 ) -> dict[str, Contender]:
-    """The map and what it is set beside, by their keys in report.json; the map's own is `map`.
-
-    Args:
-        found: on the map.
-    """
-    model, tolerance = run.model, run.tolerance
-    contenders = {"map": _contend(run, "this map", found, model)}
-    if run.truth is None and leave_out is None:  # nothing that the others find could be scored
+    """The map and what it is compared with, by their keys in report.json; the map's own is `map`."""
+    model, tolerance, progress = run.model, run.tolerance, options.progress
+    contenders = {"map": _contend(run, "this map", run.match, model)}
+    if run.truth is None and options.leave_out is None:  # nothing that the others find could be scored
         return contenders
     features = run.reference_features, run.query_features
-    baselines = baselines_of(model, *features, tolerance, seed, leave_out, progress, run.matching)
+    baselines = baselines_of(
+        model, *features, tolerance, options.seed, options.leave_out, progress, run.matching
+    )
     traverses, size = (run.reference, run.query), model.batch_size
     if not _is_plain_hog(model):
         baselines |= hog_baselines(*traverses, size, tolerance, progress, run.matching)
@@ -307,33 +339,18 @@ def _contenders(
         if key == "leave_out":  # its queries are the places themselves
             own = model.map.frame_of(torch.arange(model.map.places))[:, None]
             truth = ground_truth_in_places(as_ground_truth(own), model.map.place_of)
-        contenders[key] = contend(name, answers, truth, tolerance, bytes, k, fixed, answers.sequences)
+        contenders[key] = contend(name, answers, truth, tolerance, bytes, k, fixed)
+    for key, (name, other) in others.items() if run.truth is not None else ():
+        other.learn(run.reference)
+        found = other.localize_descriptors(other.extract_all(run.query), run.matching)
+        contenders[key] = _contend(run, name, found, other)
     return contenders
 
 
 def _contend(run: Localization, name: str, found: Match, model: DejaVu) -> Contender:
     """What a model found of the run's places."""
     found, summary = found.renumbered(run.model.map.table.scored), model.summary()
-    sizes = {"bytes": summary.map_bytes, "fixed": summary.fixed_bytes}
-    return contend(name, found, run.truth, run.tolerance, **sizes, sequences=found.sequences)
-
-
-def _learned_beside(run: Localization, name: str, other: DejaVu) -> Contender:
-    """Another model that learns the run's reference."""
-    found = other.learn(run.reference).localize_descriptors(other.extract_all(run.query), run.matching)
-    return _contend(run, name, found, other)
-
-
-def _at_other_sizes(
-    run: Localization, seed: int, progress: bool
-) -> tuple[dict[str, list[Stored]] | None, dict[str, float]]:
-    """The storage curve of a spectral map, and what report.json holds of its smoothness."""
-    route = run.model.map
-    if not isinstance(route, SpectralMap):
-        return None, {}
-    storage = storage_curve(run, seed=seed, progress=progress)
-    whole = len(route.chunks) == 1
-    return storage, {"noise_over_map": noise_over_map(route, run.reference_features, seed)} if whole else {}
+    return contend(name, found, run.truth, run.tolerance, bytes=summary.map_bytes, fixed=summary.fixed_bytes)
 
 
 def _is_plain_hog(model: DejaVu) -> bool:
@@ -341,6 +358,60 @@ def _is_plain_hog(model: DejaVu) -> bool:
     pairs = (model.preprocess, Preprocess()), (model.features, HOG())
     same = all(recipe_of(own) == recipe_of(plain) for own, plain in pairs)
     return same and model.whitening is None and getattr(model.map, "metric", "l1") == "l1"
+
+
+def _storage(
+    run: Localization, contenders: Mapping[str, Contender], options: _Options
+) -> dict[str, list[Stored]] | None:
+    """The storage curve of a spectral map whose queries are scored."""
+    if not isinstance(run.model.map, SpectralMap) or contenders["map"].scores is None:
+        return None
+    return coded_at_sizes(run, seed=options.seed, progress=options.progress)
+
+
+def _report(
+    run: Localization,
+    contenders: dict[str, Contender],
+    candidates: Match,
+    off_map: Mapping[str, Tensor],
+    storage: Mapping[str, Sequence[Stored]] | None,
+    seconds: Mapping[str, float],
+    options: _Options,
+) -> Comparison:
+    """Figures and pictures of all that was found."""
+    route, known, tolerance = run.model.map, run.truth, run.tolerance
+    pictures = draw_pictures(run, contenders, storage)
+    pictures |= draw_reliability(run.scored, known, tolerance)
+    carried = all(source_of(one).place is not None for one in (run.reference, run.query))
+    described = describe_ground_truth(options.truth, options.interpolate, carried)
+    shown = run.match._replace(index=route.frame_of(run.match.index))
+    offset = offset_of(options.truth, carried)
+    facts = {
+        **_map_facts(run.model.summary(), run.reference_features),
+        **_run_facts(run, seconds),
+        **evaluation_facts(run.scored, known, tolerance, route.positions, described),
+        **own_facts(shown, run.query_frames, tolerance, known is not None, offset),
+        **candidate_facts(route.table.scored(candidates.index), known, tolerance),
+        **rejection_facts(run.scored, known, tolerance, off_map),
+        **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
+    }
+    scored = contenders["map"].scores is not None
+    if scored and isinstance(route, SpectralMap) and len(route.chunks) == 1:
+        facts["noise_over_map"] = noise_over_map(route, run.reference_features, options.seed)
+    return Comparison(Report(contenders.pop("map"), contenders, facts), pictures, run, candidates)
+
+
+@contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Add the seconds of a block to those under a name."""
+    began = time.perf_counter()
+    yield
+    seconds[name] += time.perf_counter() - began
+
+
+def of_shown_frames(match: Match, route: PlaceMap) -> Match:
+    """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
+    return match._replace(index=route.table.scored(match.index))
 
 
 def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:

@@ -32,9 +32,6 @@ def components(
     The product of a query with all descriptors of a chunk is a sum of waves, one for each period, besides a
     constant; the strongest have the largest energy. Cosine and sine of a period count together.
 
-    Args:
-        chunk: its number in the map. counts: of periods; those of all or more are left out.
-
     Shape: query (K,) -> scores (W,), of the places of the chunk.
 
     Convention: the constant, and what the metric does with products and norms, are part of every sum.

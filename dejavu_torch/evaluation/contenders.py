@@ -94,17 +94,12 @@ def contend(
     bytes: int | None = None,
     k: int | None = None,
     fixed: int = 0,
-    sequences: Mapping[int, Match] = MappingProxyType({}),
 ) -> Contender:
-    """Matches as a contender, without scores where there is no ground truth or no query that it scores.
-
-    Args:
-        sequences: by T, the matches of sequences of T queries.
-    """
+    """Matches as a contender, without scores where there is no ground truth or no query that it scores."""
     if truth is None or not counted(match.index, as_ground_truth(truth), tolerance).any():
         return Contender(name, None, bytes, k, fixed=fixed)
     scores, curve = evaluate(match, truth, tolerance), curve_of(match, truth, tolerance)
-    return Contender(name, scores, bytes, k, curve, fixed, evaluate_each(sequences, truth, tolerance))
+    return Contender(name, scores, bytes, k, curve, fixed, evaluate_each(match.sequences, truth, tolerance))
 
 
 def evaluate_each(

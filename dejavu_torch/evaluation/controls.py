@@ -30,9 +30,6 @@ def with_mapper(model: DejaVu, mapper: Mapper) -> DejaVu:
 def template_map_of(model: DejaVu, what: str) -> TemplateMap:
     """The model's map, where it is one of templates.
 
-    Args:
-        what: needs one, for the message.
-
     Raises:
         InputError: a map of another kind.
     """

@@ -160,15 +160,7 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
 def recall_at(candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, first: int) -> float | None:
     """Share of the queries with a right answer that have one among their first candidates.
 
-    Args:
-        candidates: places of each query, the reported one first, -1 for none.
-        truth, tolerance: as of `evaluate`; the queries that count are the same.
-        first: how many of the candidates.
-
     Shape: (Q,K).
-
-    Returns:
-        None where there are fewer candidates than `first`, or no query counts.
 
     Example:
         >>> places, right = torch.tensor([[7, 0], [9, 4]]), torch.tensor([[0], [1]])

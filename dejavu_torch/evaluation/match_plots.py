@@ -1,4 +1,4 @@
-"""Pictures of queries and the places reported for them; each returns (figure, axes)."""
+"""Pictures of queries and the places reported for them."""
 
 from __future__ import annotations
 
@@ -179,10 +179,6 @@ def score_matrix(
 ) -> ScoreMatrix | None:
     """Scores of queries at all places, brought to at most `cells` rows and columns; None where all are +inf.
 
-    Args:
-        scores: query features (q,D) -> (q,N), lower is better.
-        queries: (Q,D) features; of more than `cells` every k-th is used.
-
     Convention: only a few rows of Q x N are held at a time. Each query is scaled by itself, from its best
         score to its median, since scores grow with all that a query has in no place.
     """
@@ -216,11 +212,7 @@ def _scaled(scores: Tensor) -> Tensor:
 def diagonal(
     scores: Callable[[Tensor], Tensor], queries: Tensor, matcher: SequenceMatcher, query: int, place: int
 ) -> Diagonal:
-    """What a sequence adds up for a query and the place reported for it, with as much on all sides of it.
-
-    Args:
-        scores: query features (q,D) -> (q,N), lower is better. queries: (Q,D) features.
-    """
+    """What a sequence adds up for a query and the place reported for it, with as much on all sides of it."""
     room = matcher.length
     back = [round(speed * (room - 1)) for speed in matcher.speeds]
     top, bottom = max(0, query - 2 * room + 1), min(len(queries), query + room + 1)
@@ -246,13 +238,7 @@ def plot_score_matrix(
     queries: Tensor,
     example: Diagonal | None = None,
 ) -> Plot:
-    """How much each query differs from each place, with the places reported and those that are right.
-
-    Args:
-        truth: None where nothing is known.
-        borders: (N+1,) see `FrameTable.borders`. queries: (Q,) the frame of each query, in order.
-        example: drawn below, enlarged.
-    """
+    """How much each query differs from each place, with the places reported and those that are right."""
     figure, axes = canvas(3.8) if example is None else canvas(6.9, 2)
     axis = figure.axes[0]
     edges = torch.cat([queries, queries[-1:] + 1])
@@ -328,9 +314,6 @@ def posterior_image(
 ) -> PosteriorImage:
     """Posterior of a filter behind each query, brought to at most `cells` queries and places.
 
-    Args:
-        scores: query features (q,D) -> (q,N), lower is better. queries: (Q,D) features.
-
     Convention: only a few rows of Q x N are held at a time.
     """
     block = -(-len(queries) // cells)
@@ -355,12 +338,7 @@ def posterior_image(
 def plot_posterior(
     image: PosteriorImage, truth: GroundTruth | None, borders: Tensor, queries: Tensor
 ) -> Plot:
-    """Probability of each place behind each query, and below it that of being off the map.
-
-    Args:
-        truth: None where nothing is known.
-        borders: (N+1,) see `FrameTable.borders`. queries: (Q,) the frame of each query, in order.
-    """
+    """Probability of each place behind each query, and below it that of being off the map."""
     figure, axes = canvas(5.2, 2, sharex=True, height_ratios=(4, 1))
     axis, below = axes
     x = torch.cat([queries[:: image.blocks[0]], queries[-1:] + 1]) - 0.5
@@ -392,14 +370,7 @@ def plot_coverage(
     queries: Tensor,
     unit: str,
 ) -> Plot:
-    """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9).
-
-    Args:
-        truth: (Q,R) right places, or a GroundTruth, or None where nothing is known: the colours are then the
-            probabilities, if there are any.
-        borders: (N+1,) see `FrameTable.borders`; (1,) the number of frames where places are frames.
-        queries: (Q,) the frame of each query. unit: of the tolerance.
-    """
+    """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9)."""
     figure, axis = canvas(3.8)
     reported, frames = match.index >= 0, int(borders[-1])
 

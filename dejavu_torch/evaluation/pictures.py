@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,13 +15,20 @@ from dejavu_torch.evaluation.activation import activation_rates, best_phases, la
 from dejavu_torch.evaluation.components import components
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, distinct
 from dejavu_torch.evaluation.controls import template_map_of
-from dejavu_torch.evaluation.feature_plots import (
+from dejavu_torch.evaluation.map_plots import (
+    Lines,
+    plot_activations,
+    plot_answers,
     plot_autocorrelogram,
+    plot_chunks,
     plot_features,
+    plot_ground,
+    plot_layers,
     plot_spectrogram,
+    plot_spectrum,
     plot_templates,
+    plot_velocity,
 )
-from dejavu_torch.evaluation.map_plots import plot_activations, plot_answers, plot_chunks, plot_layers
 from dejavu_torch.evaluation.match_plots import (
     Row,
     diagonal,
@@ -34,17 +40,8 @@ from dejavu_torch.evaluation.match_plots import (
     posterior_image,
     score_matrix,
 )
-from dejavu_torch.evaluation.motion_plots import plot_ground, plot_velocity
 from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture, label
-from dejavu_torch.evaluation.score_plots import (
-    Areas,
-    Stored,
-    plot_auc,
-    plot_curves,
-    plot_sequences,
-    plot_storage,
-)
-from dejavu_torch.evaluation.spectral_plots import Lines, plot_spectrum
+from dejavu_torch.evaluation.score_plots import Stored, draw_sequences, draw_storage, plot_auc, plot_curves
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of, spectrum
@@ -61,9 +58,6 @@ from dejavu_torch.types import FrequencyLayer, Match, Plan, SequenceModel, Trave
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 EXAMPLES = 4  # places of which the frames of both traverses are shown
-NOTICED = 0.001  # of an area: less is no gain
-SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is shown as well
-ALIKE = 1.1  # times the bytes: sizes whose lines would lie on each other
 STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
 
 
@@ -123,16 +117,7 @@ def draw_pictures(
     contenders: Mapping[str, Contender],
     storage: Mapping[str, Sequence[Stored]] | None = None,
 ) -> dict[str, Picture]:
-    """Every picture that can be drawn: one that needs ground truth, frames or layers is left out without.
-
-    Args:
-        contenders: by key, ours under `map`. storage: likewise, each at several sizes.
-
-    Returns:
-        Of pairs, coverage, scores, posterior, pr, auc, storage, sequences, ground, velocity, then of a
-        template map chunks, spectrogram, templates, features and activations, of a spectral one spectrum and
-        components, those that can be drawn, in this order.
-    """
+    """Every picture that can be drawn: one that needs ground truth, frames or layers is left out without."""
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
     pictures |= draw_scores(run) | draw_posterior(run)
@@ -276,11 +261,7 @@ def draw_posterior(run: Localization) -> dict[str, Picture]:
 
 
 def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
-    """Precision-recall curves, and their areas side by side; nothing where no contender has a curve.
-
-    Args:
-        tolerance: with its unit.
-    """
+    """Precision-recall curves, and their areas side by side; nothing where no contender has a curve."""
     # leave_out has other queries
     curves = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
     pictures = {}
@@ -300,109 +281,6 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
             "counts to its left.",
         )
     return pictures
-
-
-def draw_storage(
-    contenders: Mapping[str, Contender], storage: Mapping[str, Sequence[Stored]], tolerance: str
-) -> dict[str, Picture]:
-    """Areas over bytes; nothing where there are none.
-
-    Args:
-        contenders: those that store all frames are drawn across. tolerance: with its unit.
-    """
-    names = {
-        "map": "this map",
-        "null": "null: the same in shuffled order",
-        "interpolated": "keyframes in int8, interpolated",
-    }
-    curves = {key: (names[key], points) for key, points in storage.items() if points}
-    if not curves:
-        return {}
-    levels = {
-        key: (one.name, one.scores.auc)
-        for key in ("uncompressed", "hog")
-        if (one := contenders.get(key)) and one.scores
-    }
-    factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
-    factor = ""
-    if factors:
-        least, most = (f"{limit:.2g}" for limit in (min(factors), max(factors)))
-        times = least if least == most else f"{least} to {most}"
-        factor = f" For the same area the null takes {times} times the bytes of this map."
-    numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
-    return {
-        "storage": Picture(
-            plot_storage(curves, levels, f"right within {tolerance}"),
-            "what more bytes are worth",
-            "The same descriptors coded to several sizes, fixed bytes such as the whitening's not counted: "
-            "this map, which gains from what is smooth and from what repeats; its null, for which nothing is "
-            f"smooth and nothing repeats; keyframes, which gain from what is smooth.{factor}",
-            numbers | {"null_over_map": factors},
-        )
-    }
-
-
-def draw_sequences(
-    contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
-) -> dict[str, Picture]:
-    """Areas over the number of queries matched together; nothing where single ones are.
-
-    Args:
-        contenders: by key, ours under `map`. coded: our descriptors at several sizes.
-        places: of the map. tolerance: with its unit.
-    """
-    lines = {
-        key: Areas(one.name, {T: scores.auc for T, scores in one.sequences.items()})
-        for key, one in distinct(contenders).items()
-        if one.sequences
-    }
-    if not lines:
-        return {}
-    shown: dict[float, Areas] = {}
-    if "map" in lines and coded:
-        route_bytes = contenders["map"].route_bytes or 0
-        own = route_bytes / places
-        lines["map"] = lines["map"]._replace(name=f"this map, {own:.3g} route bytes per place")
-        for budget in SHOWN:
-            one = min(coded, key=lambda one: abs(one.route_bytes_per_place - budget))
-            size = one.route_bytes_per_place
-            if all(max(size, other) > ALIKE * min(size, other) for other in (own, *shown)):
-                areas = {T: scores.auc for T, scores in one.sequences.items()}
-                shown[size] = Areas(f"the same in {size:.3g} bytes", areas)
-    return {
-        "sequences": Picture(
-            plot_sequences(lines, list(shown.values()), f"right within {tolerance}"),
-            "what more queries are worth",
-            "One query by itself, and the last T together, their scores added up along constant speeds. From "
-            "0.9 to 0.99 is as far as from 0.99 to 0.999; what is beyond the ends of the axis lies on them.",
-        )
-    }
-
-
-def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:
-    """Bytes of ours, and those at which the others reach the same area, where they do.
-
-    Convention: between two of their points the area grows with the logarithm of the bytes. Ours counts where
-    it is better, by more than .001, than all that takes less.
-
-    Example:
-        >>> others = Stored(4, 0.5, 0.5), Stored(16, 0.9, 0.9)
-        >>> [(ours, theirs)] = equally_good([Stored(1, 0.7, 0.7), Stored(2, 0.95, 0.95)], others)
-        >>> ours, round(theirs, 6)
-        (1, 8.0)
-    """
-    found, best = [], -1.0
-    for one in ours:
-        if one.auc <= best + NOTICED:
-            continue
-        best = one.auc
-        for low, high in pairwise(others):
-            if low.auc <= one.auc <= high.auc and low.auc < high.auc:
-                share = (one.auc - low.auc) / (high.auc - low.auc)
-                sizes = low.route_bytes_per_place, high.route_bytes_per_place
-                found.append((one.route_bytes_per_place, sizes[0] * (sizes[1] / sizes[0]) ** share))
-                break
-    return found
 
 
 def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
@@ -442,18 +320,10 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
 
 
 def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]:
-    """One query's scores with its strongest periods only, and with all; nothing where no period is kept.
-
-    In the longest chunk, and for the query whose right place is nearest to the chunk's middle (without ground
-    truth: the middle query).
-    """
-    chunk, truth, queries = longest_chunk(route), run.truth, run.query_features
+    """One query's scores with its strongest periods only, and with all; nothing where no period is kept."""
+    chunk, queries = longest_chunk(route), run.query_features
     start, stop = route.chunks[chunk]
-    query, places = len(queries) // 2, []
-    if truth is not None:
-        query = nearest_query(truth, (start + stop) / 2)
-        right = truth.positives[query].tolist() if truth.judged[query] else []
-        places = [place for place in right if start <= place < stop]
+    query, places = example_query(run, start, stop)
     sums = components(route, queries[query], chunk)
     if not sums[-1].periods:
         return {}
@@ -570,22 +440,15 @@ def draw_features(run: Localization, route: TemplateMap) -> dict[str, Picture]:
 
 
 def draw_activations(run: Localization, route: TemplateMap) -> dict[str, Picture]:
-    """Two layers of one chunk answering one query, and their fusion; nothing where no chunk has two layers.
-
-    The chunk and layers of `leading_layers`, and the query whose right place is nearest to the chunk's
-    middle (without ground truth: the middle query).
-    """
+    """Two layers of one chunk answering one query, and all fused; nothing where no chunk has two layers."""
     plan, truth, queries = route.plan, run.truth, run.query_features
     chosen = leading_layers(plan)
     if len(chosen) < 2:
         return {}
     layers = [plan[j] for j in chosen]
     start, stop = layers[0].start, layers[0].stop
-    query, places, rates = len(queries) // 2, [], None
+    (query, places), rates = example_query(run, start, stop), None
     if truth is not None:
-        query = nearest_query(truth, (start + stop) / 2)
-        right = truth.positives[query].tolist() if truth.judged[query] else []
-        places = [place for place in right if start <= place < stop]
         best = [best_phases(route, queries, j) for j in chosen]
         rates = activation_rates(layers, best, run.scored.index, truth, run.tolerance, route.places)
     one = queries[query : query + 1]
@@ -698,6 +561,15 @@ def nearest_query(truth: GroundTruth, place: float) -> int:
     """The query one of whose right places is nearest to a place; the first where none has any."""
     right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.inf)
     return int((right - place).abs().amin(1).argmin())
+
+
+def example_query(run: Localization, start: int, stop: int) -> tuple[int, list[int]]:
+    """The query nearest to the middle of a chunk and its right places there; without truth the middle one."""
+    if run.truth is None:
+        return len(run.query_features) // 2, []
+    query = nearest_query(run.truth, (start + stop) / 2)
+    right = run.truth.positives[query].tolist() if run.truth.judged[query] else []
+    return query, [place for place in right if start <= place < stop]
 
 
 def has_frames(run: Localization) -> bool:

@@ -1,8 +1,10 @@
 """What all pictures share: their width, colours and axes, and how one is put into a report.
 
 Convention 11: axes along a route count frames of its source. What counts places, such as periods, is labelled
-with the unit of `unit_of`. Pictures take both from the map: `borders`, its table from place to frame, and the
-unit.
+with the unit of `unit_of`.
+
+In plots `borders` (N+1,) is `FrameTable.borders` of the map, `queries` (Q,) the frame of each query,
+`unit` that of periods and tolerance, `truth` None where none is known. A contender's key gives its colour.
 """
 
 from __future__ import annotations

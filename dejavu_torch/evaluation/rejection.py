@@ -32,18 +32,7 @@ class Accepted(NamedTuple):
 def rejection_facts(
     match: Match, truth: GroundTruth | None, tolerance: int, off_map: Mapping[str, Tensor]
 ) -> dict[str, Any]:
-    """What report.json holds of the probabilities of matches; nothing where they have none.
-
-    Args:
-        match, truth, tolerance: as of `evaluate`.
-        off_map: by the name of another route, the probabilities (n,) of what was found for its frames; none
-            of these is right.
-
-    Returns:
-        `rejection`, with the scores of the answers in the order of their probability, the expected
-        calibration error, an `Accepted` for each of `ASKED`, and of other routes how many frames there are
-        and what share of them is accepted.
-    """
+    """What report.json holds of the probabilities of matches; nothing where they have none."""
     if match.probability is None:
         return {}
     facts: dict[str, Any] = {
@@ -89,11 +78,7 @@ def accepted_at(asked: float, probability: Tensor, right: Tensor) -> Accepted:
 
 
 def rejection_table(facts: Mapping[str, Any]) -> list[list[str]]:
-    """What is accepted at each precision that is asked for, as rows of text, the header first.
-
-    Args:
-        facts: of `rejection_facts`. No rows where they tell of nothing.
-    """
+    """What is accepted at each precision that is asked for, as rows of text, the header first."""
     own, off_map = facts.get("precision"), facts.get("off_map", {})
     if own is None and not off_map:
         return []
@@ -142,9 +127,6 @@ def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) ->
 
 def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> float:
     """Expected calibration error: how far probabilities lie from the shares of right answers, on average.
-
-    Args:
-        bins: of equal width, in which queries of like probability are compared.
 
     Shape: probability (n,) and right (n,) bool -> a number from 0 to 1; NaN without answers.
 

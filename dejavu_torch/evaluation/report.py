@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -31,20 +32,12 @@ PICTURES = (
 LATE = 0.1  # recall at which a curve starts late
 HEADING = 11  # letters of a line of a heading
 
-SPECTRAL = (
-    "Of every number of the descriptor the map keeps the strongest lines of its spectrum along the route, in "
-    "steps of one size, and nothing else."
-)
 _MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_100_precision": "R@100P"}
 _MORE = {
     "precision_at_100_recall": "P@100R",
     "auc_reported": "AUC rep.",
     "recall_at_100_precision_reported": "R@100P rep.",
 }
-_LATE = (
-    f"*: this curve starts at a recall above {LATE}, since many queries share the best score; nothing to the "
-    "left of that counts as area"
-)
 
 
 class Report(NamedTuple):
@@ -84,9 +77,6 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
     """The scores as rows of text, the header first; no rows where nothing is scored.
 
     There are bytes only where the number of frames is known.
-
-    Args:
-        every: all scores, and the bytes in total, not only the columns that matter most.
     """
     if not any(one.scores for one in report.shown().values()):
         return []
@@ -149,41 +139,32 @@ def text_table(rows: list[list[str]]) -> str:
 
 def headline(report: Report) -> str:
     """What was done and how good it is, in plain words."""
+    return _sentences(report, "headline")
+
+
+def summary(report: Report) -> str:
+    """What was scored, in a few sentences: those that the facts allow."""
+    return _sentences(report, "summary")
+
+
+def _sentences(report: Report, macro: str) -> str:
+    """A macro of sentences.html.j2, as plain text of one line."""
     facts, scores = report.facts, report.ours.scores
-    text = f"{facts['queries']} queries were looked up"
-    text += f" on a map of {facts['frames']} places" if "frames" in facts else ""
-    line = told_line(facts, scores is not None)
-    if scores is None:
-        return f"{text}. {unscored(facts)} {sentence(line)}".strip()
-    text = f"{sentence(line)} {text}".strip()
-    answerable = facts.get("with_answer", facts["queries"])
-    some = f" Of the {answerable} that have a right place," if answerable < facts["queries"] else ""
-    text += f"{'.' if some else ':'}{some} {percent(scores.recall_at_1)} were found in their right place "
-    text += "(recall@1). Sorted by score, the answers have an area under the precision-recall curve "
-    text += f"(AUC) of {scores.auc:.3f}; 1 is perfect."
-    baseline = report.contenders.get("uncompressed")
-    if baseline and baseline.scores and baseline.bytes and report.ours.bytes and "frames" in facts:
-        ours, full = (size / facts["frames"] for size in (report.ours.bytes, baseline.bytes))
-        spectral = facts.get("kind") == "spectral"
-        text += f" {SPECTRAL}" if spectral else ""
-        text += f" The map takes {ours:.0f} bytes per place"
-        if spectral and report.ours.route_bytes is not None:
-            text += f", {report.ours.route_bytes / facts['frames']:.3g} of them for the route: the others do "
-            text += "not grow with it"
-        text += f". The {'descriptors' if spectral else 'features'} as they are would take {full:.0f} "
-        text += f"and find {percent(baseline.scores.recall_at_1)}."
-    return text
-
-
-def unscored(facts: Mapping[str, Any]) -> str:
-    """What can be said of answers where nothing tells which are right, and what to do next, in sentences."""
-    steps = steps_after(facts)
-    if not steps:
-        return (
-            "There is no ground truth, so nothing is scored: see the matches and the pictures, or give one, "
-            "such as --truth 12 (place = query + 12) or --truth truth.csv (rows of query,place)."
-        )
-    return f"{sentence(told_probable(facts['probably_right'], facts['queries']))} Next: {steps}."
+    counts = facts.get("probably_right")
+    parts = {
+        "facts": facts,
+        "ours": report.ours,
+        "scores": scores,
+        "baseline": report.contenders.get("uncompressed"),
+        "line": told_line(facts, scores is not None),
+        "probable": told_probable(counts, facts["queries"]) if counts else "",
+        "steps": steps_after(facts),
+        "late": any(is_late(one) for one in report.shown().values()),
+        "late_recall": LATE,
+    }
+    module = _environment(page=False).get_template("sentences.html.j2").make_module(parts)
+    text: str = getattr(module, macro)()
+    return re.sub(r"[ \n]+", " ", text).strip()
 
 
 def steps_after(facts: Mapping[str, Any]) -> str:
@@ -195,73 +176,14 @@ def steps_after(facts: Mapping[str, Any]) -> str:
     return "; ".join([*next_steps(together, strict), "--truth scores the answers"])
 
 
-def sentence(text: str) -> str:
+def _sentence(text: str) -> str:
     """Words as a sentence of their own; "" stays as it is."""
     return text[:1].upper() + text[1:] + "." * (text[-1:] not in ("", "?"))
 
 
-def percent(share: float) -> str:
-    """A share in words that stay on one line.
-
-    Example:
-        >>> percent(0.7988)
-        '79.9\\xa0%'
-    """
+def _percent(share: float) -> str:
+    """A share in words that stay on one line."""
     return f"{100 * share:.1f}\xa0%"
-
-
-def summary(report: Report) -> str:
-    """What was scored, in a few sentences: those that the facts allow."""
-    facts = report.facts
-    places = f" on {facts['frames']} places" if "frames" in facts else ""
-    right = f"right within {facts['tolerance']} {facts.get('unit', 'frames')}"
-    right += f" of the truth ({facts['truth']})" if facts.get("truth") else ""
-    if report.ours.scores is None:
-        counts = facts.get("probably_right")
-        right = told_probable(counts, facts["queries"]) if counts else "nothing is scored"
-    lines = [f"{facts['queries']} queries{places}; {right}"]
-    if "resampling" in facts:
-        step, reference, query = (
-            facts["resampling"][key] for key in ("step", "reference_frames", "query_frames")
-        )
-        both = f"of the reference and {query} of the query" if query else "of the reference"
-        lines.append(f"{reference} frames {both} were resampled to even steps of {step:.4g} pixels of ground")
-    if facts.get("sequence", 1) > 1:
-        speeds = facts.get("speeds") or [1.0]
-        at = "" if speeds == [1.0] else f" at {' or '.join(f'{speed:g}' for speed in speeds)} places a query"
-        lines.append(f"Each was matched together with the {facts['sequence'] - 1} before it{at} (--sequence)")
-    if facts.get("filter"):
-        lines.append("Each was matched by a filter over all queries before it (--filter)")
-    if facts.get("unknown"):
-        lines.append(f"{facts['queries'] - facts['unknown']} of the queries are in the truth")
-    if "with_answer" in facts:
-        lines.append(f"{facts['with_answer']} of the queries have a right answer")
-    if facts.get("recall_at_5") is not None:
-        text = f"{percent(facts['recall_at_5'])} of them have a right place among their first 5 candidates"
-        ten = facts.get("recall_at_10")
-        lines.append(text if ten is None else f"{text}, {percent(ten)} among the first 10")
-    if facts.get("ignored"):
-        lines.append(f"{facts['ignored']} report a place that counts neither as right nor as wrong")
-    if "accepted_right" in facts:
-        accepted = f"{facts['accepted']} are accepted, {facts['accepted_right']} correctly"
-        lines.append(f"Of {facts['judged']} scored {accepted}")
-    if facts.get("threshold_of_full_precision") is not None:
-        threshold = facts["threshold_of_full_precision"]
-        lines.append(f"Here --threshold {threshold:.9g} would accept right places only")
-    error = facts.get("rejection", {}).get("expected_calibration_error")
-    if error is not None:
-        full = facts["rejection"]["recall_at_100_precision"]
-        lines.append(
-            f"Probabilities differ from the share of right answers by {error:.3f} on average (expected "
-            f"calibration error); in their order R@100P is {full:.3f}"
-        )
-    if any(is_late(one) for one in report.shown().values()):
-        lines.append(_LATE)
-    if "seconds_learn" in facts:
-        learning = f"Learning took {facts['seconds_learn']:.1f} s, localizing"
-        took = learning if facts["seconds_learn"] else "Localizing took"
-        lines.append(f"{took} {facts['seconds_localize']:.1f} s")
-    return ". ".join(lines) + "."
 
 
 def as_html(report: Report, pictures: Mapping[str, Picture]) -> str:
@@ -293,14 +215,7 @@ def write_report(
     command: str,
     plan: str | None = None,
 ) -> None:
-    """Write report.json, one PNG for each picture, and index.html with all of it inside.
-
-    Args:
-        folder: one that exists, as `report_folder` gives.
-        pictures: by file name without ending, one of `PICTURES`.
-        title: heading of the page. command: what made it.
-        plan: the plan and summary of the map in lines; None where there is no map.
-    """
+    """Write report.json, one PNG for each picture, and index.html with all of it inside."""
     pngs = {name: as_png(picture) for name, picture in pictures.items()}
     for name, data in pngs.items():
         (folder / f"{name}.png").write_bytes(data)
@@ -338,13 +253,7 @@ def write_index(
     title: str,
     command: str,
 ) -> None:
-    """Write index.html over several reports, with one table and one picture, and links to their pages.
-
-    Args:
-        folder: one that exists.
-        rows: of the table, the header first. notes: what a reader should know of it, a line each.
-        pages: what each link says -> where it leads.
-    """
+    """Write index.html over several reports, with one table and one picture, and links to their pages."""
     _write_page(
         folder,
         title=printable(title),
@@ -367,9 +276,14 @@ def _embedded(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
-def _write_page(folder: Path, **parts: Any) -> None:
+def _environment(page: bool) -> jinja2.Environment:
     loader = jinja2.PackageLoader("dejavu_torch", "evaluation")
-    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    text = environment.get_template("report.html.j2").render(parts)
+    environment = jinja2.Environment(loader=loader, autoescape=page, trim_blocks=page, lstrip_blocks=page)
+    environment.filters |= {"sentence": _sentence, "percent": _percent}
+    return environment
+
+
+def _write_page(folder: Path, **parts: Any) -> None:
+    text = _environment(page=True).get_template("report.html.j2").render(parts)
     # names may hold what is no text
     (folder / "index.html").write_text(text, encoding="utf-8", errors="backslashreplace")

@@ -118,14 +118,7 @@ def ideal(result: Comparison, tolerance: int) -> dict[str, Contender]:
 
 
 def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int] = LENGTHS) -> list[Length]:
-    """Recall and storage of maps whose chunks have other lengths (section VI).
-
-    Args:
-        result: with the other settings. lengths: in places; those longer than the reference are left out.
-
-    Returns:
-        A row for each length; none without ground truth, or with periods of another finder.
-    """
+    """Recall and storage of maps whose chunks have other lengths (section VI)."""
     mapper, places = _mapper(result.run.model), len(result.run.reference_features)
     if result.run.truth is None or mapper is None:
         return []
@@ -191,10 +184,6 @@ def structure_places(result: Comparison, cuts: Sequence[int]) -> list[int]:
 class GivenChunks(SpectrogramAnalysis):
     """The spectrogram analysis on chunks that are known beforehand.
 
-    Args:
-        cuts: the places at which a chunk ends and the next begins, increasing.
-        settings: see SpectrogramAnalysis; window and hop have no effect.
-
     Convention: a piece of fewer than two of the shortest periods joins the piece before it.
     """
 
@@ -233,10 +222,6 @@ def boundary_effect(
 ) -> BoundaryEffect:
     """Recall@1 near to the cuts and far from them.
 
-    Args:
-        cuts: places at which something starts or stops, at least one.
-        near: places.
-
     Shape: match and truth of Q queries.
     """
     if not cuts:
@@ -257,12 +242,6 @@ def known_boundaries(
     result: Comparison, cuts: Sequence[int], tolerance: int
 ) -> dict[str, tuple[Contender, BoundaryEffect]]:
     """What it costs that chunks do not end where what repeats starts and stops (section V, underground).
-
-    Returns:
-        Two maps of comparable scores (`reduction="mean"`), each with its recall near to the cuts and far from
-        them: `comparable` on the chunks of the comparison, `known_boundaries` on chunks that end at the cuts.
-        The printed sum of eq. 4 would hide the effect: of chunks of different size the one of the fewest
-        features gets nearly all queries.
 
     Raises:
         InputError: a comparison without ground truth, or with periods of another finder.

@@ -1,18 +1,22 @@
-"""Pictures of scores: curves, areas and chunk lengths; each returns (figure, axes)."""
+"""Pictures of scores: curves, areas, chunk lengths and running times."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from textwrap import fill
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, sequences_as_json
+from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import LETTERS, LINE, Plot, canvas, label
+from dejavu_torch.evaluation.plots import LETTERS, LINE, Picture, Plot, canvas, label
 
 _OURS = COLOURS["map"]
 _SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
+NOTICED = 0.001  # of an area: less is no gain
+SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is shown as well
+ALIKE = 1.1  # times the bytes: sizes whose lines would lie on each other
 LOWEST, HIGHEST = 0.01, 0.999  # areas, where more and less is drawn as this
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
@@ -57,11 +61,7 @@ class Length(NamedTuple):
 
 
 def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
-    """Precision against recall, a line for each contender that has a curve (figures 8 to 10 of the paper).
-
-    Args:
-        contenders: by key, which gives the colour; HOG is dashed, nulls are dotted.
-    """
+    """Precision against recall, a line for each contender that has a curve (figures 8 to 10 of the paper)."""
     names = {key: label(one.name) for key, one in contenders.items()}
     for key, one in contenders.items():
         silent = one.curve is not None and len(one.curve.recall) == 0
@@ -127,17 +127,29 @@ def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
     return figure, (above, below)
 
 
-def plot_storage(
-    curves: Mapping[str, tuple[str, Sequence[Stored]]],
-    levels: Mapping[str, tuple[str, float]],
-    title: str = "",
-) -> Plot:
-    """Area under the precision-recall curve over the bytes that a route takes.
-
-    Args:
-        curves: by key, which gives the colour: name and points. levels: by key: name and area of what takes
-            far more, a line across.
-    """
+def draw_storage(
+    contenders: Mapping[str, Contender], storage: Mapping[str, Sequence[Stored]], tolerance: str
+) -> dict[str, Picture]:
+    """Areas over bytes; nothing where there are none."""
+    names = {
+        "map": "this map",
+        "null": "null: the same in shuffled order",
+        "interpolated": "keyframes in int8, interpolated",
+    }
+    curves = {key: (names[key], points) for key, points in storage.items() if points}
+    if not curves:
+        return {}
+    levels = {
+        key: (one.name, one.scores.auc)
+        for key in ("uncompressed", "hog")
+        if (one := contenders.get(key)) and one.scores
+    }
+    factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
+    factor = ""
+    if factors:
+        least, most = (f"{limit:.2g}" for limit in (min(factors), max(factors)))
+        times = least if least == most else f"{least} to {most}"
+        factor = f" For the same area the null takes {times} times the bytes of this map."
     figure, axis = canvas(3.4 + 1.1 * LINE * (len(curves) + len(levels)))
     for key, (name, area) in levels.items():
         axis.axhline(area, color=colour_of(key), linestyle=_LINES.get(key, "--"), linewidth=1.2, label=name)
@@ -151,26 +163,48 @@ def plot_storage(
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axis.minorticks_off()
     axis.set(ylim=(0, 1.02), xlabel="route bytes per place", ylabel="area under the PR curve")
-    axis.set_title(title, fontsize=10)
+    axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
     handles, labels = axis.get_legend_handles_labels()
     across = len(levels)
     handles, labels = [*handles[across:], *handles[:across]], [*labels[across:], *labels[:across]]
     figure.legend(handles, labels, loc="outside lower left", frameon=False, fontsize=9)
-    return figure, axis
+    numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
+    return {
+        "storage": Picture(
+            (figure, axis),
+            "what more bytes are worth",
+            "The same descriptors coded to several sizes, fixed bytes such as the whitening's not counted: "
+            "this map, which gains from what is smooth and from what repeats; its null, for which nothing is "
+            f"smooth and nothing repeats; keyframes, which gain from what is smooth.{factor}",
+            numbers | {"null_over_map": factors},
+        )
+    }
 
 
-def plot_sequences(lines: Mapping[str, Areas], coded: Sequence[Areas], title: str = "") -> Plot:
-    """Area under the precision-recall curve over the number of queries matched together.
-
-    Args:
-        lines: by key, which gives the colour, the map first; HOG is dashed, nulls are dotted.
-        coded: the map at other sizes, thin lines in its colour with marks of their own.
-
-    Convention: the axis is that of the log odds: from .9 to .99 is as far as from .99 to .999. Areas beyond
-        its ends are drawn at them.
-    """
-    marked = [(one, _OURS, "-", mark, 1.0) for one, mark in zip(coded, "sD^", strict=False)]
+def draw_sequences(
+    contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
+) -> dict[str, Picture]:
+    """Areas over the number of queries matched together; nothing where single ones are."""
+    lines = {
+        key: Areas(one.name, {T: scores.auc for T, scores in one.sequences.items()})
+        for key, one in distinct(contenders).items()
+        if one.sequences
+    }
+    if not lines:
+        return {}
+    shown: dict[float, Areas] = {}
+    if "map" in lines and coded:
+        route_bytes = contenders["map"].route_bytes or 0
+        own = route_bytes / places
+        lines["map"] = lines["map"]._replace(name=f"this map, {own:.3g} route bytes per place")
+        for budget in SHOWN:
+            nearest = min(coded, key=lambda size: abs(size.route_bytes_per_place - budget))
+            size = nearest.route_bytes_per_place
+            if all(max(size, other) > ALIKE * min(size, other) for other in (own, *shown)):
+                areas = {T: scores.auc for T, scores in nearest.sequences.items()}
+                shown[size] = Areas(f"the same in {size:.3g} bytes", areas)
+    marked = [(one, _OURS, "-", mark, 1.0) for one, mark in zip(shown.values(), "sD^", strict=False)]
     drawn = [
         (one, colour_of(key), _LINES.get(key.partition("_")[0], "-"), "o", 2.4 if key == "map" else 1.4)
         for key, one in lines.items()
@@ -188,16 +222,49 @@ def plot_sequences(lines: Mapping[str, Areas], coded: Sequence[Areas], title: st
         )
     ticks = sorted({T for one, *_ in drawn for T in one.auc})
     axis.set_xticks(ticks, [str(T) for T in ticks])
-    areas = {LOWEST: "0.01", 0.1: "0.1", 0.5: "0.5", 0.9: "0.9", 0.99: "0.99", HIGHEST: "0.999"}
+    levels = {LOWEST: "0.01", 0.1: "0.1", 0.5: "0.5", 0.9: "0.9", 0.99: "0.99", HIGHEST: "0.999"}
     axis.set_yscale("logit")
-    axis.set_yticks(list(areas), list(areas.values()))
+    axis.set_yticks(list(levels), list(levels.values()))
     axis.minorticks_off()
     axis.set(ylim=(0.8 * LOWEST, 1 - 0.8 * (1 - HIGHEST)))
     axis.set(xlabel="queries matched together, T", ylabel="area under the PR curve")
-    axis.set_title(title, fontsize=10)
+    axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
     figure.legend(loc="outside lower left", frameon=False, fontsize=9)
-    return figure, axis
+    return {
+        "sequences": Picture(
+            (figure, axis),
+            "what more queries are worth",
+            "One query by itself, and the last T together, their scores added up along constant speeds. From "
+            "0.9 to 0.99 is as far as from 0.99 to 0.999; what is beyond the ends of the axis lies on them.",
+        )
+    }
+
+
+def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:
+    """Bytes of ours, and those at which the others reach the same area, where they do.
+
+    Convention: between two of their points the area grows with the logarithm of the bytes. Ours counts where
+    it is better, by more than .001, than all that takes less.
+
+    Example:
+        >>> others = Stored(4, 0.5, 0.5), Stored(16, 0.9, 0.9)
+        >>> [(ours, theirs)] = equally_good([Stored(1, 0.7, 0.7), Stored(2, 0.95, 0.95)], others)
+        >>> ours, round(theirs, 6)
+        (1, 8.0)
+    """
+    found, best = [], -1.0
+    for one in ours:
+        if one.auc <= best + NOTICED:
+            continue
+        best = one.auc
+        for low, high in pairwise(others):
+            if low.auc <= one.auc <= high.auc and low.auc < high.auc:
+                share = (one.auc - low.auc) / (high.auc - low.auc)
+                sizes = low.route_bytes_per_place, high.route_bytes_per_place
+                found.append((one.route_bytes_per_place, sizes[0] * (sizes[1] / sizes[0]) ** share))
+                break
+    return found
 
 
 def drawn_areas(areas: Sequence[float]) -> list[float]:

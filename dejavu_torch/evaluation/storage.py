@@ -23,20 +23,10 @@ from dejavu_torch.types import InputError, Match
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
 
 
-def storage_curve(
+def coded_at_sizes(
     run: Localization, budgets: Sequence[float] = BUDGETS, seed: int = 0, progress: bool = False
 ) -> dict[str, list[Stored]]:
     """The run's descriptors coded anew at several budgets, each evaluated with the run's queries.
-
-    Args:
-        run: with a spectral map, whose settings are kept, and a ground truth.
-        budgets: route bytes per place; those that a contender cannot meet are left out. Each
-            contender stands at what it takes.
-        seed: of the null's shuffle. progress: show a progress bar on a terminal.
-
-    Returns:
-        By key: `map`, `null` (the descriptors in shuffled order) and `interpolated` (keyframes in int8, and
-        straight lines between them).
 
     Raises:
         InputError: a map of another kind, or no ground truth.
@@ -72,9 +62,6 @@ def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float
     The noise is Gaussian with the spectrum of each number of the descriptor, its energy averaged over half
     octaves: nothing in it repeats. What the map takes less than this is the most that it can owe to
     repetition, and all else it owes to smoothness; a trend, or a stretch quieter than others, saves too.
-
-    Args:
-        route: the map, of one chunk. features: (N,K) the descriptors that it holds. seed: of the noise.
     """
     lines = spectrum((features.float() - route.means[0].float()).T, route.transform)
     band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).log2()).long()

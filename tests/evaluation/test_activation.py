@@ -32,12 +32,6 @@ def test_rates_in_closed_form() -> None:
     }
 
 
-def test_the_chunk_ends_before_its_stop() -> None:
-    truth = as_ground_truth(torch.tensor([[39], [40]]))
-    rates = activation_rates([layer(10, 10)], [torch.tensor([9, 5])], torch.tensor([39, 0]), truth, 0, 80)
-    assert rates.layers[0][:2] == (1.0, 0.0)
-
-
 def test_a_layer_that_covers_the_route_has_no_outside() -> None:
     truth = as_ground_truth(torch.tensor([[3], [13]]))
     rates = activation_rates([layer(10, 10)], [torch.tensor([3, 3])], torch.tensor([3, 3]), truth, 0, 40)
@@ -51,32 +45,6 @@ def test_unknown_queries_and_those_without_an_answer_do_not_count() -> None:
     wrong = torch.tensor([8, 3, 3])
     rates = activation_rates([layer(10, 10)], [wrong], wrong, truth, 0, 40)
     assert rates.layers[0][:2] == rates.fused[:2] == (0.0, None)
-
-
-def test_a_query_that_reports_a_soft_place_does_not_count_in_the_fusion() -> None:
-    truth = GroundTruth(torch.tensor([[3], [5]]), torch.tensor([True, True]), torch.tensor([[20], [-1]]))
-    rates = activation_rates([layer(10, 10)], [torch.tensor([0, 5])], torch.tensor([20, 5]), truth, 0, 40)
-    assert rates.layers[0].inside == 0.5
-    assert rates.fused.inside == 1.0
-
-
-def test_a_right_place_outside_does_not_help_a_query_inside() -> None:
-    truth = as_ground_truth(torch.tensor([[3, 48]]))
-    rates = activation_rates([layer(10, 10)], [torch.tensor([8])], torch.tensor([48]), truth, 0, 60)
-    assert rates.layers[0].inside == 0.0
-
-
-def test_chance_is_at_most_one() -> None:
-    truth = as_ground_truth(torch.tensor([[3]]))
-    rates = activation_rates([layer(4, 4)], [torch.tensor([1])], torch.tensor([3]), truth, 50, 60)
-    assert rates.layers[0].chance == rates.fused.chance == 1.0
-
-
-def test_fewer_phases_than_frames_count_the_distance_in_frames() -> None:
-    coarse = layer(20, 5)  # a phase is 4 frames: frames 0-3 have phase 0, 16-19 phase 4
-    best, places = torch.arange(5), torch.zeros(5, 1, dtype=torch.int64)
-    assert in_phase(coarse, best, places, 3).tolist() == [True, False, False, False, False]
-    assert in_phase(coarse, best, places, 4).tolist() == [True, True, False, False, True]
 
 
 @given(st.fractions(2, 60, max_denominator=7), st.integers(0, 500), st.integers(0, 9), st.data())

@@ -109,12 +109,6 @@ def test_what_is_asked_of_a_line(scored: bool, offset: int | None, asks: bool) -
     assert ("contradict the truth (place = query + 0)" in told) == (asks and scored)
 
 
-def test_of_many_queries_a_few_that_are_sure_ask_nothing() -> None:
-    queries = torch.arange(200)
-    match = answers(queries + 9, torch.where(queries < 30, 0.9, 0.1))
-    assert "line" not in own_facts(match, queries, 5, scored=False)
-
-
 def test_an_offset_may_be_negative_or_none() -> None:
     queries = torch.arange(60)
     for offset, told in (

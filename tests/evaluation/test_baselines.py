@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames, stride_bytes
+from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
@@ -41,19 +41,6 @@ def test_the_nearest_stored_frame(metric: str) -> None:
         assert match.accepted.all()
 
 
-def test_of_equally_near_frames_the_first_is_reported() -> None:
-    reference = torch.tensor([[2.0], [0.0], [2.0], [0.0]])
-    match = nearest_frames(reference, torch.tensor([[0.0], [1.0], [2.0]]))
-    assert match.index.tolist() == [1, 0, 0]
-
-
-def test_the_uncompressed_reference_finds_its_own_frames() -> None:
-    reference = torch.rand(50, 8)
-    match = nearest_frames(reference, reference)
-    assert match.index.tolist() == list(range(50))
-    assert match.score.tolist() == [0.0] * 50
-
-
 @pytest.mark.parametrize("k", [1, 4])
 def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> None:
     """Their distances are those of the nearest stored frame; a sequence tells where between them it is."""
@@ -76,14 +63,6 @@ def test_distances_in_parts_change_nothing(monkeypatch: pytest.MonkeyPatch) -> N
                 patch.setattr("dejavu_torch.evaluation.baselines.DISTANCES_AT_ONCE", numbers)
                 parts = nearest_frames(reference, query, k, matching=Matching(sequence))
             assert all(torch.equal(x, y) for x, y in zip(parts, whole, strict=True))
-
-
-@pytest.mark.parametrize(
-    ("frames", "k", "kept"), [(10, 1, 10), (10, 3, 4), (9, 3, 3), (10, 10, 1), (10, 99, 1)]
-)
-def test_bytes_of_every_kth_frame(frames: int, k: int, kept: int) -> None:
-    assert stride_bytes(frames, dimension=6, itemsize=4, k=k) == kept * 24
-    assert len(range(0, frames, k)) == kept
 
 
 @given(

@@ -189,13 +189,6 @@ def test_report_of_an_evaluation(tmp_path: Path) -> None:
     assert "matches.csv" in text_table(score_table(result.report))
 
 
-def test_a_silent_method_has_a_report_too(tmp_path: Path) -> None:
-    result = evaluate_file(written(tmp_path, HEADER + "0,-1,inf,0\n1,-1,inf,0\n"), "0")
-    assert set(scores_of(result).values()) == {0.0}
-    assert result.report.facts["accepted_precision"] is None
-    write_report(tmp_path, result.report, result.pictures, "silent", "")
-
-
 # a map of resampled places
 
 
@@ -246,24 +239,6 @@ def test_convention_11_all_frames_of_one_place_are_right(resampled: Resampled, t
     assert scores_of(evaluate_file(path, truth, 24))["recall_at_1"] == 0
 
 
-def test_every_frame_as_a_query_of_a_resampled_map(resampled: Resampled, tmp_path: Path) -> None:
-    rows = "".join(
-        f"{q},{p},0.5,1\n" for q, p in enumerate((REFERENCE - QUERY[:, None]).abs().argmin(1).tolist())
-    )
-    result = evaluate_file(
-        written(tmp_path, HEADER + rows), str(resampled.map.parent / "truth.csv"), 0, map=resampled.map
-    )
-    assert result.report.facts["judged"] == len(QUERY)
-    assert scores_of(result)["recall_at_1"] == 1
-
-
-def test_a_frame_may_be_several_queries(resampled: Resampled, tmp_path: Path) -> None:
-    path = written(tmp_path, HEADER + "0,0,0.1,1\n0,90,0.2,1\n1,1,0.3,1\n")
-    for map_ in (resampled.map, None):
-        facts = evaluate_file(path, "0", map=map_).report.facts
-        assert (facts["queries"], facts["accepted_right"]) == (3, 2)
-
-
 def test_frames_that_the_reference_does_not_have_are_refused(resampled: Resampled, tmp_path: Path) -> None:
     path = written(tmp_path, HEADER + f"0,{len(REFERENCE)},0.1,1\n")
     with refused(f"place {len(REFERENCE)}", f"below {len(REFERENCE)}"):
@@ -271,15 +246,6 @@ def test_frames_that_the_reference_does_not_have_are_refused(resampled: Resample
     truth = written(tmp_path, "query,place\n0,99999\n", "truth.csv")
     with refused("place 99999", f"0 to {len(REFERENCE) - 1}"):
         evaluate_file(resampled.matches, str(truth), map=resampled.map)
-
-
-def test_a_map_of_frames_says_how_many_there_are(tmp_path: Path) -> None:
-    model = template_model(periods=Fixed(FrequencyLayer(24, 24, 0, 60, (0, 1)))).learn(torch.rand(60, 4))
-    model.save(tmp_path / "m.safetensors")
-    facts = evaluate_file(written(tmp_path, MATCHES), "0", map=tmp_path / "m.safetensors").report.facts
-    assert (facts["unit"], facts["places"]) == ("frames", 60)
-    with refused("place 70", "below 60"):
-        evaluate_file(written(tmp_path, HEADER + "0,70,1,1\n"), "0", map=tmp_path / "m.safetensors")
 
 
 def test_corridor(tmp_path: Path, data_dir: Path) -> None:

@@ -24,10 +24,6 @@ def test_chunks_are_drawn_at_their_periods() -> None:
     assert {"93", "171", "97.5", "widest bar: 4 features"} <= set(texts(figure))
 
 
-def test_chunks_of_a_route_without_layers() -> None:
-    assert "this route does not repeat: no layers" in texts(plot_chunks((), torch.arange(101), "frames")[0])
-
-
 def test_activations_show_the_scores_and_mark_the_best() -> None:
     layers, scores = (layer(4, 8, 16), layer(2, 8, 16)), torch.rand(2, 8)
     figure, rows = plot_activations(

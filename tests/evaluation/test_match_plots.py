@@ -71,24 +71,6 @@ def test_coverage_leaves_grey_what_is_not_scored() -> None:
     assert {"3 not scored", "right within 0 frames"} <= set(texts(figure))
 
 
-def test_coverage_without_truth_or_of_one_query() -> None:
-    figure, axis = plot_coverage(matched(3), None, 5, torch.arange(11), torch.arange(1), "frames")
-    assert dots(axis) == {"1 reported": [(0, 3)]}
-    render(figure)
-
-
-@pytest.mark.parametrize(("channels", "height", "width"), [(1, 32, 32), (3, 32, 64), (3, 20, 100)])
-def test_frames_of_any_shape(channels: int, height: int, width: int) -> None:
-    frames = torch.rand(2, channels, height, width)
-    titles = ["reference, frame 1", "second, frame 2"]
-    figure, axes = plot_rows([Row("", titles, list(frames))] * 3)
-    assert axes.shape == (3, 2)
-    assert set(titles) <= set(texts(figure))
-    image = render(figure)
-    shown = image.width * 3 * height / (2 * width)
-    assert shown < image.height < 1.2 * shown + 300  # little room that is empty
-
-
 def found(index: list[int], score: list[float], below: float = 10.0) -> Match:
     scores = torch.tensor(score)
     return Match(torch.tensor(index), scores, scores < below)
@@ -113,20 +95,6 @@ def test_where_a_threshold_rejects_some_the_best_of_them_is_shown() -> None:
     last = example_matches(match, None, 0)[-1]
     assert (last.query, last.right) == (2, -1)
     assert "surest not accepted" in last.why
-
-
-def test_an_example_is_shown_once_and_only_if_there_is_one() -> None:
-    (one,) = example_matches(found([4], [0.1]), None, 0)
-    assert one.why == "surest answer, least sure answer, score 0.1"
-    right = example_matches(found([0, 1], [0.1, 0.2]), as_ground_truth(torch.arange(2)[:, None]), 0)
-    assert [one.why.split(",")[0] for one in right] == ["surest right answer", "least sure answer"]
-    assert example_matches(found([-1], [torch.inf]), None, 0) == []
-
-
-def test_the_right_place_shown_is_the_nearest_to_the_one_reported() -> None:
-    truth = as_ground_truth(torch.tensor([[3, 90, -1]]))
-    (example,) = example_matches(found([80], [0.1]), truth, 0)
-    assert example.right == 90
 
 
 def test_rows_show_frames_side_by_side_under_their_titles() -> None:
@@ -169,15 +137,6 @@ def test_few_queries_are_scored_at_a_time(monkeypatch: pytest.MonkeyPatch) -> No
     score_matrix(scores, torch.rand(35, 4))
     assert sum(asked) == 35
     assert max(asked) == 10
-
-
-def test_places_that_nothing_covers_stay_empty() -> None:
-    scores = torch.rand(4, 10)
-    scores[:, 6:] = torch.inf
-    matrix = score_matrix(lambda rows: scores[: len(rows)], torch.rand(1, 2))
-    assert matrix is not None
-    assert matrix.values.isnan().tolist() == [[False] * 6 + [True] * 4]
-    assert score_matrix(lambda rows: torch.full((len(rows), 5), torch.inf), torch.rand(3, 2)) is None
 
 
 def test_the_score_matrix_is_drawn_with_reported_and_right_places() -> None:

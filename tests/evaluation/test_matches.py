@@ -86,11 +86,6 @@ def test_other_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
     assert told(written(tmp_path, text)) == told(written(tmp_path, PLAIN))
 
 
-def test_without_the_column_every_finite_score_is_accepted(tmp_path: Path) -> None:
-    path = written(tmp_path, "query,place,score\n5,1,0.25\n3,2,inf\n4,-1,0.5\n")
-    assert told(path) == [(3, -1, INF, False), (4, -1, INF, False), (5, 1, 0.25, True)]
-
-
 def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path: Path) -> None:
     path = written(tmp_path, "query,place,score,accepted\n0,-1,0.5,1\n1,4,inf,1\n")
     assert told(path) == [(0, -1, INF, False), (1, -1, INF, False)]
@@ -130,13 +125,6 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path, text: str | bytes, words
 def test_what_reports_nothing_needs_no_probability(tmp_path: Path) -> None:
     text = "query,place,score,probability\n0,-1,inf,\n1,4,0.5,0.75\n"
     assert read_matches(written(tmp_path, text)).match.probability.tolist() == [0, 0.75]
-
-
-def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with refused("none.csv", "is not there", "query,place,score"):
-        read_matches(tmp_path / "none.csv")
-    with refused("is a folder"):
-        read_matches(tmp_path)
 
 
 # ranks
@@ -205,12 +193,6 @@ def lines(path: Path) -> list[str]:
     return text.splitlines()
 
 
-def test_without_frames_and_names_places_are_frames(tmp_path: Path) -> None:
-    path = tmp_path / "m.csv"
-    assert write_matches(path, [MATCH]) == (3, 2)
-    assert lines(path) == [HEADER, "0,2,0.5,1,,", "1,-1,inf,0,,", "2,0,0.25,1,,"]
-
-
 def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> None:
     path, frames = tmp_path / "m.csv", torch.tensor([10, 14, 19])
 
@@ -241,14 +223,6 @@ def test_any_name_leaves_the_file_readable(scratch: Path, names: list[str]) -> N
         assert row["query_name"].isprintable()
         if name.isprintable():
             assert row["query_name"] == name
-
-
-def test_names_with_commas_quotes_and_line_breaks(tmp_path: Path) -> None:
-    path = tmp_path / "m.csv"
-    write_matches(path, [MATCH], query_name=['a, "b".png', "ä\n.png", "c\u2028d\udcff.png"].__getitem__)
-    rows = list(csv.DictReader(path.open(newline="", encoding="utf-8")))
-    assert [row["query_name"] for row in rows] == ['a, "b".png', "ä\\n.png", "c\\u2028d\\udcff.png"]
-    assert len(lines(path)) == 4
 
 
 def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.strip import SlidingWindow
-from dejavu_torch.evaluation.activation import best_phases
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.pictures import (
     Localization,
@@ -45,7 +44,6 @@ ALL = [
     *("spectrogram", "templates", "features", "activations"),
 ]
 ALONE = [name for name in ALL if name != "auc"]  # one area has nothing to be compared with
-UNSCORED = [name for name in ALONE if name != "pr"]
 
 
 def layer(period: int, start: int, stop: int, *features: int) -> FrequencyLayer:
@@ -111,14 +109,6 @@ def test_every_picture_of_frames_that_repeat() -> None:
     assert "Elsewhere" in pictures["activations"].caption
 
 
-def test_a_route_of_one_chunk_has_nothing_elsewhere() -> None:
-    model = template_model(periods=SpectrogramAnalysis(window=120, min_period=4))
-    picture = drawn(model, frames(0), frames(1), same_places())["activations"]
-    numbers = picture.numbers
-    assert "lsewhere" not in picture.caption
-    assert [rate["outside"] for rate in (*numbers["layers"], numbers["fused"])] == [None] * 3
-
-
 def test_the_rates_are_those_of_the_layers_they_stand_beside() -> None:
     """Two layers that each answer for their own period only: swapped, neither would be in phase."""
     values = (torch.arange(90)[:, None] % torch.tensor([9.0, 9.0, 10.0])) + torch.tensor([0.0, 1.0, 2.0])
@@ -130,45 +120,39 @@ def test_the_rates_are_those_of_the_layers_they_stand_beside() -> None:
     assert [rate["chance"] for rate in rates] == [pytest.approx(5 / 9), 0.5]
 
 
-def test_without_truth_nothing_is_scored() -> None:
-    pictures = drawn(short(), frames(0), frames(1)[:50], None)
-    assert list(pictures) == UNSCORED
-    assert pictures["activations"].numbers == {}
-
-
-def test_a_truth_in_which_some_is_unknown() -> None:
+@pytest.mark.parametrize(
+    ("case", "left_out"),
+    [
+        ("without truth", ["pr"]),
+        ("some unknown", []),
+        ("nothing judged", ["pr"]),
+        ("one chunk", []),
+        ("ready features", ["pairs", "features"]),
+        ("one layer", ["activations", "spectrogram"]),
+        ("no layers", ["pairs", "scores", "spectrogram", "templates", "features", "activations"]),
+    ],
+)
+def test_pictures_that_there_is_nothing_for_are_left_out(case: str, left_out: list[str]) -> None:
     right = offset_truth(120, 120)
-    known = torch.arange(120) % 3 > 0
-    pictures = drawn(short(), frames(0), frames(1), GroundTruth(right, known, right - 5))
-    assert list(pictures) == ALONE
-
-
-def test_a_truth_that_judges_nothing_gives_no_curve() -> None:
-    right = torch.full((120, 1), -1)
-    soft = torch.arange(120).expand(120, -1)  # whatever is reported
-    pictures = drawn(
-        short(), frames(0), frames(1), GroundTruth(right, torch.ones(120, dtype=torch.bool), soft)
-    )
-    assert list(pictures) == UNSCORED
-
-
-def test_a_route_without_layers_keeps_what_needs_none() -> None:
-    pictures = drawn(template_model(periods=Fixed()), frames(0), frames(1), same_places())
-    assert list(pictures) == ["coverage", "pr", "chunks"]
-
-
-def test_ready_features_have_no_frame_to_draw_on() -> None:
-    made = [HOG()(frames(seed)) for seed in (0, 1)]
-    assert list(drawn(short(), *made, same_places())) == [
-        name for name in ALONE if name not in ("pairs", "features")
-    ]
-
-
-def test_one_layer_has_no_partner() -> None:
-    model = template_model(periods=Fixed(layer(12, 0, 120, 0, 1, 2)))
-    pictures = drawn(model, frames(0), frames(1), same_places())
-    # the spectrogram is that of SpectrogramAnalysis
-    assert list(pictures) == ["pairs", "coverage", "scores", "pr", "chunks", "templates", "features"]
+    truths = {
+        "without truth": None,
+        "some unknown": GroundTruth(right, torch.arange(120) % 3 > 0, right - 5),
+        "nothing judged": GroundTruth(
+            right.clamp(max=-1), right[:, 0] >= 0, torch.arange(120).expand(120, -1)
+        ),
+    }
+    models = {
+        "one chunk": template_model(periods=SpectrogramAnalysis(window=120, min_period=4)),
+        "one layer": template_model(periods=Fixed(layer(12, 0, 120, 0, 1, 2))),
+        "no layers": template_model(periods=Fixed()),
+    }
+    made = [HOG()(frames(seed)) if case == "ready features" else frames(seed) for seed in (0, 1)]
+    pictures = drawn(models.get(case, short()), *made, truths.get(case, same_places()))
+    assert list(pictures) == [name for name in ALONE if name not in left_out]
+    if case == "one chunk":
+        numbers = pictures["activations"].numbers
+        assert [rate["outside"] for rate in (*numbers["layers"], numbers["fused"])] == [None] * 3
+        assert "lsewhere" not in pictures["activations"].caption
 
 
 def test_features_are_drawn_for_our_hog_only() -> None:
@@ -256,27 +240,6 @@ def test_the_frame_under_the_features_is_what_hog_sees() -> None:
     assert torch.equal(HOG(cell=4)(seen[None]), model.describe(frame[None]))
 
 
-def test_features_are_drawn_on_the_frame_as_hog_resizes_it() -> None:
-    model = template_model(HOG(cell=4, resize=(16, 40)), SpectrogramAnalysis(window=60, min_period=4))
-    pictures = drawn(model, frames(0, channels=3), frames(1, channels=3), None)
-    assert pictures["features"].plot[1].flat[0].images[0].get_array().shape == (16, 40)
-    assert "frame 30" in pictures["features"].caption
-
-
-@pytest.mark.parametrize(
-    ("plan", "leading"),
-    [
-        ((), []),
-        ((layer(4, 0, 20, 1),), [0]),
-        ((layer(4, 0, 20, 1), layer(5, 0, 20, 1, 2), layer(6, 0, 20, 1, 2, 3)), [2, 1]),
-        ((layer(4, 0, 30, 1), layer(4, 30, 50, 1), layer(6, 30, 50, 2)), [1, 2]),  # two layers before length
-        ((layer(4, 0, 10, 1), layer(5, 0, 10, 1), layer(4, 10, 30, 1), layer(6, 10, 30, 2)), [2, 3]),
-    ],
-)
-def test_leading_layers(plan: tuple[FrequencyLayer, ...], leading: list[int]) -> None:
-    assert leading_layers(plan) == leading
-
-
 def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain() -> None:
     wave = torch.sin(torch.arange(80) * 2 * torch.pi / 8)
     noise = torch.randn(80, 3)
@@ -284,16 +247,6 @@ def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain() -> No
     one = layer(8, 0, 80, 0, 1, 2, 3)
     templates = template_model(periods=Fixed(one)).learn_features(stored).map.blocks()[0]
     assert best_explained(stored, one, templates) == 2
-
-
-def test_best_phases_are_those_that_the_chunk_has() -> None:
-    # period 50 in a chunk of 20 frames from 10: phases 10..29; the others' templates are 0
-    stored = torch.randn(40, 6).abs() + 1
-    model = template_model(periods=Fixed(layer(50, 10, 30, *range(6)))).learn_features(stored)
-    queries = torch.cat([stored[10:30], torch.zeros(1, 6)])
-    best = best_phases(model.map, queries, 0)
-    assert best[:20].tolist() == list(range(10, 30))
-    assert 10 <= int(best[20]) < 30
 
 
 def test_slit_scan_holds_no_more_than_it_shows() -> None:

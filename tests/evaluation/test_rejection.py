@@ -10,7 +10,6 @@ from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import Fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.rejection import (
-    accepted_at,
     draw_reliability,
     rejection_facts,
     rejection_table,
@@ -44,13 +43,6 @@ def test_the_figures_of_a_rejection() -> None:
         "0.667",
         ["accepted of 4 frames of sea", "0.5000", "0.2500", "0.2500", "0.2500", "0.2500"],
     )
-
-
-def test_nothing_is_accepted_where_nothing_is_sure() -> None:
-    none = accepted_at(0.99, torch.tensor([0.5]), torch.tensor([True]))
-    assert (none.precision, none.kept) == (None, 0.0)
-    facts = rejection_facts(MATCH._replace(probability=MATCH.score / 2), TRUTH, 0, {})["rejection"]
-    assert rejection_table(facts)[1] == ["precision reached", *[""] * 5]
 
 
 def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:

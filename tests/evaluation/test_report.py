@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 
-from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import Picture, canvas
@@ -68,18 +67,6 @@ def test_a_curve_that_starts_late_has_a_star_and_the_star_is_explained(equal: bo
     assert one.as_json()["curve_starts_at_recall"] == ours.starts
 
 
-def test_a_match_without_truth_or_that_reports_nothing_is_a_contender_too() -> None:
-    one = contend("x", match([0.1]), None, 0, bytes=7)
-    assert (one.scores, one.curve, one.starts, one.bytes) == (None, None, None, 7)
-    silent = Match(torch.tensor([-1]), torch.tensor([torch.inf]), torch.tensor([False]))
-    nothing = contend("x", silent, torch.tensor([[0]]), 0)
-    assert nothing.starts is None
-    assert nothing.scores is not None
-    unknown = as_ground_truth(torch.tensor([[0]]))._replace(judged=torch.tensor([False]))
-    assert isinstance(unknown, GroundTruth)
-    assert contend("x", match([0.1]), unknown, 0).scores is None
-
-
 def test_bytes_per_place_stand_in_the_table_where_the_places_are_known() -> None:
     null = Contender("null", SCORES)
     head, ours, other = score_table(report({"frames": 32}, null=null))
@@ -91,13 +78,6 @@ def test_bytes_per_place_stand_in_the_table_where_the_places_are_known() -> None
     assert not any("bytes" in cell for cell in score_table(report())[0])
     for every in (False, True):
         assert len({len(row) for row in score_table(report({"frames": 32}, null=null), every)}) == 1
-
-
-def test_bytes_that_do_not_grow_with_the_route_stand_apart() -> None:
-    one = Contender("shared", SCORES, 4000, fixed=3200)
-    assert one.route_bytes == one.as_json()["route_bytes"] == 800
-    assert score_table(report({"frames": 32}, stride=one))[2][-2:] == ["125.0", "25.0"]
-    assert Contender("null", SCORES).route_bytes is None
 
 
 def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path: Path) -> None:
@@ -116,12 +96,6 @@ def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path: Path) -> None:
     assert sequence_table(report(null=aside)) == []
     assert "sequences" not in aside.as_json()
     assert "T = " not in written(tmp_path, report(null=aside))
-
-
-def test_frames_that_are_used_otherwise_are_listed_as_well() -> None:
-    row = Contender("every 2nd", SCORES, 100, 2)
-    other = Contender("between every 2nd", SCORES._replace(auc=0.9), 100, 2)
-    assert len(report(stride=row, interpolated=other).shown()) == 3
 
 
 def test_what_stores_the_same_frames_twice_is_listed_once() -> None:
@@ -144,11 +118,6 @@ def test_scores_are_those_of_the_columns() -> None:
     assert score_table(report())[1] == ["this map", "0.500", "0.750", "0.100"]
 
 
-def test_text_tables_are_aligned() -> None:
-    assert text_table([["", "AUC"], ["a map", "1"]]).splitlines() == ["       AUC", "a map    1"]
-    assert text_table([]) == ""
-
-
 def test_long_headings_of_a_text_table_take_several_lines() -> None:
     table = text_table([["", "AUC", "route bytes per place"], ["a map", "0.5", "5.0"]])
     assert table.splitlines() == [
@@ -156,12 +125,6 @@ def test_long_headings_of_a_text_table_take_several_lines() -> None:
         "       AUC    per place",
         "a map  0.5          5.0",
     ]
-
-
-def test_the_terminal_s_table_fits_a_hundred_and_ten_columns() -> None:
-    longest = Contender("same features, every 10th place (at least the map's bytes)", SCORES, 70560000, 10)
-    table = text_table(score_table(report({"frames": 10000}, stride=longest)))
-    assert max(len(line) for line in table.splitlines()) <= 110
 
 
 def test_the_summary_tells_what_was_scored() -> None:
@@ -244,12 +207,6 @@ def test_the_key_of_a_spectral_map(tmp_path: Path) -> None:
     for kind, words in (("spectral", ["lines", "strongest periods"]), ("templates", ["layer"])):
         below = written(tmp_path, report({"kind": kind})).partition("the map</h2>")[2]
         assert re.findall(r"<dt>([^<]+)</dt>", below) == words
-
-
-def test_the_words_of_the_last_table_are_explained_beside_it(tmp_path: Path) -> None:
-    below = written(tmp_path, report()).partition("all scores</h2>")[2]
-    assert re.findall(r"<dt>([^<]+)</dt>", below)[:3] == ["P@100R", "rep.", "recall"]
-    assert "TP / all</dd>" in below
 
 
 def test_report_json_has_the_facts_the_scores_and_an_entry_for_each_contender(tmp_path: Path) -> None:

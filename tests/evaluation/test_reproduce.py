@@ -22,7 +22,6 @@ from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.paper_tables import (
     PUBLISHED,
-    Published,
     boundary_lines,
     route_lines,
     section_five,
@@ -141,30 +140,6 @@ def test_section_five_sets_the_papers_numbers_beside_ours(aerial: Comparison) ->
     assert {len(row) for row in (head, paper, ideal, own, *others)} == {len(head)}
 
 
-@pytest.mark.slow
-def test_every_picture_of_the_paper_is_there(aerial: Comparison) -> None:
-    assert {"frames", "autocorrelogram", "layers", "pr", "auc", "coverage", "chunks"} < set(aerial.pictures)
-    assert {"spectrogram", "templates", "features", "activations"} < set(aerial.pictures)
-
-
-@pytest.mark.slow
-def test_each_dataset_tells_what_its_map_holds(aerial: Comparison) -> None:
-    facts = aerial.report.facts
-    (line,) = route_lines({"aerial": aerial.report})
-    assert "measured" not in line
-    assert f"{len(facts['periods'])} periods from {facts['periods'][0]} to {facts['periods'][-1]}" in line
-    nothing = aerial.report._replace(facts={**facts, "periods": [], "chunks": []})
-    assert "no periods in 0 chunks" in route_lines({"aerial": nothing})[0]
-
-
-@pytest.mark.slow
-def test_a_number_the_paper_does_not_tell_is_left_empty(aerial: Comparison) -> None:
-    report = aerial.report._replace(
-        facts={**aerial.report.facts, "published": Published(0.0032, None, 0.6998)._asdict()}
-    )
-    assert section_five({"x": report})[1][1:4] == ["0.0032", "", "0.6998"]
-
-
 def test_other_datasets_are_refused() -> None:
     with refused("'moon'", "expected aerial, outdoor, underground"):
         reproduce("moon")
@@ -267,24 +242,6 @@ def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
     assert {"velocity", "frames", "layers", "autocorrelogram"} < set(outdoor.pictures)
 
 
-@pytest.mark.slow
-def test_comparable_scores_are_means_on_the_same_map(outdoor: Comparison) -> None:
-    mapper = TemplateMapper(SpectrogramAnalysis(64, **PAPER))
-    model = DejaVu(mapper=mapper).learn_features(outdoor.run.reference_features)
-    index = model.localize(outdoor.run.query_features).index
-    right = (index[:, None] - outdoor.run.truth.positives).abs().amin(1) <= 5  # type: ignore[union-attr]
-    comparable = outdoor.report.contenders["comparable"].scores
-    assert comparable is not None
-    assert comparable.recall_at_1 == pytest.approx(float(right.float().mean()), abs=0.02)
-    assert outdoor.report.ours.scores != comparable
-
-
-@pytest.mark.slow
-def test_other_lengths_store_the_positions_of_the_frames_too(outdoor: Comparison) -> None:
-    row = outdoor.report.facts["chunk_lengths"][1]
-    assert (row["window"], row["map_bytes"]) == (64, outdoor.report.facts["map_bytes"])
-
-
 class Rails(ArrayTraverse):
     """A traverse that tells where structures start and stop, at half a metre a frame."""
 
@@ -362,10 +319,3 @@ def test_a_map_with_known_boundaries_is_learned_and_scored_as_any_other() -> Non
     assert maps["comparable"][0].scores == fixed
     assert known.scores is not None
     assert known.scores.recall_at_1 > fixed.recall_at_1
-
-
-def test_known_boundaries_need_a_ground_truth() -> None:
-    features = torch.randn(64, 4)
-    result = compare(ArrayTraverse(features, "a"), ArrayTraverse(features[:60], "b"))
-    with refused("need a ground truth"):
-        known_boundaries(result, [30], 5)

@@ -14,16 +14,12 @@ from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.pictures import (
     Localization,
-    better_places,
     draw_components,
     draw_pictures,
-    draw_sequences,
     draw_spectrum,
-    draw_storage,
-    equally_good,
 )
 from dejavu_torch.evaluation.report import PICTURES
-from dejavu_torch.evaluation.score_plots import Stored
+from dejavu_torch.evaluation.score_plots import Stored, draw_sequences, draw_storage
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of
@@ -101,25 +97,8 @@ def test_the_components_end_with_the_map_s_own_scores() -> None:
     assert "fit better" not in " ".join(texts(unscored.plot[0]))
 
 
-def test_wrong_places_that_fit_better() -> None:
-    scores = torch.tensor([0.1, 0.5, 0.3, 0.4, 0.2, 0.9])
-    assert better_places(scores, [2], 0) == 2
-    assert better_places(scores, [2], 1) == 2
-    assert better_places(scores, [2], 2) == 0
-    assert better_places(scores, [5, 3], 0) == 3
-
-
 def points(*pairs: tuple[float, float]) -> list[Stored]:
     return [Stored(size, area, area) for size, area in pairs]
-
-
-def test_the_same_area_is_looked_up_between_two_points() -> None:
-    ours = points((1, 0.5), (2, 0.7), (3, 0.7004), (4, 0.99))
-    others = points((2, 0.3), (8, 0.7), (32, 0.9))
-    found = equally_good(ours, others)  # the third gains nothing, the fourth is out of reach
-    assert [one for one, _ in found] == [1, 2]
-    assert [other for _, other in found] == pytest.approx([4, 8])
-    assert equally_good(ours, []) == equally_good([], others) == []
 
 
 def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
@@ -168,13 +147,6 @@ def test_the_areas_of_sequences_of_all_contenders_and_of_the_map_at_other_sizes(
     assert {"1", "5", "11", "right within 2 frames"} <= set(texts(figure))
     single = {"map": Contender("this map", None)}
     assert draw_sequences(single, [], 100, "2 frames") == {}
-
-
-def test_areas_beyond_the_axis_lie_on_its_ends() -> None:
-    contenders = {"map": Contender("this map", None, sequences=at(0, 0.5, 1))}
-    _, axis = draw_sequences(contenders, [], 10, "2 frames")["sequences"].plot
-    low, high = axis.get_ylim()
-    assert all(low < area < high for area in axis.lines[0].get_ydata())
 
 
 def test_every_picture_of_a_spectral_map() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from dejavu_torch import DejaVu, SequenceMatcher
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import Comparison, compare
-from dejavu_torch.evaluation.storage import noise_over_map, storage_curve
+from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.maps.spectral import SpectralMapper
 
 PLACES, NUMBERS = 400, 16
@@ -29,7 +29,9 @@ def route(seed: int) -> Tensor:
 @pytest.fixture(scope="module")
 def result() -> Comparison:
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
-    return compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=2)
+    return compare(
+        ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=2, storage_curve=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,7 @@ def test_the_curve_is_in_the_report(report: dict[str, Any]) -> None:
 
 
 def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, report: dict[str, Any]) -> None:
-    curve = storage_curve(result.run, [2.0])
+    curve = coded_at_sizes(result.run, [2.0])
     (ours,), (null,), (between,) = curve["map"], curve["null"], curve["interpolated"]
     assert ours.auc == report["auc"]
     assert ours.route_bytes_per_place == report["route_bytes_per_place"]
@@ -65,13 +67,13 @@ def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, rep
 def test_each_budget_is_evaluated_at_every_length() -> None:
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    found = compare(*pair, "0", model=model, tolerance=2, sequence=SequenceMatcher(5))
+    found = compare(*pair, "0", model=model, tolerance=2, sequence=SequenceMatcher(5), storage_curve=True)
     storage = found.report.as_json()["storage"]
     for key in ("map", "null", "interpolated"):
         for one in storage[key]:
             assert list(one["sequences"]) == ["1", "5", "11", "21"]
             assert one["sequences"]["5"] == {name: one[name] for name in ("auc", "recall_at_1")}
-    (own,) = storage_curve(found.run, [2.0])["map"]
+    (own,) = coded_at_sizes(found.run, [2.0])["map"]
     assert own.as_json()["sequences"] == found.report.as_json()["sequences"]
     assert "sequences" in found.pictures
 
@@ -87,7 +89,7 @@ def test_noise_as_smooth_as_the_route_costs_what_repetition_saves(report: dict[s
 
 
 def test_budgets_that_cannot_be_met_are_left_out(result: Comparison) -> None:
-    curve = storage_curve(result.run, [0.01, 1000.0])
+    curve = coded_at_sizes(result.run, [0.01, 1000.0])
     assert curve["map"] == curve["null"] == []
     # two keyframes at least; all frames at most
     assert [one.route_bytes_per_place for one in curve["interpolated"]] == [NUMBERS]
@@ -95,21 +97,13 @@ def test_budgets_that_cannot_be_met_are_left_out(result: Comparison) -> None:
 
 def test_what_has_no_curve_is_refused(result: Comparison) -> None:
     with refused("no ground truth", "spectral"):
-        storage_curve(result.run._replace(truth=None))
+        coded_at_sizes(result.run._replace(truth=None))
     with refused("'templates'", "spectral"):
-        storage_curve(result.run._replace(model=template_model().learn(route(0))))
+        coded_at_sizes(result.run._replace(model=template_model().learn(route(0))))
 
 
 def test_without_truth_there_is_no_curve() -> None:
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
-    unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model)
+    unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model, storage_curve=True)
     assert "storage" not in unscored.report.as_json()
     assert {"spectrum", "components"} <= unscored.pictures.keys()
-
-
-def test_route_bytes_stand_beside_all_bytes(report: dict[str, Any]) -> None:
-    assert report["route_bytes"] == report["map_bytes"] - report["fixed_bytes"]
-    for key, size in (("uncompressed", PLACES * NUMBERS * 4), ("stride", PLACES // 4 * NUMBERS)):
-        assert report[key]["route_bytes"] == report[key]["bytes"] == size  # nothing to whiten with
-    assert report["interpolated"]["route_bytes"] <= report["route_bytes"]
-    assert "route_bytes" not in report["null"]
