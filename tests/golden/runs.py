@@ -24,7 +24,7 @@ def _visits(route: str) -> tuple[str, str]:
 
 # {data} is DEJAVU_TEST_DATA; a whitening of 4 bits multiplies what another number of threads rounds otherwise
 RUNS: dict[str, tuple[str, ...]] = {
-    "demo": (*_visits("aerial?seed=0&frames=600"), "--whitening.bits", "16"),
+    "demo": (*_visits("aerial?seed=0&frames=600"), "--whitening.bits", "16", "--storage_curve"),
     "paper": (*_visits(f"aerial?frames=200&{SMALL}"), "--config", "paper", "--mapper.periods.window", "100"),
     "templates": (
         *_visits(f"aerial?seed=1&frames=256&{SMALL}"),
