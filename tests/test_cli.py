@@ -141,14 +141,11 @@ def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
     assert model.mapper.metric == "cosine"
 
 
-@pytest.mark.parametrize(
-    "templates", [TEMPLATES, ("--mapper", "TemplateMapper"), ("--mapper=TemplateMapper",)]
-)
-def test_parts_of_a_mapper_of_templates_as_options(templates: tuple[str, ...], tmp_path: Path) -> None:
+def test_parts_of_a_mapper_of_templates_as_options(tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
     np.save(tmp_path / "frames.npy", frames(64, size=16))
     window = "--mapper.periods.window", "32"
-    run("learn", tmp_path / "frames.npy", "--map", route, *templates, *window)
+    run("learn", tmp_path / "frames.npy", "--map", route, *TEMPLATES, *window)
     model = DejaVu.load(route)
     assert (model.mapper.periods.window, model.mapper.periods.peaks) == (32, "local")
     assert model.whitening is None
@@ -468,7 +465,11 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m.safetensors --features.cel 3": ("--features.cel", "not accepted"),
     "learn a.npy --map m.safetensors --features.bins soft": ("--features.bins is soft", "hard or linear"),
     "learn a.npy --map m.safetensors --features torch.nn.Linear": ("--features.in_features", "required"),
-    "learn a.npy --map m.safetensors --whitening some": ("--whitening is some", "Whitening", "or none"),
+    "learn a.npy --map m.safetensors --whitening some": (
+        "--whitening is some",
+        "Whitening",
+        "none or a map file",
+    ),
     "learn a.npy --map m.safetensors --whitening none --whitening.bits 4": (
         "--whitening.bits",
         "no settings",

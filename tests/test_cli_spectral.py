@@ -21,7 +21,6 @@ from helpers import refused
 from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.presets import with_configs
 from dejavu_torch.features import views
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -45,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def model_of(*words: str | Path) -> DejaVu:
-    model = parse("learn", run_learn, with_configs(["x", "--map", "y", *map(str, words)]))["model"]
+    model = parse("learn", run_learn, ["x", "--map", "y", *map(str, words)])["model"]
     assert isinstance(model, DejaVu)
     return model
 
@@ -246,12 +245,12 @@ OWNER = "has no such setting", "TemplateMapper has"
         (["--whitening", "dejavu_torch.HOG"], ("whitening", "dejavu_torch.HOG")),
         (["--whitening", "nowhere.safetensors"], ("nowhere.safetensors is not there",)),
         (["--whitening.colour", "1"], ("whitening", "colour")),
-        (["--mapper.periods.window", "64"], ("--mapper.periods.window: Spectral", *OWNER, "local_maxima")),
-        (["--mapper.reduction=sum"], ("--mapper.reduction: SpectralMapper", *OWNER)),
-        (["--mapper.step=1", *TEMPLATES], ("--mapper.step: TemplateMapper", "SpectralMapper has", "default")),
+        (["--mapper.periods.window", "64"], ("--mapper.periods: the chosen", *OWNER, "local_maxima")),
+        (["--mapper.reduction=sum"], ("--mapper.reduction: the chosen", *OWNER)),
+        (["--mapper.step=1", *TEMPLATES], ("--mapper.step: the chosen", "SpectralMapper has", "default")),
         (
             ["--mapper", "TemplateMapper", "--mapper.route_bytes_per_place", "2"],
-            ("route_bytes_per_place: Templ",),
+            ("route_bytes_per_place: the chosen",),
         ),
         (["--second_truth", "0"], ("--second_truth 0", "--second")),
         (["--second", "nowhere"], ("nowhere is not there",)),

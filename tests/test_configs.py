@@ -18,7 +18,7 @@ from helpers import refused
 from dejavu_torch import DejaVu, InputError
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.presets import check_config, find_config, preset_names, with_configs
+from dejavu_torch.cli.presets import check_config, check_word, find_config, preset_names
 from dejavu_torch.evaluation.reproduce import paper_model
 from dejavu_torch.model_file import PARTS, recipe_of
 
@@ -27,7 +27,7 @@ PRESETS = ["default", "local_maxima", "paper"]
 
 
 def model_of(name: str) -> DejaVu:
-    model = parse("learn", run_learn, with_configs(["x", "--map", "y", "--config", name]))["model"]
+    model = parse("learn", run_learn, ["x", "--map", "y", "--config", name])["model"]
     assert isinstance(model, DejaVu)
     return model
 
@@ -90,17 +90,15 @@ def test_a_preset_is_found_by_name_from_anywhere(tmp_path: Path, monkeypatch: py
 
 
 def test_a_config_stands_in_its_place() -> None:
-    found = with_configs(
-        ["fit", "--config", "paper", "-c", "default", "--config=train_small", "--other", "paper"]
-    )
-    paths = [str(find_config(name)) for name in ("paper", "default", "train_small")]
-    named = ["--config", paths[0], "--config", paths[1], f"--config={paths[2]}"]
-    assert found == ["fit", *named, "--other", "paper"]
+    """Ahead of the options, which overrule it; the last of several counts."""
+    words = ["--batch_size", "9", "x", "--config", "paper", "--config=local_maxima", "--map", "y"]
+    model = parse("learn", run_learn, words)["model"]
+    assert (model.mapper.periods.peaks, model.batch_size) == ("local", 9)
 
 
 def test_a_config_without_a_name_is_refused() -> None:
-    with refused("--config", "last word"):
-        with_configs(["in.npy", "--config"])
+    with refused("--config", "expected one argument"):
+        parse("learn", run_learn, ["in.npy", "--config"])
 
 
 @pytest.mark.slow
@@ -165,22 +163,21 @@ def test_a_config_that_is_none_is_refused_ahead_of_the_loader(
 ) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    for command in (["--config", str(path)], ["fit", "-c", str(path)], [f"--config={path}"]):
-        with refused("mine.yaml", words, "expected a YAML file of options"):
-            with_configs(command)
+    with refused("mine.yaml", words, "expected a YAML file of options"):
+        parse("learn", run_learn, ["x", "--map", "y", f"--config={path}"])
 
 
 def test_a_config_calls_nothing_by_its_tags(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(f"a: !!python/object/apply:os.mkdir ['{tmp_path / 'ran'}']\n")
     with refused("mine.yaml", "no YAML"):
-        with_configs(["--config", str(tmp_path / "mine.yaml")])
+        parse("learn", run_learn, ["x", "--map", "y", "--config", str(tmp_path / "mine.yaml")])
     assert not (tmp_path / "ran").exists()
 
 
 def test_a_config_is_a_regular_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     with refused("fifo is no regular file"):
-        with_configs(["--config", str(tmp_path / "fifo")])
+        parse("learn", run_learn, ["x", "--map", "y", "--config", str(tmp_path / "fifo")])
     for name in (str(tmp_path), "a\0b", "a" * 5000, ""):
         with refused("--config"):
             find_config(name)
@@ -195,6 +192,7 @@ def test_a_word_of_more_than_an_option_can_mean_is_refused() -> None:
     flow = "{" + aliases(10).replace("\n", ", ") + "}"
     for word in (flow, f"--mapper={flow}", "[" * 100_000):
         with refused("expected"):
-            with_configs(["--seed", word])
+            check_word(word)
     plain = ["sim:aerial?frames=64&seed=*", "--features.x=a&b*c: [", "a*&b"]
-    assert with_configs(plain) == plain
+    for word in plain:
+        check_word(word)

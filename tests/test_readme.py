@@ -14,9 +14,8 @@ import torch
 
 from benchmarks.__main__ import BENCHES
 from dejavu_torch import DejaVu, ImposedPeriods, PlaceFilter, TemplateMapper
-from dejavu_torch.cli import _spelt_out, commands, train
-from dejavu_torch.cli.parser import UsageError, command_parser, without_whitening_map
-from dejavu_torch.cli.presets import with_configs
+from dejavu_torch.cli import commands, train
+from dejavu_torch.cli.parser import UsageError, command_parser
 from dejavu_torch.features.cnn import SmallCNN
 
 ROOT = Path(__file__).parents[1]
@@ -106,9 +105,7 @@ def understand(line: str) -> None:
     name, *words = shlex.split(line, comments=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)  # where the configs lie
-        words = _spelt_out(with_configs(words))
         if program != "dejavu" or name != "train":
-            words, _ = without_whitening_map(words) if program == "dejavu" else (words, None)
             parser_of(program, name).parse_args(words)
             return
         patch.setattr(train, "TrainCLI", ParseOnly)

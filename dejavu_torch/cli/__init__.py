@@ -26,7 +26,6 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
     "export": "write a map, and what is ahead of it, as an ONNX file",
     "info": "what is in a map",
 }
-BARE = {"--velocity": "GroundOdometry", "--page": "8765"}  # what an option without a value means
 LONGEST = 300  # characters of a message of torch's
 
 
@@ -104,16 +103,15 @@ def run_command(given: Sequence[str]) -> None:
     with errors_of_one_line(given):
         from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
         from dejavu_torch.cli.parser import COMMAND, parse
-        from dejavu_torch.cli.presets import with_configs
 
-        name, words = given[0], with_configs(given[1:])
+        name, words = given[0], given[1:]
         if name == "train":  # Lightning's own command line
             from dejavu_torch.cli.train import run_train
 
-            run_train([*words[:1], *_config_first(words[1:])])
+            run_train(words)
             return
         function = getattr(commands, f"run_{name}")
-        chosen = parse(name, function, _config_first(_spelt_out(words)))
+        chosen = parse(name, function, words)
         if COMMAND in function.__annotations__:
             import shlex
 
@@ -169,30 +167,6 @@ def overview(word: str) -> NoReturn:
     else:
         fail(f"{word!r} is no command; expected one of {', '.join(COMMANDS)} (see --help)")
     raise SystemExit(0)
-
-
-def _spelt_out(words: Sequence[str]) -> list[str]:
-    """The command line with a bare --velocity given the one value it can have, a bare --page its port, and
-    the options of a template mapper's periods the class that they are of, where nothing else says it."""
-    spelt = [
-        f"{word}={BARE[word]}" if word in BARE and after.startswith("--") else word
-        for word, after in pairwise([*words, "--"])
-    ]
-    named = any(word.partition("=")[0] in ("--config", "--mapper.periods") for word in words)
-    first = next((i for i, word in enumerate(spelt) if word.startswith("--mapper.periods.")), None)
-    if first is not None and not named and any(word.endswith("TemplateMapper") for word in words):
-        spelt.insert(first, "--mapper.periods=SpectrogramAnalysis")
-    return spelt
-
-
-def _config_first(words: Sequence[str]) -> list[str]:
-    """The command line with its config files ahead of the options, which then have the last word."""
-    config = [
-        word.startswith("--config=") or word == "--config" or before == "--config"
-        for before, word in pairwise(["", *words])
-    ]
-    first = [word for word, is_config in zip(words, config, strict=True) if is_config]
-    return first + [word for word, is_config in zip(words, config, strict=True) if not is_config]
 
 
 def fail(message: str) -> NoReturn:

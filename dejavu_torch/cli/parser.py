@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import pydoc
 import re
@@ -13,8 +14,10 @@ from typing import Any, Literal, NoReturn, cast, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
+from jsonargparse.typing import restricted_string_type
 from torch import nn
 
+from dejavu_torch.cli.presets import check_config, check_word, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hog import HOG
@@ -39,6 +42,8 @@ HINT = (
     "the features that it was learned from; --descriptor takes those alone, from a map or from what "
     "`dejavu train` makes of several routes."
 )
+BARE = {"velocity": "GroundOdometry", "page": 8765}  # what an option without a value means
+MapFile = restricted_string_type("MapFile", r".*\.safetensors")
 MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 NETWORKS = ("features", "backbone", "network")  # options that name a class, or a function that makes one
 WORDS = {  # what values of Python's types are on a command line
@@ -47,6 +52,7 @@ WORDS = {  # what values of Python's types are on a command line
     "bool": "true or false",
     "str": "a word",
     "Path": "a path",
+    "MapFile": "a map file",
     "Module": "a class or function by its import path, such as dejavu_torch.HOG",
     **dict.fromkeys(("list", "tuple", "Sequence"), "a list, such as [1, 2]"),
     **dict.fromkeys(("dict", "Mapping"), "settings, as KEY: VALUE"),
@@ -151,23 +157,44 @@ class HelpFormatter(jsonargparse.DefaultHelpFormatter):
         return text + (")" if cut else "")
 
 
+class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
+    """--config: a preset by its name, or a YAML file of options."""
+
+    def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
+        path = find_config(values)
+        check_config(path)
+        super().__call__(parser, cfg, str(path), option_string)
+
+
 class Parser(jsonargparse.ArgumentParser):
-    """An argument parser whose errors are UsageErrors of one line."""
+    """A parser whose errors are UsageErrors of one line, and whose options overrule its --config."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        # nor is --conf taken for --config, which is looked for ahead of the parser
         super().__init__(*args, formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, *rest: Any, **settings: Any
     ) -> Any:
+        for word in args or ():
+            check_word(word)
         # a null for a part of a part is handed to the parser of that part as None
         words = args and with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args])
-        parsed = super().parse_args(words, *rest, **settings)
+        parsed = super().parse_args(words and self._config_first(words), *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
             if any(abs(number) > LARGEST for number in whole_numbers(value)):
                 self.error(f"--{key} is {value}; expected whole numbers of at most {LARGEST}")
         return parsed
+
+    def _config_first(self, words: Sequence[str]) -> Sequence[str]:
+        names = [name for name in ("-c", "--config") if name in self._option_string_actions]
+        if not names:
+            return words
+        reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        reader.error = self.error  # type: ignore[method-assign]
+        reader.add_argument(*names, action="append", default=[])
+        start = 1 if self._subparsers is not None else 0  # behind the subcommand
+        found, others = reader.parse_known_args(words[start:])
+        return [*words[:start], *(f"--config={name}" for name in found.config), *others]
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         head, required, names = message.partition("required: ")
@@ -280,10 +307,12 @@ def add_option(parser: Parser, parameter: inspect.Parameter, helps: Mapping[str,
         settings["type"] = parameter.annotation
         if default is not parameter.empty:
             settings["default"] = default
-            settings |= {} if keyword else {"nargs": "?"}
+            settings |= {} if keyword and parameter.name not in BARE else {"nargs": "?"}
         elif keyword:
             settings["required"] = True
-    parser.add_argument(f"--{parameter.name}" if keyword else parameter.name, **settings)
+    action = parser.add_argument(f"--{parameter.name}" if keyword else parameter.name, **settings)
+    if parameter.name in BARE:
+        action.const = BARE[parameter.name]
 
 
 def grouped(function: Callable[..., None], arguments: dict[str, Any]) -> dict[str, Any]:
@@ -300,9 +329,14 @@ def add_model(parser: Parser) -> None:
     """Every argument of DejaVu as an option, and --config."""
     parser.description = f"{parser.description} {HINT}"
     parser.add_argument(
-        "--config", action="config", help="preset (default, local_maxima, paper) or YAML file"
+        "-c", "--config", action=Preset, help="preset (default, local_maxima, paper) or YAML file"
     )
-    parser.add_class_arguments(DejaVu, None)
+    parser.add_class_arguments(DejaVu, None, skip={"whitening", "velocity"})
+    helps = described(DejaVu)[1]
+    parameters = inspect.signature(DejaVu, eval_str=True).parameters
+    for name, also in (("whitening", MapFile), ("velocity", None)):
+        one = parameters[name]
+        add_option(parser, one.replace(kind=one.KEYWORD_ONLY, annotation=one.annotation | also), helps)
     parser.set_defaults(DEFAULT_PARTS)
 
 
@@ -314,98 +348,96 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         InputError: what the constructor of a part refuses.
     """
     parser = command_parser(name, function)
-    words, whitening = without_whitening_map(words) if MODEL in function.__annotations__ else (words, None)
+    told = [word.lstrip("-").partition("=")[0] for word in words if word.startswith("--")]
     try:
         parsed = parser.parse_args(list(words))
     except UsageError as error:
-        clearer = _of_another_mapper(parser, words) if MODEL in function.__annotations__ else None
-        raise (UsageError(clearer) if clearer else error) from error
+        if MODEL in function.__annotations__:
+            _explain(str(error), words, told)
+        raise
     try:
         arguments: dict[str, Any] = parser.instantiate(parsed).as_dict()
     except Exception as error:
         raise refusal(error) from error
     if MODEL in function.__annotations__:
-        settings = list(inspect.signature(DejaVu).parameters)
-        changed = [one for one in settings if parsed[one] != parser.get_defaults()[one]]
-        lost = set(changed) - {"features", "threshold", "precision"}  # a map has all but these itself
-        told = [word.lstrip("-").partition("=")[0] for word in words if word.startswith("--")]
-        given = {"compare": "map", "learn": "append"}.get(name)  # a map that is taken as it is
-        if given and arguments[given]:
-            taken = ("second", "second_truth", "descriptor")
-            lost |= {one for one in taken if arguments[one] is not None}
-            lost |= {"whitening"} if whitening else set()
-            lost |= {"seed"} if given == "append" and arguments["seed"] else set()
-            if lost:
-                named = (one.partition(".")[0] for one in told)
-                one = next((one for one in named if one in lost), "whitening" if whitening else "config")
-                there = "a --map" if given == "map" else f"the map of --{given}"
-                raise UsageError(f"--{one}: {there} has its own settings; expected one or the other")
-        if name == "learn":
-            needed = {
-                "source": arguments["sources"] or (arguments["append"] and arguments["average"]) or None,
-                "--map": arguments["map"] or arguments["append"],
-            }
-            missing = ", ".join(one for one, value in needed.items() if value is None)
-            if missing:
-                raise UsageError(f"the following arguments are required: {missing}")
-        arguments.pop("config")
-        if whitening:
-            _check_own(whitening, told, "whitening")
-        if arguments.get("descriptor"):
-            _check_own(arguments["descriptor"], told, "descriptor")
-        both = [arguments[one] for one in ("threshold", "precision")]
-        if None not in both:
-            raise UsageError("--threshold {:g} and --precision {:g}; expected one of them".format(*both))
-        model = arguments[MODEL] = DejaVu(**{one: arguments.pop(one) for one in settings})
-        if whitening:
-            written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"
-            check_not_read(written, whitening)
-            _take(model, whitening, told, "whitening")
-        if arguments.get("descriptor"):
-            if whitening:
-                seen = f"--whitening {whitening} has its own features"
-                raise UsageError(f"{seen}; expected it or --descriptor {arguments['descriptor']}")
-            _take(model, arguments["descriptor"], told, "descriptor")
+        defaults = parser.get_defaults()
+        changed = {one for one in inspect.signature(DejaVu).parameters if parsed[one] != defaults[one]}
+        _check_settings(name, arguments, changed, told)
+        arguments[MODEL] = _model_of(name, arguments, told)
     return grouped(function, arguments)
 
 
-def _of_another_mapper(parser: Parser, words: Sequence[str]) -> str | None:
-    """The first option of a mapper that the chosen mapper does not have and another has, if there is one."""
-    rest, settings = [], []
-    for before, word in pairwise(["", *words]):
-        if word.startswith("--mapper."):
-            settings.append(word.partition("=")[0])
-        elif word.startswith("--") or not before.startswith("--mapper.") or "=" in before:
-            rest.append(word)  # and not the value of such an option
-    try:
-        chosen = parser.parse_args(rest).mapper.class_path.rpartition(".")[2]
-    except UsageError:
-        return None
-    known = {mapper.__name__: inspect.signature(mapper).parameters for mapper in MAPPERS}
-    for setting in settings if chosen in known else []:
-        name = setting.split(".")[1]
-        having = [mapper for mapper in MAPPERS if name in known[mapper.__name__]]
-        if having and name not in known[chosen]:
-            return (
-                f"{setting}: {chosen} has no such setting; {having[0].__name__} has, as with "
-                f"--config {MAPPERS[having[0]]}"
+def _explain(message: str, words: Sequence[str], told: Sequence[str]) -> None:
+    """Say more than the parser where an option is of another mapper, or of what a file brings.
+
+    Args:
+        told: options of the command line.
+    """
+    pattern = r"--mapper\b.*?(?:unrecognized arguments: --mapper\.(\w+)|'(\w+)' is not accepted)"
+    unknown = re.match(pattern, message)
+    name = unknown and (unknown[1] or unknown[2])
+    for mapper, preset in MAPPERS.items():
+        if name in inspect.signature(mapper).parameters:
+            has = f"{mapper.__name__} has it, as with --config {preset}"
+            raise UsageError(f"--mapper.{name}: the chosen mapper has no such setting; {has}")
+    if message.startswith(("--whitening cannot be had", "--whitening is NestedArg")):
+        for option, value in pairwise(" ".join(words).replace("--whitening=", "--whitening ").split(" ")):
+            if option == "--whitening" and value.endswith(".safetensors"):
+                _check_own(Path(value), told, "whitening")
+
+
+def _check_settings(name: str, arguments: dict[str, Any], changed: set[str], told: Sequence[str]) -> None:
+    """Refuse settings beside a map that has its own, and a command to learn without source or file.
+
+    Args:
+        changed: arguments of DejaVu that are not the default. told: options of the command line.
+    """
+    both = [arguments[one] for one in ("threshold", "precision")]
+    if None not in both:
+        raise UsageError("--threshold {:g} and --precision {:g}; expected one of them".format(*both))
+    given = {"compare": "map", "learn": "append"}.get(name)  # a map that is taken as it is
+    if given and arguments[given]:
+        lost = changed - {"features", "threshold", "precision"}
+        taken = ("second", "second_truth", "descriptor", *["seed"] * (given == "append"))
+        lost |= {one for one in taken if arguments[one]}
+        if lost:
+            named = (one.partition(".")[0] for one in told)
+            one = next((one for one in named if one in lost), "config")
+            there = "a --map" if given == "map" else f"the map of --{given}"
+            raise UsageError(f"--{one}: {there} has its own settings; expected one or the other")
+    if name == "learn":
+        needed = {
+            "source": arguments["sources"] or (arguments["append"] and arguments["average"]) or None,
+            "--map": arguments["map"] or arguments["append"],
+        }
+        missing = ", ".join(one for one, value in needed.items() if value is None)
+        if missing:
+            raise UsageError(f"the following arguments are required: {missing}")
+
+
+def _model_of(name: str, arguments: dict[str, Any], told: Sequence[str]) -> DejaVu:
+    """The model that the arguments, which lose what it takes, describe."""
+    del arguments["config"]
+    settings = {one: arguments.pop(one) for one in inspect.signature(DejaVu).parameters}
+    files: dict[Literal["whitening", "descriptor"], Path] = {}
+    if isinstance(settings["whitening"], MapFile):
+        files["whitening"] = Path(settings["whitening"])
+        settings["whitening"] = None
+    if arguments.get("descriptor"):
+        files["descriptor"] = arguments["descriptor"]
+    for what, path in files.items():
+        _check_own(path, told, what)
+    model = DejaVu(**settings)
+    if len(files) == 2:
+        seen = f"--whitening {files['whitening']} has its own features"
+        raise UsageError(f"{seen}; expected it or --descriptor {files['descriptor']}")
+    for what, path in files.items():
+        if what == "whitening":
+            check_not_read(
+                arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors", path
             )
-    return None
-
-
-def without_whitening_map(words: Sequence[str]) -> tuple[list[str], Path | None]:
-    """The words without `--whitening MAP`, and the map."""
-    kept: list[str] = []
-    whitening = None
-    for word in words:
-        if kept and kept[-1] == "--whitening" and not word.startswith("--"):
-            word = f"{kept.pop()}={word}"
-        if word.startswith("--whitening="):
-            value = word.partition("=")[2]
-            whitening = Path(value) if value.endswith(".safetensors") else None
-            word = "--whitening=null" if whitening else word
-        kept.append(word)
-    return kept, whitening
+        _take(model, path, told, what)
+    return model
 
 
 def _check_own(path: Path, told: Sequence[str], what: Literal["whitening", "descriptor"]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
@@ -120,26 +119,3 @@ def check_word(word: str) -> None:
             pass
         except ValueError as error:
             raise InputError(f"{word}: {error}; expected a value as an option has") from error
-
-
-def with_configs(words: Sequence[str]) -> list[str]:
-    """A command line with the path of each config in place of a preset's name.
-
-    Raises:
-        InputError: see `find_config`, or a word too long for any option.
-    """
-    found = list(words)
-    if words and words[-1] in ("--config", "-c"):
-        raise InputError(f"{words[-1]} is the last word; expected a YAML file or a preset behind it")
-    for i, word in enumerate(words):
-        check_word(word)
-        if word.startswith("--config="):
-            path = find_config(word.removeprefix("--config="))
-            found[i] = f"--config={path}"
-        elif i and words[i - 1] in ("--config", "-c"):
-            path = find_config(word)
-            found[i - 1 : i + 1] = "--config", str(path)
-        else:
-            continue
-        check_config(path)
-    return found

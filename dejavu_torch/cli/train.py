@@ -23,7 +23,7 @@ from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from dejavu_torch.cli.commands import features_words, print_map
-from dejavu_torch.cli.parser import Parser, refusal
+from dejavu_torch.cli.parser import Parser, Preset, refusal
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
 from dejavu_torch.features.embedding import Embedding
@@ -139,7 +139,7 @@ class TrainCLI(LightningCLI):
         """A parser whose errors are one line."""
         parser = TrainParser(**kwargs)
         parser.add_argument(
-            "-c", "--config", action="config", help="YAML file or preset; its keys are the options below"
+            "-c", "--config", action=Preset, help="YAML file or preset; its keys are the options below"
         )
         return parser
 

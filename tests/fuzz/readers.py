@@ -33,7 +33,7 @@ from torch import Tensor
 from dejavu_torch import cli
 from dejavu_torch.cli import commands, live, train
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.presets import FOLDER, with_configs
+from dejavu_torch.cli.presets import FOLDER
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.camera import Camera
 from dejavu_torch.data.ground_truth import find_ground_truth
@@ -419,7 +419,7 @@ def config(case: Case) -> None:
     if random.random() < 0.1:
         chosen = mutate_text(random, "local_maxima").decode(errors="surrogateescape").replace("\0", "")
     case.begin()
-    parse(name, getattr(commands, f"run_{name}"), with_configs([*words, "--config", chosen]))
+    parse(name, getattr(commands, f"run_{name}"), [*words, "--config", chosen])
 
 
 LINES = [
