@@ -28,8 +28,10 @@ from dejavu_torch.cli.options import (
     Judging,
     Learning,
     LiveSearches,
+    Loading,
     Searches,
     Sequences,
+    load_map,
     truth_by,
 )
 from dejavu_torch.data.chain import chained
@@ -44,7 +46,7 @@ from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.model_file import NO_MAP, REGISTRY, recipe_of, with_parts
+from dejavu_torch.model_file import REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration
@@ -122,54 +124,43 @@ def run_learn(
         cluster: Ray workers that make the chunks of a long route: auto, one for each processor of this
             machine, or the address of a cluster. Sources are read there, by the same paths
     """
-    append, average, calibration = growing.append, growing.average, learning.calibration
+    append, average = growing.append, growing.average
     where, map = device_of(learning.device, learns=True), append if map is None else map
-    given = model.precision
     assert map is not None  # the parser has seen to it
-    if append is None:
-        model.to(where)
-    else:
-        model = _map_to_append_to(append, model, len(sources) > 0).to(where)
-    precision = f"--precision {given}" if given is not None else f"the map's precision, {model.precision},"
+    given = model.precision
+    model = (model if append is None else _map_to_append_to(append, model, len(sources) > 0)).to(where)
     if cluster is not None:
         _check_cluster(cluster, learning.device)
         _check_chunks(cluster, model)
     _check_map_name(map)
     check_output_file(map)
     check_not_read(map, *sources, learning.second, *learning.files, average, growing.average_truth)
-    if calibration == NO_CALIBRATION and model.precision is not None:
+    precision = f"--precision {given}" if given is not None else f"the map's precision, {model.precision},"
+    if learning.calibration == NO_CALIBRATION and model.precision is not None:
         seen = f"{precision} with --calibration none"
         raise InputError(f"{seen}; expected one of them, as --threshold replaces the precision")
     learning.seed_whitening(model)
-    growing.check(sources, calibration)
-    visits: Views | None = None
-    if sources:
-        chain = chained([open_source(one) for one in sources])
-        traverse = model.resample(chain, model.step, True, model.frame_shape)
-        _print_steps(traverse)
-        traverse, views = learning.with_second(model, traverse)
-        visits = growing.visits(model, traverse) if average is not None else None
-        learning.check_precision(model, traverse, precision)
+    growing.check(sources, learning.calibration)
+    traverse, views, visits = _to_learn(sources, model, growing, learning)
+    shown = visits.traverse if traverse is None else traverse
+    learning.check_precision(model, shown, precision)
+    known: Views | None = None
+    if traverse is not None:
         traverse, known = learning.with_calibration(model, traverse)
-    else:
-        visits = growing.visits(model, None)
-        traverse, views = visits.traverse, None
-        learning.check_precision(model, traverse, precision)
-        known = None
-        if calibration not in UNREAD:
-            with truth_by("--calibration_truth"):
-                further = open_source(str(calibration))
-                known = growth.associate(model, None, further, learning.calibration_truth)
+        shown = traverse
+    elif learning.calibration not in UNREAD:
+        with truth_by("--calibration_truth"):
+            further = open_source(str(learning.calibration))
+            known = growth.associate(model, None, further, learning.calibration_truth)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
     with _coding(cluster) as code:
-        if append is not None and sources:
+        if append is not None and traverse is not None:
             growth.append(model, traverse, progress=True, checkpoint=checkpoint, code=code, visits=visits)
             places = torch.arange(start, model.map.places)
             known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
             done = f"{len(places)} places behind the {start} of {append}; written to {map}"
-        elif append is not None:
-            assert visits is not None
+        elif traverse is None:
             checkpoint.check_unused()
             count, places = growth.average(model, visits, progress=True), visits.places
             done = f"{count} of the {start} places of {append}"
@@ -178,11 +169,11 @@ def run_learn(
             growth.learn_mean(model, traverse, visits, True, views, checkpoint, code)
         else:
             model.learn(traverse, progress=True, second=views, checkpoint=checkpoint, code=code)
-            if cluster is not None and model.map.places <= SHORT:
-                seen = f"{model.map.places} frames are learned here"
-                print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
-    if calibration != NO_CALIBRATION:
-        growth.calibrate_if_possible(model, traverse, known, places)
+    if cluster is not None and append is None and model.map.places <= SHORT:
+        seen = f"{model.map.places} frames are learned here"
+        print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
+    if learning.calibration != NO_CALIBRATION:
+        growth.calibrate_if_possible(model, shown, known, places)
     model.matching()
     model.save(map)
     checkpoint.remove()
@@ -195,6 +186,20 @@ def run_learn(
         print("next: try more frames, another --preprocess.contrast, or `dejavu train fit`")
 
 
+def _to_learn(
+    sources: Sequence[str], model: DejaVu, growing: Growth, learning: Learning
+) -> tuple[Traverse | None, Views | None, Any]:
+    """The traverse to learn, what whitening learns from, and visits to average in; the first and either of
+    the others are None where they are not asked for."""
+    if not sources:
+        return None, None, growing.visits(model, None)
+    chain = chained([open_source(one) for one in sources])
+    traverse = model.resample(chain, model.step, True, model.frame_shape)
+    _print_steps(traverse)
+    traverse, views = learning.with_second(model, traverse)
+    return traverse, views, growing.visits(model, traverse) if growing.average is not None else None
+
+
 def run_localize(
     map: Path,
     source: str,
@@ -203,12 +208,10 @@ def run_localize(
     acceptance: Acceptance,
     top: int | None = None,
     corners: list[list[float]] | None = None,
-    as_is: bool = False,
     sequences: Searches,
     search: Search = "auto",
     cluster: str | None = None,
-    device: str = "cpu",
-    features: nn.Module | None = None,
+    loading: Loading,
 ) -> None:
     """Find the frames of a source on a map.
 
@@ -219,14 +222,11 @@ def run_localize(
         top: write so many places of each query, no two within 5 of each other, a row each with its rank; a
             probability is that of the first
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
-        as_is: take the frames as they are, though the map's are resampled
         search: of single queries: scan scores all places; auto also, unless the map has a faster way to the
             same places
         cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
-        device: what computes: cpu, cuda, cuda:1 or mps
-        features: class of the map's features, if not ours
     """
-    where = device_of(device)
+    device_of(loading.device)
     check_output_file(out)
     check_not_read(out, map, source)
     matcher = sequences.matcher(APART, acceptance.threshold)
@@ -234,19 +234,17 @@ def run_localize(
     if top is not None:
         check_candidates(top, APART)
     if cluster is not None:
-        _check_cluster(cluster, device)
+        _check_cluster(cluster, loading.device)
         if sequences.filter or sequences.sequence != 1:
             together = "--filter" if sequences.filter else f"--sequence {sequences.sequence}"
             raise InputError(f"--cluster {cluster} and {together}; expected one of them")
-    model = _load_map(map, features).to(where)
+    model = loading.model(map)
     if corners is not None:
-        if as_is or model.velocity is None or model.step is None:
-            why = "--as_is measures no ground" if as_is else f"{map} was learned without --velocity"
+        if model.velocity is None or model.step is None:
+            why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
             raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
         check_corners(corners)
         model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
-    if as_is:
-        model.velocity = None
     acceptance.of(model)
     if top is not None:
         check_candidates(top, APART, model.map.places)
@@ -287,9 +285,7 @@ def run_live(
     reference: str | None = None,
     realtime: bool = False,
     timeout: float = 10.0,
-    as_is: bool = False,
-    device: str = "cpu",
-    features: nn.Module | None = None,
+    loading: Loading,
 ) -> None:
     """Find frames as they come: a line of JSON for each on stdout, a summary on stderr at the end.
 
@@ -306,23 +302,18 @@ def run_live(
         realtime: take the frames of a video at their times, and drop those that come too fast
         timeout: seconds without a frame after which a camera, address or pipe, the only ones it is for, has
             stalled
-        as_is: take the frames as they are, though the map's are resampled
-        device: as of `dejavu localize`
-        features: class of the map's features, if not ours
     """
     from dejavu_torch.cli.live import follow
     from dejavu_torch.data.camera import without_password
 
-    where = device_of(device)
+    device_of(loading.device)
     if reference is not None and page is None:
         raise InputError(f"--reference {reference} without --page; expected both")
     if not 0 < timeout <= threading.TIMEOUT_MAX:
         raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
     matcher = sequences.matcher(APART, acceptance.threshold)
     acceptance.check(matcher)
-    model = _load_map(map, features).to(where)
-    if as_is:
-        model.velocity = None
+    model = loading.model(map)
     acceptance.of(model)
     model.matching(matcher)
     follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
@@ -365,7 +356,7 @@ def run_compare(
         model.threshold = None  # of distances: that of the filter is none for the map to keep
     if map is not None:
         given = model
-        model = _load_map(map, None if isinstance(given.features, HOG) else given.features)
+        model = load_map(map, None if isinstance(given.features, HOG) else given.features)
         if model.map.routes:
             names = ", ".join(route.name for route in model.map.routes)
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
@@ -514,7 +505,7 @@ def run_export(
     check_output_file(onnx)
     check_not_read(onnx, map)
     matcher = sequences.matcher(APART, threshold)
-    model = _load_map(map, features)
+    model = load_map(map, features)
     Acceptance(threshold).of(model)
     if matcher is not None and model.precision is not None:
         seen = f"the map's precision, {model.precision}, is of single frames in an ONNX file"
@@ -546,7 +537,7 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
             raise InputError(f"{path} and {twice} are one file; expected each map once")
     if len(maps) < 2:
         raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
-    models = [_load_map(path, copy.deepcopy(features)) for path in maps]
+    models = [load_map(path, copy.deepcopy(features)) for path in maps]
     try:
         model = growth.merge(models, [path.stem for path in maps])
     except InputError as error:
@@ -655,20 +646,12 @@ def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
         places: whether places are to be appended, not only visits averaged in.
     """
     default = recipe_of(given.features) == recipe_of(HOG())
-    model = _load_map(path, None if default else given.features)
+    model = load_map(path, None if default else given.features)
     try:
         growth.one_route(model, "append to" if places else "average visits into")
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     Acceptance(given.threshold, given.precision).of(model)
-    return model
-
-
-def _load_map(path: Path, features: nn.Module | None = None) -> DejaVu:
-    """As `DejaVu.load`; a descriptor is refused, which finds nothing by itself."""
-    model = DejaVu.load(path, features)
-    if not model.map.places:
-        raise InputError(f"{path} is {NO_MAP.replace('FILE', str(path))}")
     return model
 
 

@@ -8,11 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torch import nn
+
 from dejavu_torch import growth
+from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.chain import parts_of
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu, check_precision
+from dejavu_torch.model_file import NO_MAP
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -87,6 +91,35 @@ class LiveSearches(Searches):
     def __post_init__(self) -> None:
         self.filter = self.filter or self.sequence is None
         self.sequence = 1 if self.sequence is None else self.sequence
+
+
+@dataclass
+class Loading:
+    """How a map is loaded.
+
+    Args:
+        as_is: take the frames as they are, though the map's are resampled
+        device: what computes: cpu, cuda, cuda:1 or mps
+        features: class of the map's features, if not ours
+    """
+
+    as_is: bool = False
+    device: str = "cpu"
+    features: nn.Module | None = None
+
+    def model(self, path: Path) -> DejaVu:
+        """The model of a map file, on the device."""
+        model = load_map(path, self.features).to(device_of(self.device))
+        model.velocity = None if self.as_is else model.velocity
+        return model
+
+
+def load_map(path: Path, features: nn.Module | None = None) -> DejaVu:
+    """As `DejaVu.load`; a descriptor is refused, which finds nothing by itself."""
+    model = DejaVu.load(path, features)
+    if not model.map.places:
+        raise InputError(f"{path} is {NO_MAP.replace('FILE', str(path))}")
+    return model
 
 
 @dataclass
