@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import cluster, live, matcher, memory, scale, scale_report, storage
+from benchmarks.measure import table
 from dejavu_torch.cli import errors_of_one_line, fail, main
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.cli.parser import command_parser
@@ -22,9 +23,9 @@ def run_matcher(*, out: Path) -> None:
     Args:
         out: folder for bench.json and bench.png
     """
-    rows = matcher.run_bench("matcher", out)
-    print(text_table(matcher.bench_table(rows)))
-    if any("No module" in (row.skipped or "") for row in rows):
+    rows = matcher.run_matcher(out)
+    print(text_table(table(rows, matcher.COLUMNS)))
+    if any("No module" in (row["skipped"] or "") for row in rows):
         print("what is skipped needs pip install '.[bench,export]'")
     close(out, "x ours: seconds / those of the fastest dejavu")
 
@@ -51,8 +52,8 @@ def run_storage(
     check_not_read(out / "bench.json", *sources, codebooks)
     given, shared = (None if one is None else DejaVu.load(one) for one in (map, whitening))
     found = storage.run_storage(out, sources, places, codebooks, given, shared, progress=True)
-    for title, table in storage.storage_tables(found):
-        print(*[printable(title)] * bool(title), text_table(table), "", sep="\n")
+    for title, lines in storage.storage_tables(found):
+        print(*[printable(title)] * bool(title), text_table(lines), "", sep="\n")
     for line in storage.skipped_lines(found):
         print(printable(line))
     close(out, "the best of each family, T queries matched together")
@@ -74,8 +75,8 @@ def run_train(
     check_not_read(out / "bench.json", *sources)
     rows = train.run_train(out, sources, steps, seeds)
     print(text_table(train.train_table(rows)))
-    seeded = ", ".join(dict.fromkeys(str(row.seed) for row in rows))
-    seen = f"{rows[0].case}, seeds {seeded}, threads: {rows[0].threads}"
+    seeded = ", ".join(dict.fromkeys(str(row["seed"]) for row in rows))
+    seen = f"{rows[0]['case']}, seeds {seeded}, threads: {rows[0]['threads']}"
     close(out, f"{seen}; each row changes one thing of the row above")
 
 
@@ -96,7 +97,7 @@ def run_memory(*, out: Path, places: Sequence[int] = ()) -> None:
         out: folder for bench.json and bench.png
         places: frames that are learned; 1000, 10000 and 50000 if not given
     """
-    print(text_table(memory.memory_table(memory.run_memory(out, places))))
+    print(text_table(table(memory.run_memory(out, places), memory.COLUMNS)))
     close(out, "peak: beyond that of the programs loaded")
 
 
@@ -109,8 +110,8 @@ def run_scale(*, out: Path, places: Sequence[int] = (), device: str = "cpu") -> 
         device: what localizes: as of `dejavu localize`
     """
     rows = scale.run_scale(out, places, str(device_of(device)), progress=True)
-    for title, table in scale_report.scale_tables(rows):
-        print(title, text_table(table), "", sep="\n")
+    for title, lines in scale_report.scale_tables(rows):
+        print(title, text_table(lines), "", sep="\n")
     close(out, f"recall within {scale.TOLERANCE} places; localized on one thread")
 
 

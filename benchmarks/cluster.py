@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.matcher import Row, write_bench
+from benchmarks.measure import Column, Row, bars, new_row, table, with_ratios, write_bench
 from dejavu_torch.cluster import Cluster, code_on
 from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.frame_range import FrameRange
-from dejavu_torch.data.output import check_output_folder, whole_folder
+from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.learning import ChunkCoder, encode_local
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -25,6 +25,12 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.types import Traverse
 
 CHUNK = 128  # places
+COLUMNS: dict[str, Column] = {
+    "seconds": ("seconds", ".2f"),
+    "times as fast as the first": ("faster", ".2f"),
+    "processor seconds": ("cpu_seconds", ".2f"),
+    "other chunks": ("difference", ".0%"),
+}
 SAMPLE = 1000  # frames that whitening, mean and step are learned from
 
 
@@ -48,8 +54,7 @@ def run_cluster(out: Path, frames: int = 8192, repeats: int = 3) -> list[Row]:
         np.save(path, np.concatenate([(255 * one.permute(0, 2, 3, 1)).byte().numpy() for one in pictures]))
         route = read_array(path)
         rows = _timed(_contenders(_coder(route), route, cluster), frames, repeats)
-    with whole_folder(out) as written:
-        write_bench(written, rows)
+    write_bench(out, rows, bars(rows))
     return rows
 
 
@@ -91,21 +96,8 @@ def _contenders(
 
 def cluster_table(rows: Sequence[Row]) -> list[list[str]]:
     """The figures as rows of text, the header first."""
-    head = ["", "seconds", "times as fast as the first", "processor seconds", "other chunks"]
-    first = rows[0].seconds or 0.0
-    return [
-        head,
-        *(
-            [
-                row.contender,
-                f"{row.seconds:.2f}",
-                f"{first / (row.seconds or 1):.2f}",
-                f"{row.cpu_seconds:.2f}",
-                f"{row.difference:.0%}",
-            ]
-            for row in rows
-        ),
-    ]
+    faster = [row | {"faster": rows[0]["seconds"] / row["seconds"]} for row in rows]
+    return table(faster, COLUMNS, "{contender}")
 
 
 def _timed(
@@ -121,17 +113,15 @@ def _timed(
             seconds[key].append(time.perf_counter() - began)
             busy[key].append(processor_time() - spent)
             sums[key] = [one.stream.checksum for one in chunks]
-    best = {key: min(times[1:]) for key, times in seconds.items()}
     first = next(iter(sums.values()))
-    case = f"chunks of {frames} frames"
     rows = []
-    for key, least in best.items():
-        name, threads = key
+    for (name, threads), times in seconds.items():
+        key = name, threads
         others = sum(a != b for a, b in zip(sums[key], first, strict=True)) / len(first)
-        ratio, cpu = least / min(best.values()), min(busy[key][1:])
-        row = Row(case, name, least, seconds[key][0], ratio, threads=threads, difference=others)
-        rows.append(row._replace(cpu_seconds=cpu))
-    return rows
+        row = new_row(f"chunks of {frames} frames", name, threads=threads, difference=others)
+        row |= {"seconds": min(times[1:]), "seconds_first": times[0], "cpu_seconds": min(busy[key][1:])}
+        rows.append(row)
+    return with_ratios(rows)
 
 
 def processor_time() -> float:

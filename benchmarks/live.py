@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch.nn.functional import interpolate
 from tqdm import tqdm
 
-import dejavu_torch
+from benchmarks.measure import Column, Row, table, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.camera import shots_of
-from dejavu_torch.data.output import check_output_folder, whole_folder
+from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.video import Video
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.live.feed import FrameReader, in_real_time
@@ -32,32 +31,16 @@ SIZES = ((480, 640), (120, 160))  # that maps are learned from
 NUMBERS = 128  # of a descriptor
 NEAR = 5  # places
 NOISE = 0.1  # of a feature's spread, between two looks at one place
+COLUMNS: dict[str, Column] = {
+    "p50 ms": ("seconds", ".1f", 1e-3),
+    "p99 ms": ("seconds_p99", ".1f", 1e-3),
+    "frames/s": ("rate", ".0f"),
+    "cpu ms": ("cpu_seconds", ".1f", 1e-3),
+    "frames": ("frames", ".0f"),
+    f"dropped at {RATE}/s": ("dropped", ".0f"),
+    "found": ("recall_at_1", ".3f"),
+}
 WARM = 10  # frames ahead of those that are timed
-
-
-class LiveRow(NamedTuple):
-    """What frames took, one by one.
-
-    case: camera, and the map's frames. seconds: of a decoded frame's way to its place, the median;
-    seconds_p99: the longest but for 1 %. rate: frames a second from the file to the place, decoding beside
-    it; cpu_seconds: that a frame takes of all cores together, which other programs change little. dropped: of
-    the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of decoding, features,
-    whitening, scores and filter, each by itself, the best of some.
-    """
-
-    case: str
-    contender: str
-    seconds: float
-    seconds_p99: float
-    rate: float
-    cpu_seconds: float
-    frames: int
-    dropped: int
-    recall_at_1: float
-    places: int
-    route_bytes_per_place: float
-    threads: int
-    parts: dict[str, float]
 
 
 def bench_live(
@@ -67,7 +50,7 @@ def bench_live(
     camera: tuple[int, int] = CAMERA,
     numbers: int = NUMBERS,
     progress: bool = False,
-) -> list[LiveRow]:
+) -> list[Row]:
     """Localize the frames of a video one by one on a map of many places, with HOG and the filter.
 
     Args:
@@ -80,6 +63,13 @@ def bench_live(
     Convention: the route is the video once, and for the rest its descriptors turned at random, block by
         block: other places that change as a real route does. Only the time is of interest: the frames are
         those that were learned.
+
+    Returns:
+        case: camera, and the map's frames. seconds: of a decoded frame's way to its place, the median;
+        seconds_p99: the longest but for 1 %. rate: frames a second from the file to the place, decoding
+        beside it; cpu_seconds: that a frame takes of all cores together, which other programs change little.
+        dropped: of the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of
+        decoding, features, whitening, scores and filter, each by itself, the best of some.
 
     Raises:
         InputError: fewer places than frames, or fewer frames than are timed.
@@ -100,7 +90,7 @@ def bench_live(
 
 def _case(
     path: Path, size: tuple[int, int], camera: tuple[int, int], places: int, frames: int, numbers: int
-) -> LiveRow:
+) -> Row:
     video = Video(path, width=size[1], height=size[0])
     model, first = long_model(video, places, numbers)
     localizer = LiveLocalizer(model)
@@ -120,21 +110,21 @@ def _case(
         for shot in feed:
             localizer(shot.pixels)
     by = " x ".join(map(str, size))
-    return LiveRow(
-        f"{camera[0]} x {camera[1]} on a map of {by}",
-        "dejavu",
-        p50,
-        p99,
-        rate,
-        cpu,
-        frames,
-        feed.dropped,
-        found / frames,
-        places,
-        model.map.summary().route_bytes / places,
-        torch.get_num_threads(),
-        parts_of(model, video),
-    )
+    return {
+        "case": f"{camera[0]} x {camera[1]} on a map of {by}",
+        "contender": "dejavu",
+        "seconds": p50,
+        "seconds_p99": p99,
+        "rate": rate,
+        "cpu_seconds": cpu,
+        "frames": frames,
+        "dropped": feed.dropped,
+        "recall_at_1": found / frames,
+        "places": places,
+        "route_bytes_per_place": model.map.summary().route_bytes / places,
+        "threads": torch.get_num_threads(),
+        "parts": parts_of(model, video),
+    }
 
 
 def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:
@@ -212,7 +202,7 @@ def parts_of(model: DejaVu, video: Video, repeats: int = 30) -> dict[str, float]
     return seconds
 
 
-def run_live(out: Path, places: int = 100_000, frames: int = 300) -> list[LiveRow]:
+def run_live(out: Path, places: int = 100_000, frames: int = 300) -> list[Row]:
     """Run the bench, and write bench.json and bench.png into the folder `out`.
 
     Raises:
@@ -220,38 +210,19 @@ def run_live(out: Path, places: int = 100_000, frames: int = 300) -> list[LiveRo
     """
     check_output_folder(out)
     rows = bench_live(places, frames, progress=True)
-    facts = {
-        "rows": [row._asdict() for row in rows],
-        "rate": RATE,
-        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
-        "versions": {"dejavu_torch": dejavu_torch.__version__, "torch": torch.__version__},
+    drawn = {
+        row["case"]: {
+            name: 1e3 * value for name, value in ({"dejavu": row["seconds"]} | row["parts"]).items()
+        }
+        for row in rows
     }
-    with whole_folder(out) as folder:
-        (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-        figure, _ = plot_ratios(bars(rows), "milliseconds a frame (p50), and of each part by itself")
-        figure.savefig(folder / "bench.png")
+    picture = plot_ratios(drawn, "milliseconds a frame (p50), and of each part by itself")
+    write_bench(out, rows, picture, rate=RATE)
     return rows
 
 
-def live_table(rows: Sequence[LiveRow]) -> list[list[str]]:
+def live_table(rows: Sequence[Row]) -> list[list[str]]:
     """The figures as rows of text, the header first."""
-    names = list(rows[0].parts) if rows else []
-    table = [["", "p50 ms", "p99 ms", "frames/s", "cpu ms", f"dropped at {RATE}/s", "found", *names]]
-    for row in rows:
-        figures = [
-            f"{1e3 * row.seconds:.1f}",
-            f"{1e3 * row.seconds_p99:.1f}",
-            f"{row.rate:.0f}",
-            f"{1e3 * row.cpu_seconds:.1f}",
-        ]
-        figures += [f"{row.dropped} of {row.frames}", f"{row.recall_at_1:.3f}"]
-        table.append([row.case, *figures, *(f"{1e3 * row.parts[name]:.1f}" for name in names)])
-    return table
-
-
-def bars(rows: Sequence[LiveRow]) -> dict[str, dict[str, float]]:
-    """Milliseconds of each part and of a whole way, as `plot_ratios` draws them."""
-    return {
-        row.case: {"dejavu": 1e3 * row.seconds} | {name: 1e3 * value for name, value in row.parts.items()}
-        for row in rows
-    }
+    flat = [row | row["parts"] for row in rows]
+    parts: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
+    return table(flat, COLUMNS | parts, "{case}")

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import json
-import os
-import signal
-import subprocess
 import sys
 import tempfile
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,10 +18,24 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.matcher import MEMORY, Row, bars, peak_memory, resident, write_bench
-from benchmarks.plots import plot_ratios
+from benchmarks.measure import (
+    PROCESS,
+    Column,
+    Found,
+    Opened,
+    Row,
+    Store,
+    bars,
+    give_back,
+    in_process,
+    new_row,
+    peak_memory,
+    resident,
+    with_ratios,
+    write_bench,
+)
 from dejavu_torch.data.frame_range import IndexedTraverse
-from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_folder
+from dejavu_torch.data.output import check_output_folder, temporary_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.distance import l1_backend
@@ -46,44 +53,46 @@ TOLERANCE = 5  # frames
 NAMES = ("places", "queries")  # of the two drives' files
 OURS = "dejavu"
 LOADED = "programs loaded"
+BATCH = 64  # queries
+COLUMNS: dict[str, Column] = {
+    "peak MB": ("peak_bytes", ".1f", 1e6),
+    "file MB": ("bytes", ".2f", 1e6),
+    "seconds": ("seconds", ".1f"),
+    "recall@1": ("recall_at_1", ".3f"),
+}
 
 
-class Contender(ABC):
-    """A way to keep a route in a file, and to find places on it."""
-
-    @abstractmethod
-    def learn(self, route: Traverse, path: Path) -> None:
-        """Describe the frames of a route, and keep it in a file."""
-
-    @abstractmethod
-    def localize(self, path: Path, queries: Traverse) -> Tensor:
-        """The place of each query on the route of a file, (Q,)."""
-
-
-class Mapped(Contender):
+class Mapped(Store):
     """Ours: a map."""
 
     def __init__(self, mapper: TemplateMapper | SpectralMapper) -> None:
         self.mapper = mapper
 
-    def learn(self, route: Traverse, path: Path) -> None:
-        DejaVu(mapper=self.mapper).learn(route).save(path)
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
+        model = DejaVu(mapper=self.mapper).learn(route)
+        model.save(path)
+        return model.summary().route_bytes
 
-    def localize(self, path: Path, queries: Traverse) -> Tensor:
-        matches = DejaVu.load(path).matches(queries)
-        return gathered((match.index for match in matches), queries)
+    def load(self, path: Path, device: str = "cpu") -> Opened:
+        model = DejaVu.load(path)
+
+        def find(frames: Tensor) -> Found:
+            match = model.localize(frames)
+            return Found(match.score, match.index)
+
+        return Opened(find)
 
 
-class Held(Contender):
+class Held(Store):
     """Descriptors of all frames in float32, compared with those of each query by one matrix product."""
 
     def __init__(self, whitened: bool) -> None:
         self.whitened = whitened
 
     def model(self) -> DejaVu:
-        return DejaVu(whitening=Whitening() if self.whitened else "none")
+        return DejaVu(whitening=Whitening() if self.whitened else "none").eval()
 
-    def learn(self, route: Traverse, path: Path) -> None:
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
         model = self.model()
         fixed = {}
         if model.whitening is None:
@@ -92,23 +101,25 @@ class Held(Contender):
             held = model.describe_reference(route)
             fixed = model.whitening.state_dict()
         save_file({"held": held, **fixed}, path)
+        return held.nbytes
 
-    def localize(self, path: Path, queries: Traverse) -> Tensor:
+    def load(self, path: Path, device: str = "cpu") -> Opened:
         model, state = self.model(), load_file(path)
         held = state.pop("held")
         if model.whitening is not None:
             model.whitening.load_state_dict(state)
         lengths = torch.linalg.vector_norm(held, dim=1).square()
-        return gathered(
-            ((lengths - 2 * part @ held.T).argmin(1) for part in model.describer.descriptors(queries)),
-            queries,
-        )
+
+        def find(frames: Tensor) -> Found:
+            return Found(*(lengths - 2 * model.whitened(model.describe(frames)) @ held.T).min(1))
+
+        return Opened(find)
 
 
-class Faiss(Contender):
+class Faiss(Store):
     """HOG of all frames in a flat index of faiss."""
 
-    def learn(self, route: Traverse, path: Path) -> None:
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
         import faiss
 
         index: Any = None
@@ -116,23 +127,35 @@ class Faiss(Contender):
             index = faiss.IndexFlatL2(part.shape[1]) if index is None else index
             index.add(part.numpy())
         faiss.write_index(index, str(path))
+        return path.stat().st_size
 
-    def localize(self, path: Path, queries: Traverse) -> Tensor:
+    def load(self, path: Path, device: str = "cpu") -> Opened:
         import faiss
 
         faiss.omp_set_num_threads(torch.get_num_threads())
-        index = faiss.read_index(str(path))
-        parts = DejaVu(whitening="none").describer.descriptors(queries)
-        return gathered((torch.from_numpy(index.search(part.numpy(), 1)[1][:, 0]) for part in parts), queries)
+        index, model = faiss.read_index(str(path)), DejaVu(whitening="none").eval()
+
+        def find(frames: Tensor) -> Found:
+            score, place = index.search(model.describe(frames).numpy(), 1)
+            return Found(torch.from_numpy(score[:, 0]), torch.from_numpy(place[:, 0]))
+
+        return Opened(find)
 
 
-CONTENDERS: dict[str, Contender] = {
+CONTENDERS: dict[str, Store] = {
     OURS: Mapped(SpectralMapper()),
     "dejavu templates": Mapped(TemplateMapper()),
     "whitened, float32": Held(whitened=True),
     "HOG, float32": Held(whitened=False),
     "faiss, HOG": Faiss(),
 }
+
+
+@torch.no_grad()
+def localize(store: Store, path: Path, queries: Traverse) -> Tensor:
+    """The place of each query on the route of a file, (Q,)."""
+    find = store.load(path).find
+    return gathered((find(part).place for part in queries.batches(BATCH)), queries)
 
 
 def gathered(parts: Iterator[Tensor], traverse: Traverse) -> Tensor:
@@ -226,19 +249,19 @@ def measure(task: Task, folder: Path) -> dict[str, Any]:
         given back, so that the run cannot use it.
 
     Returns:
-        The fields of a `Row` that it knows.
+        What it knows of a row.
     """
     torch.set_num_threads(task.threads)
     contender, file = CONTENDERS[task.contender], task.file(folder)
     route, queries = (np.load(folder / f"{name}.npy") for name in NAMES)
     trial = file.with_suffix(".trial")
     contender.learn(Drive(route, torch.arange(TRIAL)), trial)
-    contender.localize(trial, Drive(queries, torch.arange(1)))
+    localize(contender, trial, Drive(queries, torch.arange(1)))
     trial.unlink()
     l1_backend()
     give_back()
     if not task.places:
-        return {"peak_bytes": resident() if MEMORY.exists() else None}
+        return {"peak_bytes": resident() if PROCESS.exists() else None}
     shown = shown_by(task.queries or task.places, task.places)
     frames = Drive(queries if task.queries else route, shown)
     found = torch.empty(0)
@@ -246,7 +269,7 @@ def measure(task: Task, folder: Path) -> dict[str, Any]:
     def run() -> None:
         nonlocal found
         if task.queries:
-            found = contender.localize(file, frames)
+            found = localize(contender, file, frames)
         else:
             contender.learn(frames, file)
 
@@ -259,40 +282,9 @@ def measure(task: Task, folder: Path) -> dict[str, Any]:
     return facts
 
 
-def give_back() -> None:
-    """Return to the system what is free in the heap, where its library can."""
-    gc.collect()
-    with suppress(AttributeError, OSError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 def measured(task: Task, folder: Path) -> dict[str, Any]:
     """`measure` in a process of its own; why there are no figures where it fails."""
     return in_process(__name__, [task, str(folder)])
-
-
-def in_process(module: str, arguments: object) -> dict[str, Any]:
-    """What a module prints as JSON, run by itself on arguments; where it fails why, as `skipped`."""
-    # without the current folder, from which nothing is imported
-    search = os.pathsep.join(filter(None, sys.path))
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", module, json.dumps(arguments)],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": search},
-        preexec_fn=end_with_parent if sys.platform == "linux" else None,
-    )
-    if done.returncode < 0:
-        return {"skipped": f"ended by signal {-done.returncode}, such as for want of memory"}
-    if done.returncode:
-        return {"skipped": (done.stderr.strip().splitlines() or ["it failed"])[-1][:200]}
-    facts: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return facts
-
-
-def end_with_parent() -> None:
-    """Have the system end this process when its parent ends, as by Ctrl-C."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -> Iterator[Row]:
@@ -327,7 +319,7 @@ def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -
             facts = measured(task, folder)
             if not task.queries and task.places != middle:
                 task.file(folder).unlink(missing_ok=True)
-            yield Row(task.case, task.contender, threads=threads, **facts)
+            yield new_row(task.case, task.contender, **{"threads": threads} | facts)
 
 
 def run_memory(out: Path, places: Sequence[int] = ()) -> list[Row]:
@@ -338,52 +330,9 @@ def run_memory(out: Path, places: Sequence[int] = ()) -> list[Row]:
     """
     check_output_folder(out)  # before the long work
     rows = with_ratios(list(bench_memory(places)))
-    peaks = bars(rows, lambda row: row.peak_bytes and row.peak_bytes / 1e6)
-    peaks.pop(LOADED, None)
-    picture = plot_ratios(peaks, "memory at most, in MB; less is better") if peaks else None
-    with whole_folder(out) as folder:
-        write_bench(folder, rows, picture)
+    drawn = [row for row in rows if row["case"] != LOADED]
+    write_bench(out, rows, bars(drawn, "peak_bytes", 1e6, label="memory at most, in MB; less is better"))
     return rows
-
-
-def with_ratios(rows: Sequence[Row]) -> list[Row]:
-    """The rows with their seconds over those of our fastest of the case."""
-    fastest: dict[str, float] = {}
-    for row in rows:
-        if row.contender.startswith("dejavu") and row.seconds is not None:
-            fastest[row.case] = min(row.seconds, fastest.get(row.case, row.seconds))
-    return [
-        row._replace(ratio_to_ours=row.seconds / fastest[row.case])
-        if row.seconds is not None and row.case in fastest
-        else row
-        for row in rows
-    ]
-
-
-def memory_table(rows: Sequence[Row]) -> list[list[str]]:
-    """The figures as rows of text, the header first.
-
-    Example:
-        >>> memory_table([Row("learn", "dejavu", 2.0, peak_bytes=3_000_000, bytes=10_000)])[1]
-        ['learn: dejavu', '3.0', '0.01', '2.0', '', '']
-    """
-
-    def text(value: float | None, form: str, unit: float = 1) -> str:
-        return "" if value is None else format(value / unit, form)
-
-    head = ["", "peak MB", "file MB", "seconds", "recall@1", ""]
-    body = [
-        [
-            f"{row.case}: {row.contender}",
-            text(row.peak_bytes, ".1f", 1e6),
-            text(row.bytes, ".2f", 1e6),
-            text(row.seconds, ".1f"),
-            text(row.recall_at_1, ".3f"),
-            f"skipped: {row.skipped}" if row.skipped else "",
-        ]
-        for row in rows
-    ]
-    return [head, *body]
 
 
 if __name__ == "__main__":

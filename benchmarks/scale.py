@@ -18,10 +18,19 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-import dejavu_torch
 from benchmarks.made import Likeness, MadeRoute, likeness
-from benchmarks.matcher import Row, peak_memory, programs
-from benchmarks.memory import give_back, in_process
+from benchmarks.measure import (
+    Find,
+    Found,
+    Opened,
+    Row,
+    Store,
+    give_back,
+    in_process,
+    peak_memory,
+    with_ratios,
+    write_bench,
+)
 from benchmarks.plots import plot_growth
 from benchmarks.repeating import TiledRoute, tiles_of
 from benchmarks.scale_contenders import (
@@ -36,16 +45,12 @@ from benchmarks.scale_contenders import (
     ROTATED,
     ROWS,
     TRAINED,
-    Contender,
-    Find,
-    Found,
-    Opened,
 )
-from benchmarks.scale_report import RECALL, ScaleRow, exponents, pictured, with_ratios
+from benchmarks.scale_report import RECALL, exponents, pictured, scale_row
 from benchmarks.template_search import PLACES as TEMPLATES
 from benchmarks.template_search import bench_templates
 from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
-from dejavu_torch.data.output import check_output_folder, temporary_folder, whole_file, whole_folder
+from dejavu_torch.data.output import check_output_folder, temporary_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.maps import codec, distance
@@ -62,6 +67,13 @@ SHUFFLED = 100_000  # places of a null at most
 MEMORY = 8_000_000_000  # bytes of a process
 COPIED = 2**27  # bytes of a copy that shows the bandwidth
 TOLERANCE = 5
+FAISS = {
+    "trained": TRAINED,
+    "trained_rotation": ROTATED,
+    "cells_per_probe": CELLS_PER_PROBE,
+    "probes_at_least": PROBED_AT_LEAST,
+    "ef_search": EF_SEARCH,
+}
 
 
 class Task(NamedTuple):
@@ -81,7 +93,7 @@ class Task(NamedTuple):
     room: float = 0.0
     step: float = 0.0
 
-    def made(self) -> Contender:
+    def made(self) -> Store:
         return CONTENDERS[self.contender](self.room, self.step)
 
     def file(self, folder: Path) -> Path:
@@ -107,7 +119,7 @@ class Kept(IndexedTraverse):
 
 
 def learn(task: Task, folder: Path) -> dict[str, Any]:
-    """Keep the descriptors; the fields of a `ScaleRow` that this tells."""
+    """Keep the descriptors; the figures of a row that this tells."""
     torch.set_num_threads(task.threads)
     contender, file = task.made(), task.file(folder)
     route = Kept(folder / f"{task.source}.npy", task.places)
@@ -132,7 +144,7 @@ def learn(task: Task, folder: Path) -> dict[str, Any]:
 
 
 def localize(task: Task, folder: Path) -> dict[str, Any]:
-    """Find the queries in what was kept, one by one and in batches; the fields that this tells."""
+    """Find the queries in what was kept, one by one and in batches; the figures that this tells."""
     torch.set_num_threads(1)
     state = load_file(folder / f"{task.case}.safetensors")
     queries, truth = state["queries"], state["truth"]
@@ -194,7 +206,7 @@ def bandwidth(device: str) -> float:
     return 2 * COPIED / fastest
 
 
-def measured(task: Task, folder: Path) -> ScaleRow:
+def measured(task: Task, folder: Path) -> Row:
     """A contender's row: it learns in one process and localizes in another."""
     facts: dict[str, Any] = {}
     for what in (learn, localize):
@@ -203,7 +215,7 @@ def measured(task: Task, folder: Path) -> ScaleRow:
             break
     for file in folder.glob(task.file(folder).name + "*"):
         file.unlink()
-    return ScaleRow(task.case, task.contender, task.places, threads=task.threads, **facts)
+    return scale_row(task.case, task.contender, task.places, **{"threads": task.threads} | facts)
 
 
 class Folder:
@@ -294,9 +306,7 @@ def spread(places: int) -> Tensor:
     return torch.arange(count) * (places // count)
 
 
-def bench_scale(
-    places: Sequence[int] = (), device: str = "cpu", progress: bool = False
-) -> Iterator[ScaleRow]:
+def bench_scale(places: Sequence[int] = (), device: str = "cpu", progress: bool = False) -> Iterator[Row]:
     """All contenders at all sizes, a row at a time.
 
     Args:
@@ -339,38 +349,25 @@ def bench_scale(
         yield from map(_of_templates, found)
 
 
-def _of_templates(row: Row) -> ScaleRow:
+def _of_templates(row: Row) -> Row:
     """A row of template search: a query by itself takes as long as one of many."""
-    places = int(row.case.partition("=")[2])
-    size = row.file_bytes
-    return ScaleRow(
-        row.case,
-        row.contender,
-        places,
-        row.seconds,
-        row.seconds,
-        row.peak_bytes,
-        route_bytes=size,
-        bytes_per_place=None if size is None else size / places,
-        threads=row.threads,
-        skipped=row.skipped,
-        difference=row.difference,
-    )
+    places, size = int(row["case"].partition("=")[2]), row["file_bytes"]
+    same = {key: row[key] for key in ("seconds", "peak_bytes", "threads", "skipped", "difference")}
+    same |= {"seconds_one": row["seconds"], "route_bytes": size, "bytes_per_place": size and size / places}
+    return scale_row(row["case"], row["contender"], places, **same)
 
 
-def _case(
-    folder: Folder, case: str, source: str, places: int, threads: int, device: str
-) -> Iterator[ScaleRow]:
+def _case(folder: Folder, case: str, source: str, places: int, threads: int, device: str) -> Iterator[Row]:
     folder.ask(case, source, places)
     for name in PLACED:
         task = Task(case, name, source, places, threads, device)
         if name.startswith("null") and places > SHUFFLED:
-            yield ScaleRow(case, name, places, skipped=f"shuffled orders are of at most {SHUFFLED} places")
+            yield scale_row(case, name, places, skipped=f"shuffled orders are of at most {SHUFFLED} places")
         else:
             yield measured(task, folder.path)
 
 
-def _repeating(folder: Folder, places: int, threads: int, device: str) -> Iterator[ScaleRow]:
+def _repeating(folder: Folder, places: int, threads: int, device: str) -> Iterator[Row]:
     case = f"repeat={places}"
     folder.ask(case, "tiles", places)
     room = step = 0.0
@@ -378,58 +375,38 @@ def _repeating(folder: Folder, places: int, threads: int, device: str) -> Iterat
         source = "flown" if name == FLOWN else "tiles"
         if (name in (FLOWN, "null")) and places > SHUFFLED:
             why = "noisy frames are drawn" if name == FLOWN else "shuffled orders are"
-            yield ScaleRow(case, name, places, skipped=f"{why} of at most {SHUFFLED} places")
+            yield scale_row(case, name, places, skipped=f"{why} of at most {SHUFFLED} places")
             continue
         row = measured(Task(case, name, source, places, threads, device, room, step), folder.path)
         if name == ONE_CHUNK:
-            room, step = row.bytes_per_place or 0.0, row.step or 0.0
+            room, step = row["bytes_per_place"] or 0.0, row["step"] or 0.0
         yield row
 
 
 def run_scale(
     out: Path, places: Sequence[int] = (), device: str = "cpu", progress: bool = False
-) -> list[ScaleRow]:
+) -> list[Row]:
     """`bench_scale`, written into a folder: bench.json at each row that is finished, bench.png at the end.
 
     Raises:
         InputError: as `bench_scale`, or a folder that cannot be made or written in.
     """
     check_output_folder(out)
-    rows: list[ScaleRow] = []
+    rows: list[Row] = []
+    facts: dict[str, Any] = {"tolerance": TOLERANCE, "device": device, "faiss": FAISS}
     bar = tqdm(bench_scale(places, device, progress), "rows", disable=None if progress else True, leave=False)
     try:
         for row in bar:
             rows = with_ratios([*rows, row])
-            with whole_folder(out) as folder:
-                write_rows(folder, rows, device)
+            write_bench(out, rows, exponents=exponents(rows), **facts)
             if not bar.disable:
-                bar.write(f"{row.case}: {row.contender}", sys.stderr)
+                bar.write(f"{row['case']}: {row['contender']}", sys.stderr)
     finally:  # also where a later row fails
         panels = pictured(rows)
         if panels:
-            figure, _ = plot_growth(panels, linear=[RECALL])
-            with whole_file(out / "bench.png") as temporary:
-                figure.savefig(temporary)
+            picture = plot_growth(panels, linear=[RECALL])
+            write_bench(out, rows, picture, exponents=exponents(rows), **facts)
     return rows
-
-
-def write_rows(folder: Path, rows: Sequence[ScaleRow], device: str) -> None:
-    """Write bench.json into a folder that exists."""
-    facts = {
-        "rows": [row._asdict() for row in rows],
-        "exponents": exponents(rows),
-        "tolerance": TOLERANCE,
-        "device": device,
-        "version": dejavu_torch.__version__,
-        "faiss": {
-            "trained": TRAINED,
-            "trained_rotation": ROTATED,
-            "cells_per_probe": CELLS_PER_PROBE,
-            "probes_at_least": PROBED_AT_LEAST,
-            "ef_search": EF_SEARCH,
-        },
-    }
-    (folder / "bench.json").write_text(json.dumps(facts | programs(), indent=1) + "\n", encoding="utf-8")
 
 
 def limit_memory() -> None:

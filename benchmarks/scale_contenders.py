@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from benchmarks.measure import Found, Opened, Store
 from benchmarks.repeating import step_that_holds
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -27,45 +27,7 @@ CELLS_PER_PROBE, PROBED_AT_LEAST = 32, 32  # of an inverted file
 EF_SEARCH = 64  # candidates while a graph is searched
 
 
-class Found(NamedTuple):
-    """The best place of each query and its score, lower is better: (Q,), (Q,)."""
-
-    score: Tensor
-    place: Tensor
-
-
-Find = Callable[[Tensor], Found]
-
-
-class Opened(NamedTuple):
-    """A file that was loaded.
-
-    find: the places of queries (Q,K). device: that it runs on. scanned: bytes that each batch of queries goes
-    through as a whole, asked for when there was one; None where it did not.
-    """
-
-    find: Find
-    device: str = "cpu"
-    scanned: Callable[[], int | None] = lambda: None
-
-
-class Contender(ABC):
-    """A way to keep descriptors in a file, and to find the nearest."""
-
-    def prepare(self, route: IndexedTraverse) -> float | None:
-        """Choose by the route, which is no part of learning; the step of a map that learns with one."""
-        return None
-
-    @abstractmethod
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        """Keep the descriptors of a route in a file; how many bytes of it are the route's."""
-
-    @abstractmethod
-    def load(self, path: Path, device: str) -> Opened:
-        """Make ready to find the places of queries in a file; who cannot use the device takes the CPU."""
-
-
-class Mapped(Contender):
+class Mapped(Store):
     """Ours: a spectral map.
 
     Args:
@@ -97,7 +59,7 @@ class Mapped(Contender):
         model.save(path)
         return model.map.summary().route_bytes
 
-    def load(self, path: Path, device: str) -> Opened:
+    def load(self, path: Path, device: str = "cpu") -> Opened:
         model = DejaVu.load(path).to(device)
         order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
 
@@ -120,7 +82,7 @@ class Held(Mapped):
         return self.mapper.step
 
 
-class Faiss(Contender):
+class Faiss(Store):
     """An index of faiss over descriptors of length 1.
 
     Args:
@@ -152,7 +114,7 @@ class Faiss(Contender):
         names = 8 * route.length if "IVF" in self.factory else 0
         return path.stat().st_size - empty - names
 
-    def load(self, path: Path, device: str) -> Opened:
+    def load(self, path: Path, device: str = "cpu") -> Opened:
         import faiss
 
         faiss.omp_set_num_threads(torch.get_num_threads())
@@ -170,7 +132,7 @@ class Faiss(Contender):
         return Opened(find)
 
 
-class Interpolated(Contender):
+class Interpolated(Store):
     """Every k-th descriptor in int8 and straight lines between them, in so many bytes per place."""
 
     def __init__(self, room: float) -> None:
@@ -188,7 +150,7 @@ class Interpolated(Contender):
         save_file({"keys": small, "scale": scale.view(1), "k": torch.tensor([k, route.length])}, path)
         return small.nbytes
 
-    def load(self, path: Path, device: str) -> Opened:
+    def load(self, path: Path, device: str = "cpu") -> Opened:
         from dejavu_torch.evaluation.baselines import between_keyframes
 
         state = load_file(path)
@@ -218,7 +180,7 @@ FLOWN = f"{OURS}, one chunk, of noisy frames"
 # by name: what it is made of, given the route bytes per place and the step of `ONE_CHUNK` at this size, where
 # it is to take the same. "np" leaves out the training of faiss's filter by Hamming distances, which takes
 # long and is not used here
-PLACED: dict[str, Callable[[float, float], Contender]] = {
+PLACED: dict[str, Callable[[float, float], Store]] = {
     f"{OURS} 1 B": lambda *_: Mapped(1.0, CHUNK),
     f"{OURS} 4 B": lambda *_: Mapped(4.0, CHUNK),
     f"{OURS} 1 B, one chunk": lambda *_: Mapped(1.0, WHOLE),
@@ -233,7 +195,7 @@ PLACED: dict[str, Callable[[float, float], Contender]] = {
     "faiss OPQ, IVF-PQ, 16 B": lambda *_: Faiss("OPQ16,IVF{cells},PQ16np"),
     "faiss HNSW": lambda *_: Faiss("HNSW16,Flat"),
 }
-REPEATED: dict[str, Callable[[float, float], Contender]] = {
+REPEATED: dict[str, Callable[[float, float], Store]] = {
     ONE_CHUNK: lambda *_: Held(WHOLE),
     FIXED: lambda *_: Held(CHUNK),
     FLOWN: lambda room, step: Mapped(None, WHOLE, step),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,13 +13,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-import dejavu_torch
 from benchmarks.coded_video import CodedVideo
-from benchmarks.matcher import peak_memory
+from benchmarks.measure import Contender, Row, new_row, peak_memory, with_ratios, write_bench
 from benchmarks.plots import plot_frontiers
 from benchmarks.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.data.ground_truth import GroundTruth
-from dejavu_torch.data.output import check_output_folder, whole_file, whole_folder
+from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.contenders import LENGTHS, evaluate_each, lengths_beside, sequences_as_json
@@ -30,6 +28,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Match, Traverse
 
 BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
@@ -51,38 +50,11 @@ WHITENINGS: Mapping[str, Mapping[str, int]] = {  # other settings than the defau
 WHITENED = 5.0  # route bytes per place of the map behind each of them
 LEVEL = 0.95  # an area that tells stores apart: near 1 it hangs on single queries
 TOLERANCE = 5
+KEYS = (
+    *("family", "seconds", "peak_bytes", "bytes", "fixed_bytes", "route_bytes", "route_bytes_per_place"),
+    *("recall_at_1", "auc", "sequences", "ratio_to_ours", "skipped"),
+)
 OURS, NULL, OTHERS = "dejavu", "null", "dejavu, other whitenings"
-
-
-class Row(NamedTuple):
-    """What one contender is recognised at on one route, and what it takes; None where it is not known.
-
-    family: of contenders that make one front. seconds: to store the route and match all queries; of what
-    has descriptors of its own with describing all frames, and of the first of several rows that share a
-    training with that. peak_bytes: most memory held meanwhile beyond what was held before.
-    ratio_to_ours: seconds over those of our fastest. bytes: of all, with the whitening; those that do not
-    grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
-    together. skipped: why there are no figures.
-    """
-
-    case: str
-    contender: str
-    family: str
-    seconds: float | None = None
-    peak_bytes: int | None = None
-    bytes: int | None = None
-    fixed_bytes: int | None = None
-    route_bytes: int | None = None
-    route_bytes_per_place: float | None = None
-    recall_at_1: float | None = None
-    auc: float | None = None
-    sequences: Mapping[str, Mapping[str, float]] | None = None
-    ratio_to_ours: float | None = None
-    skipped: str | None = None
-
-    def auc_of(self, length: int) -> float | None:
-        """The area of sequences of T queries."""
-        return (self.sequences or {}).get(str(length), {}).get("auc")
 
 
 class Route(NamedTuple):
@@ -109,14 +81,6 @@ class Answer(NamedTuple):
     fixed: int
 
 
-class Contender(NamedTuple):
-    """A way to store a route. answer: stores it and matches all queries; what it raises says why not."""
-
-    name: str
-    family: str
-    answer: Callable[[Matching], Answer]
-
-
 def bench_storage(
     sources: Sequence[str] = (),
     places: Sequence[int] = (),
@@ -136,6 +100,14 @@ def bench_storage(
         given: a model with a map of the one pair's reference, set beside the others.
         whitening: a model whose whitening describes all routes; None learns one for each.
         seed: of the whitening and the null. progress: show progress bars on a terminal.
+
+    Yields:
+        family: of contenders that make one front. seconds: to store the route and match all queries; of what
+        has descriptors of its own with describing all frames, and of the first of several rows that share a
+        training with that. peak_bytes: most memory held meanwhile beyond what was held before.
+        ratio_to_ours: seconds over those of our fastest. bytes: of all, with the whitening; those that do not
+        grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
+        together. skipped: why there are no figures.
 
     Raises:
         InputError: sources that are no pairs or do not fit each other, and what the sources raise.
@@ -261,11 +233,12 @@ def contenders_of(
         given: see `bench_storage`.
     """
     for name, family, keep in _stores(route, other, seed):
-        yield Contender(name, family, partial(_among, route, keep))
+        yield Contender(name, partial(partial, _among, route, keep), family=family)
     yield from _other_whitenings(route, other, seed)
     if given is not None:
-        yield Contender("dejavu, the map that was given", "dejavu, given", partial(_by_map, route, given))
-    yield Contender("the paper", "the paper", partial(_by_paper, route))
+        found = partial(partial, _by_map, route, given)
+        yield Contender("dejavu, the map that was given", found, family="dejavu, given")
+    yield Contender("the paper", partial(partial, _by_paper, route), family="the paper")
 
 
 Store = tuple[str, str, Callable[[], Kept]]  # name, family, and what it gives back of the descriptors
@@ -363,7 +336,8 @@ def _other_whitenings(route: Route, other: Traverse | None, seed: int) -> Iterat
     models: dict[str, Callable[[], DejaVu]]
     models = {name: partial(learned, settings) for name, settings in WHITENINGS.items()}
     for name, model in (models | {"of another route": shared}).items():
-        yield Contender(f"dejavu {WHITENED:g}, whitening {name}", OTHERS, partial(answer, model))
+        whitened = partial(partial, answer, model)
+        yield Contender(f"dejavu {WHITENED:g}, whitening {name}", whitened, family=OTHERS)
 
 
 def _among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer:
@@ -389,31 +363,30 @@ def _by_paper(route: Route, matching: Matching) -> Answer:
 
 def judged(route: Route, contender: Contender) -> Row:
     """Store a route, match all queries, and score them."""
-    row = Row(route.name, contender.name, contender.family)
+    row = new_row(route.name, contender.name, KEYS, family=contender.family)
     matching = _matching(len(route.places), len(route.queries))
     answers: list[Answer] = []
     began = time.perf_counter()
     try:
-        peak = peak_memory(lambda: answers.append(contender.answer(matching)))
-        if not answers:  # a system that tells nothing of memory
-            answers.append(contender.answer(matching))
+        answer_of = contender.prepare()
+        peak = peak_memory(lambda: answers.append(answer_of(matching)))
     except InputError as error:
-        return row._replace(skipped=str(error))
+        return row | {"skipped": str(error)}
     except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
-        return row._replace(skipped=f"{type(error).__name__}: {' '.join(str(error).split())}"[:200])
+        return row | {"skipped": f"{type(error).__name__}: {one_line(error)}"[:200]}
     seconds, (answer,) = time.perf_counter() - began, answers
     scores = evaluate_each(answer.found.sequences, route.truth, TOLERANCE)
-    return row._replace(
-        seconds=seconds,
-        peak_bytes=peak,
-        bytes=answer.route + answer.fixed,
-        fixed_bytes=answer.fixed,
-        route_bytes=answer.route,
-        route_bytes_per_place=answer.route / len(route.places),
-        recall_at_1=scores[1].recall_at_1,
-        auc=scores[1].auc,
-        sequences=sequences_as_json(scores),
-    )
+    return row | {
+        "seconds": seconds,
+        "peak_bytes": peak,
+        "bytes": answer.route + answer.fixed,
+        "fixed_bytes": answer.fixed,
+        "route_bytes": answer.route,
+        "route_bytes_per_place": answer.route / len(route.places),
+        "recall_at_1": scores[1].recall_at_1,
+        "auc": scores[1].auc,
+        "sequences": sequences_as_json(scores),
+    }
 
 
 def _matching(places: int, queries: int) -> Matching:
@@ -421,6 +394,12 @@ def _matching(places: int, queries: int) -> Matching:
     longest = max(length for length in LENGTHS if length <= places)
     sequence = SequenceMatcher(longest)
     return Matching(sequence, lengths_beside(sequence, queries, places))
+
+
+def area(row: Row, length: int) -> float | None:
+    """The AUC of sequences of T queries."""
+    auc: float | None = (row["sequences"] or {}).get(str(length), {}).get("auc")
+    return auc
 
 
 class Point(NamedTuple):
@@ -435,13 +414,13 @@ def front(rows: Sequence[Row], length: int = 1) -> list[Point]:
 
     Example:
         >>> sizes = {2.0: 0.7, 1.0: 0.5, 4.0: 0.6}
-        >>> rows = [Row("", "", "", route_bytes_per_place=size, sequences={"1": {"auc": auc}})
+        >>> rows = [new_row("", "", KEYS, route_bytes_per_place=size, sequences={"1": {"auc": auc}})
         ...         for size, auc in sizes.items()]
         >>> [tuple(point) for point in front(rows)]
         [(1.0, 0.5), (2.0, 0.7)]
     """
     best: list[Point] = []
-    points = (Point(row.route_bytes_per_place or 0, row.auc_of(length) or 0) for row in rows if _ran(row))
+    points = (Point(row["route_bytes_per_place"] or 0, area(row, length) or 0) for row in rows if _ran(row))
     for point in sorted(points, key=lambda point: (point.size, -point.auc)):
         if not best or point.auc > best[-1].auc:
             best.append(point)
@@ -468,22 +447,22 @@ def bytes_for(auc: float, points: Sequence[Point]) -> float | None:
 
 
 def _ran(row: Row) -> bool:
-    return row.skipped is None
+    return row["skipped"] is None
 
 
 def _families(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """The rows of each family but `OTHERS`, which differ in what does not grow with the route."""
     found: dict[str, list[Row]] = {}
     for row in rows:
-        if _ran(row) and row.family != OTHERS:
-            found.setdefault(row.family, []).append(row)
+        if _ran(row) and row["family"] != OTHERS:
+            found.setdefault(row["family"], []).append(row)
     return found
 
 
 def _cases(rows: Sequence[Row]) -> dict[str, list[Row]]:
     found: dict[str, list[Row]] = {}
     for row in rows:
-        found.setdefault(row.case, []).append(row)
+        found.setdefault(row["case"], []).append(row)
     return found
 
 
@@ -500,7 +479,7 @@ def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
         for length in LENGTHS:
             fronts = {name: front(some, length) for name, some in families.items() if name != OURS}
             for row in families.get(OURS, ()):
-                auc, size = row.auc_of(length), row.route_bytes_per_place
+                auc, size = area(row, length), row["route_bytes_per_place"]
                 if auc is None or size is None:
                     continue
                 needed = {name: bytes_for(auc, points) for name, points in fronts.items()}
@@ -530,12 +509,12 @@ def whitenings(rows: Sequence[Row]) -> dict[str, list[Whitened]]:
     """For each route with other whitenings than its own: that one, the first, and the others."""
     found: dict[str, list[Whitened]] = {}
     for case, own in _cases(rows).items():
-        others = [row for row in own if _ran(row) and row.family == OTHERS]
-        ours = [row for row in own if _ran(row) and row.contender == f"{OURS} {WHITENED:g}"]
+        others = [row for row in own if _ran(row) and row["family"] == OTHERS]
+        ours = [row for row in own if _ran(row) and row["contender"] == f"{OURS} {WHITENED:g}"]
         if others and ours:
-            names = ["the default", *(row.contender.rpartition("whitening ")[2] for row in others)]
+            names = ["the default", *(row["contender"].rpartition("whitening ")[2] for row in others)]
             found[case] = [
-                Whitened(name, row.fixed_bytes or 0, row.auc or 0)
+                Whitened(name, row["fixed_bytes"] or 0, row["auc"] or 0)
                 for name, row in zip(names, ours + others, strict=True)
             ]
     return found
@@ -558,36 +537,11 @@ def run_storage(
     check_output_folder(out)
     rows: list[Row] = []
     for row in bench_storage(sources, places, codebooks, given, whitening, progress=progress):
-        rows = _with_ratios([*rows, row])
-        with whole_folder(out) as folder:  # what fails before leaves none
-            write_rows(folder, rows)
-    figure, _ = plot_frontiers(pictured(rows), whitenings(rows))
-    with whole_file(out / "bench.png") as temporary:
-        figure.savefig(temporary)
+        rows = with_ratios([*rows, row], lambda row: row["family"] == OURS)
+        write_bench(out, rows, equal_auc=equal_areas(rows), tolerance=TOLERANCE)
+    picture = plot_frontiers(pictured(rows), whitenings(rows))
+    write_bench(out, rows, picture, equal_auc=equal_areas(rows), tolerance=TOLERANCE)
     return rows
-
-
-def _with_ratios(rows: Sequence[Row]) -> list[Row]:
-    fastest = {
-        case: min((row.seconds for row in own if row.family == OURS and row.seconds), default=None)
-        for case, own in _cases(rows).items()
-    }
-    return [
-        row._replace(ratio_to_ours=row.seconds / ours) if row.seconds and (ours := fastest[row.case]) else row
-        for row in rows
-    ]
-
-
-def write_rows(folder: Path, rows: Sequence[Row]) -> None:
-    """Write bench.json into a folder that exists."""
-    facts = {
-        "rows": [row._asdict() for row in rows],
-        "equal_auc": equal_areas(rows),
-        "tolerance": TOLERANCE,
-        "threads": torch.get_num_threads(),
-        "version": dejavu_torch.__version__,
-    }
-    (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float]]]]:
@@ -609,7 +563,8 @@ def storage_tables(rows: Sequence[Row], at: float = 1.6) -> Iterator[tuple[str, 
         families = _families(own)
         table = [["route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
         for name, some in families.items():
-            fits = ([r.auc or 0 for r in some if (r.route_bytes_per_place or 0) <= NEAR * b] for b in SHOWN)
+            sizes = [(row["route_bytes_per_place"] or 0, row["auc"] or 0) for row in some]
+            fits = ([auc for size, auc in sizes if size <= NEAR * budget] for budget in SHOWN)
             table.append([name, *(f"{max(areas):.3f}" if areas else "" for areas in fits)])
         yield f"{case}: AUC", table
         levels = {}
@@ -641,8 +596,8 @@ def skipped_lines(rows: Sequence[Row]) -> list[str]:
     """Why rows were skipped, one line for each reason, with the first of them."""
     reasons: dict[tuple[str, str], list[str]] = {}
     for row in rows:
-        if row.skipped:
-            reasons.setdefault((row.case, row.skipped), []).append(row.contender)
+        if row["skipped"]:
+            reasons.setdefault((row["case"], row["skipped"]), []).append(row["contender"])
     return [
         f"{case}: skipped {names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {reason}"
         for (case, reason), names in reasons.items()

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from benchmarks.matcher import Program, Row, benchmark, in_one_thread
+from benchmarks.measure import Contender, Row, benchmark, in_one_thread
 from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.recognition.select import best_match
@@ -73,16 +73,12 @@ def _case(route: TemplateMap, queries: int, repeats: int, generator: torch.Gener
     def each(found: Callable[[Tensor], Tensor]) -> Tensor:
         return torch.cat([found(query) for query in asked])
 
-    programs = [
-        Program(name, 1, partial(in_one_thread, partial(each, found)))
+    contenders = [
+        Contender(name, partial(in_one_thread, partial(each, found)))
         for name, found in ((OURS, in_layers), (SCAN, scan))
     ]
     with torch.no_grad():
-        rows = benchmark(f"templates={route.places}", programs, repeats)
+        rows = benchmark(f"templates={route.places}", contenders, repeats)
     for row in rows:
-        seconds, first = row.seconds, row.seconds_first
-        yield row._replace(
-            seconds=None if seconds is None else seconds / queries,
-            seconds_first=None if first is None else first / queries,
-            file_bytes=route.summary().route_bytes,
-        )
+        single = {key: row[key] and row[key] / queries for key in ("seconds", "seconds_first")}
+        yield row | single | {"file_bytes": route.summary().route_bytes}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import tempfile
 import time
@@ -16,10 +15,10 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-import dejavu_torch
+from benchmarks.measure import Row, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.ground_truth import GroundTruth
-from dejavu_torch.data.output import check_output_folder, whole_folder
+from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.augmentation import Augmentation
@@ -73,20 +72,6 @@ def ladder() -> list[Rung]:
     return [*rungs, rungs[-1]._replace(name="a rate in the loss", rate=RATE)]
 
 
-class TrainRow(NamedTuple):
-    """One training. seconds: of its steps alone. auc, recall_at_1: by route bytes per place of the map,
-    where they suffice for one."""
-
-    case: str
-    contender: str
-    seed: int
-    steps: int
-    seconds: float
-    auc: dict[str, float]
-    recall_at_1: dict[str, float]
-    threads: int
-
-
 class Clock(pl.Callback):
     """Seconds of the steps of a training."""
 
@@ -104,13 +89,17 @@ def bench_train(
     seeds: Sequence[int] = SEEDS,
     rungs: Sequence[Rung] | None = None,
     progress: bool = False,
-) -> list[TrainRow]:
+) -> list[Row]:
     """Train a descriptor of the reference in several ways, on the CPU, and find the query on maps of it.
 
     Args:
         reference, query: traverses of one route.
         steps: of each training. seeds: a training each. rungs: `ladder` if None.
         progress: show a progress bar on a terminal.
+
+    Returns:
+        seconds: of the steps alone. auc, recall_at_1: by route bytes per place of the map, where they suffice
+        for one.
 
     Raises:
         InputError: no steps or seeds, or nothing that tells the right places.
@@ -132,7 +121,7 @@ def bench_train(
 
 def _trained(
     rung: Rung, seed: int, reference: Traverse, query: Traverse, truth: GroundTruth, steps: int
-) -> TrainRow:
+) -> Row:
     pl.seed_everything(seed, verbose=False)
     task = PlaceRecognitionTask(
         rung.backbone(), SpectralMapper(BUDGETS[0]), rate=rung.rate, lr=rung.lr, weight_decay=WEIGHT_DECAY
@@ -167,21 +156,21 @@ def _trained(
             continue
         scores = evaluate(model.localize_descriptors(queries), truth, TOLERANCE)
         auc[f"{budget:g}"], recall[f"{budget:g}"] = scores.auc, scores.recall_at_1
-    return TrainRow(
-        f"{reference.name}, {steps} steps",
-        rung.name,
-        seed,
-        steps,
-        clock.seconds,
-        auc,
-        recall,
-        torch.get_num_threads(),
-    )
+    return {
+        "case": f"{reference.name}, {steps} steps",
+        "contender": rung.name,
+        "seed": seed,
+        "steps": steps,
+        "seconds": clock.seconds,
+        "auc": auc,
+        "recall_at_1": recall,
+        "threads": torch.get_num_threads(),
+    }
 
 
 def run_train(
     out: Path, sources: Sequence[str] = (), steps: int | None = None, seeds: Sequence[int] = ()
-) -> list[TrainRow]:
+) -> list[Row]:
     """Run the bench, and write bench.json and bench.png into the folder `out`.
 
     Args:
@@ -197,36 +186,26 @@ def run_train(
     rows = bench_train(
         reference, query, STEPS if steps is None else steps, tuple(seeds) or SEEDS, progress=True
     )
-    facts = {
-        "rows": [row._asdict() for row in rows],
-        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
-        "bf16": has_bf16(),
-        "versions": {"dejavu_torch": dejavu_torch.__version__, "torch": torch.__version__},
-    }
-    with whole_folder(out) as folder:
-        (folder / "bench.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-        figure, _ = plot_ratios(
-            {f"{rows[0].steps} steps": _means(rows)}, "seconds of a training, mean of the seeds"
-        )
-        figure.savefig(folder / "bench.png")
+    title, axis = f"{rows[0]['steps']} steps", "seconds of a training, mean of the seeds"
+    write_bench(out, rows, plot_ratios({title: _means(rows)}, axis), bf16=has_bf16())
     return rows
 
 
-def _means(rows: Sequence[TrainRow]) -> dict[str, float]:
+def _means(rows: Sequence[Row]) -> dict[str, float]:
     seconds: dict[str, list[float]] = {}
     for row in rows:
-        seconds.setdefault(row.contender, []).append(row.seconds)
+        seconds.setdefault(row["contender"], []).append(row["seconds"])
     return {name: sum(some) / len(some) for name, some in seconds.items()}
 
 
-def train_table(rows: Sequence[TrainRow]) -> list[list[str]]:
+def train_table(rows: Sequence[Row]) -> list[list[str]]:
     """The figures as rows of text, the header first: means of the seeds, and their lowest and highest."""
     table = [["", "seconds", *(f"AUC at {budget:g} B" for budget in BUDGETS)]]
-    for name in dict.fromkeys(row.contender for row in rows):
-        own = [row for row in rows if row.contender == name]
+    for name in dict.fromkeys(row["contender"] for row in rows):
+        own = [row for row in rows if row["contender"] == name]
         line = [name, f"{_means(own)[name]:.1f}"]
         for budget in BUDGETS:
-            found = [row.auc[f"{budget:g}"] for row in own if f"{budget:g}" in row.auc]
+            found = [row["auc"][f"{budget:g}"] for row in own if f"{budget:g}" in row["auc"]]
             told = f"{sum(found) / len(found):.3f} ({min(found):.3f}-{max(found):.3f})" if found else "-"
             line.append(told)
         table.append(line)

@@ -52,7 +52,7 @@ def test_what_fits_is_not_held_twice() -> None:
     if not Path("/proc/self/statm").exists():
         pytest.skip("no /proc")
     code = (
-        "import torch; from benchmarks.matcher import peak_memory\n"
+        "import torch; from benchmarks.measure import peak_memory\n"
         "from dejavu_torch.memory import concatenate\n"
         "print(peak_memory(lambda: concatenate(torch.ones(64, 2048) for _ in range(700))))"
     )

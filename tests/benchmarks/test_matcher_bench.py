@@ -14,18 +14,9 @@ from helpers import refused
 from matplotlib.figure import Figure
 
 from benchmarks import matcher as bench
-from benchmarks.matcher import (
-    Program,
-    Row,
-    Run,
-    bench_matcher,
-    bench_table,
-    benchmark,
-    run_bench,
-    write_bench,
-)
+from benchmarks.matcher import COLUMNS, bench_matcher, run_matcher
+from benchmarks.measure import Contender, Row, Run, benchmark, new_row, table, write_bench
 from benchmarks.plots import plot_ratios
-from dejavu_torch.evaluation.report import text_table
 
 
 def small(**options: object) -> list[Row]:
@@ -43,7 +34,7 @@ def small(**options: object) -> list[Row]:
 
 @pytest.fixture(scope="module")
 def rows() -> dict[tuple[str, str], Row]:
-    return {(row.case, row.contender): row for row in small()}
+    return {(row["case"], row["contender"]): row for row in small()}
 
 
 L1 = "l1 9 x 40 x 410"
@@ -74,64 +65,65 @@ def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
 
 def test_an_exported_map_has_the_size_of_its_file(rows: dict[tuple[str, str], Row]) -> None:
     pytest.importorskip("onnxruntime")
-    assert rows[EXPORT, "dejavu"].file_bytes is None
-    assert (rows[EXPORT, "onnxruntime"].file_bytes or 0) > 200 * bench.NUMBERS * 4
+    assert rows[EXPORT, "dejavu"]["file_bytes"] is None
+    assert (rows[EXPORT, "onnxruntime"]["file_bytes"] or 0) > 200 * bench.NUMBERS * 4
 
 
 def test_without_onnxruntime_the_row_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     ours, theirs = small(images=[], distances=[], sequences=[], filters=[])
-    assert ours.seconds is not None
-    assert theirs.skipped is not None
-    assert "onnxruntime" in theirs.skipped
-    assert theirs.file_bytes is None
+    assert ours["seconds"] is not None
+    assert theirs["skipped"] is not None
+    assert "onnxruntime" in theirs["skipped"]
+    assert theirs["file_bytes"] is None
 
 
 def test_contenders_give_what_we_give(rows: dict[tuple[str, str], Row]) -> None:
-    ran = {key: row for key, row in rows.items() if row.skipped is None}
+    ran = {key: row for key, row in rows.items() if row["skipped"] is None}
     assert {(HOG, "scikit-image"), (L1, "scipy cdist"), (L1, "torch.cdist")} <= ran.keys()  # the test extra
     for (case, _), row in ran.items():
-        assert row.difference is not None
-        assert row.difference < {HOG: 1e-6, FILTER: 0.05}.get(case, 1e-4)
+        assert row["difference"] is not None
+        assert row["difference"] < {HOG: 1e-6, FILTER: 0.05}.get(case, 1e-4)
 
 
 def test_a_size_is_that_of_the_result(rows: dict[tuple[str, str], Row]) -> None:
-    assert rows[HOG, "dejavu"].bytes == rows[HOG, "scikit-image"].bytes == 70 * (2 * 1 * 4 * 9) * 4
-    assert rows[L1, "dejavu"].bytes == 9 * 410 * 4
-    assert rows[L1, "scipy cdist"].bytes == 9 * 410 * 8
+    assert rows[HOG, "dejavu"]["bytes"] == rows[HOG, "scikit-image"]["bytes"] == 70 * (2 * 1 * 4 * 9) * 4
+    assert rows[L1, "dejavu"]["bytes"] == 9 * 410 * 4
+    assert rows[L1, "scipy cdist"]["bytes"] == 9 * 410 * 8
 
 
 def test_threads_are_reported(rows: dict[tuple[str, str], Row]) -> None:
-    assert rows[L1, "dejavu"].threads == torch.get_num_threads()
-    assert rows[L1, "scipy cdist"].threads == rows[HOG, "scikit-image"].threads == 1
+    assert rows[L1, "dejavu"]["threads"] == torch.get_num_threads()
+    assert rows[L1, "scipy cdist"]["threads"] == rows[HOG, "scikit-image"]["threads"] == 1
 
 
 def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
     for case in (HOG, L1, SEQUENCE, FILTER, EXPORT):
-        mine = [row for row in rows.values() if row.case == case and row.seconds]
-        ours = min(row.seconds for row in mine if row.contender.startswith("dejavu") and row.seconds)
-        assert [row.ratio_to_ours for row in mine] == [row.seconds and row.seconds / ours for row in mine]
+        seconds = {name: row["seconds"] for (of, name), row in rows.items() if of == case and row["seconds"]}
+        ours = min(taken for name, taken in seconds.items() if name.startswith("dejavu"))
+        for name, taken in seconds.items():
+            assert rows[case, name]["ratio_to_ours"] == taken / ours
 
 
 def test_a_program_that_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
-    found = {row.contender: row for row in small(images=[], sequences=[], filters=[], exports=[])}
-    assert found["faiss"].skipped is not None
-    assert "faiss" in found["faiss"].skipped
-    assert found["faiss"]._replace(skipped=None) == Row(L1, "faiss")
-    assert found["torch.compile"].skipped == "RuntimeError: not asked for"
-    assert found["torch.cdist"].skipped is None
+    found = {row["contender"]: row for row in small(images=[], sequences=[], filters=[], exports=[])}
+    assert found["faiss"]["skipped"] is not None
+    assert "faiss" in found["faiss"]["skipped"]
+    assert found["faiss"] | {"skipped": None} == new_row(L1, "faiss")
+    assert found["torch.compile"]["skipped"] == "RuntimeError: not asked for"
+    assert found["torch.cdist"]["skipped"] is None
 
 
 def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "AT_MOST", 0)
     ours, theirs = small(distances=[], sequences=[], filters=[], exports=[])
-    assert (ours.measured_rows, theirs.measured_rows) == (None, 1)
-    assert theirs.bytes == ours.bytes
-    assert theirs.difference is not None
-    assert theirs.difference < 1e-6
-    assert theirs.seconds is not None
-    assert theirs.seconds_first is not None
+    assert (ours["measured_rows"], theirs["measured_rows"]) == (None, 1)
+    assert theirs["bytes"] == ours["bytes"]
+    assert theirs["difference"] is not None
+    assert theirs["difference"] < 1e-6
+    assert theirs["seconds"] is not None
+    assert theirs["seconds_first"] is not None
 
 
 class Counted:
@@ -154,14 +146,14 @@ def test_contenders_take_turns_after_the_warm_up() -> None:
     log: list[str] = []
     a = Counted("a", torch.zeros(4), log, pause=0.2)
     b = Counted("b", torch.tensor([0.0, 0.5]), log)
-    first, second = benchmark("case", [Program("dejavu", 1, a.ready), Program("other", 2, b.ready)], 3)
-    watched = 0 if first.peak_bytes is None else 1
+    first, second = benchmark("case", [Contender("dejavu", a.ready, 1), Contender("other", b.ready, 2)], 3)
+    watched = 0 if first["peak_bytes"] is None else 1
     assert log == ["a ready", *["a"] * (1 + watched), "b ready", *["b"] * (1 + watched), *["a", "b"] * 3]
-    assert first.seconds is not None
-    assert first.seconds_first is not None
-    assert first.seconds < 0.2 <= first.seconds_first  # getting ready counts in the first run only
-    assert (first.difference, second.difference) == (0.0, 0.5)
-    assert (second.measured_rows, second.bytes, second.threads) == (2, 16, 2)
+    assert first["seconds"] is not None
+    assert first["seconds_first"] is not None
+    assert first["seconds"] < 0.2 <= first["seconds_first"]  # getting ready counts in the first run only
+    assert (first["difference"], second["difference"]) == (0.0, 0.5)
+    assert (second["measured_rows"], second["bytes"], second["threads"]) == (2, 16, 2)
 
 
 def test_an_error_of_ours_is_raised_and_one_of_theirs_is_a_row() -> None:
@@ -169,10 +161,10 @@ def test_an_error_of_ours_is_raised_and_one_of_theirs_is_a_row() -> None:
         raise ZeroDivisionError("of\nno use")
 
     fine = Counted("a", torch.zeros(2), [])
-    rows = benchmark("case", [Program("dejavu", 1, fine.ready), Program("other", 1, broken)], 1)
-    assert rows[1] == Row("case", "other", skipped="ZeroDivisionError: of no use")
+    rows = benchmark("case", [Contender("dejavu", fine.ready, 1), Contender("other", broken, 1)], 1)
+    assert rows[1] == new_row("case", "other", skipped="ZeroDivisionError: of no use")
     with pytest.raises(ZeroDivisionError):
-        benchmark("case", [Program("dejavu", 1, broken), Program("other", 1, fine.ready)], 1)
+        benchmark("case", [Contender("dejavu", broken, 1), Contender("other", fine.ready, 1)], 1)
 
 
 def test_peak_memory_sees_what_is_freed_again() -> None:
@@ -181,7 +173,7 @@ def test_peak_memory_sees_what_is_freed_again() -> None:
 
     # in a process of its own, where nothing else is freed meanwhile
     code = (
-        "import time, torch; from benchmarks.matcher import peak_memory\n"
+        "import time, torch; from benchmarks.measure import peak_memory\n"
         "def run():\n"
         "    large = torch.ones(16, 2**20)\n"  # 64 MiB
         "    time.sleep(0.1)\n"
@@ -193,9 +185,9 @@ def test_peak_memory_sees_what_is_freed_again() -> None:
 
 
 def test_what_is_written(tmp_path: Path, rows: dict[tuple[str, str], Row]) -> None:
-    write_bench(tmp_path, list(rows.values()))
+    write_bench(tmp_path, list(rows.values()), plot_ratios({"one": {"dejavu": 1.0}}))
     written = json.loads((tmp_path / "bench.json").read_text())
-    assert [Row(**row) for row in written["rows"]] == list(rows.values())
+    assert written["rows"] == list(rows.values())
     assert written["threads"] == torch.get_num_threads()
     assert written["l1_backend"] in ("numba", "torch")
     assert written["versions"]["torch"].startswith(torch.__version__.split("+")[0])
@@ -212,30 +204,27 @@ def test_a_bar_for_each_contender() -> None:
 
 
 def test_the_table() -> None:
+    done = {"seconds": 0.5, "seconds_first": 1.25, "ratio_to_ours": 1.0, "threads": 2, "difference": 0.0}
     rows = [
-        Row("l1", "dejavu", 0.5, 1.25, 1.0, 2_000_000, 1_000_000, 2, 0.0),
-        Row("l1", "slow", 5.0, 6.0, 10.0, None, 1_000_000, 1, 1e-5, measured_rows=7, file_bytes=4_000_000),
-        Row("l1", "absent", skipped="ImportError: no module"),
+        new_row("l1", "dejavu", **done, peak_bytes=2_000_000, bytes=1_000_000),
+        new_row("l1", "slow", **done, measured_rows=7, file_bytes=4_000_000),
+        new_row("l1", "absent", skipped="ImportError: no module"),
     ]
-    head, *body = bench_table(rows)
-    assert body == [
+    assert table(rows, COLUMNS)[1:] == [
         ["l1: dejavu", "0.500", "1.0", "1.25", "2", "2.0", "1.0", "", "0.0e+00", ""],
-        ["l1: slow", "5.000", "10.0", "6.00", "1", "", "1.0", "4.0", "1.0e-05", "7 measured"],
+        ["l1: slow", "0.500", "1.0", "1.25", "2", "", "", "4.0", "0.0e+00", "7 measured"],
         ["l1: absent", "", "", "", "", "", "", "", "", "skipped: ImportError: no module"],
     ]
-    assert len(text_table([head, *body]).splitlines()) == 4
 
 
-def test_run_bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [Row("l1", "dejavu", 1.0, ratio_to_ours=1.0)]
-    monkeypatch.setitem(bench.BENCHES, "matcher", lambda frames, repeats: rows if frames == 8 else [])
-    assert run_bench("matcher", tmp_path / "new", frames=8) == rows
-    assert (tmp_path / "new" / "bench.json").exists()
-    with refused("'brew'", "matcher"):
-        run_bench("brew", tmp_path / "other")
+def test_a_run_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [new_row("l1", "dejavu", seconds=1.0, ratio_to_ours=1.0)]
+    monkeypatch.setattr(bench, "bench_matcher", lambda: rows)
+    assert run_matcher(tmp_path / "new") == rows
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["bench.json", "bench.png"]
     (tmp_path / "file").touch()
     with refused("file"):
-        run_bench("matcher", tmp_path / "file")
+        run_matcher(tmp_path / "file")
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ from benchmarks.memory import (
     Task,
     bench_memory,
     gathered,
+    localize,
     measured,
-    memory_table,
     paint_drives,
     shown_by,
 )
@@ -64,16 +64,18 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
 
 def test_every_contender_learns_each_size_and_localizes_on_the_middle_one(stub: Stub) -> None:
     rows = list(bench_memory([300, 100, 200], queries=[5]))
-    assert [row.case for row in rows[:2]] == ["programs loaded", "learn 100 frames"]
-    cases = dict.fromkeys(row.case for row in rows[1:])
+    assert [row["case"] for row in rows[:2]] == ["programs loaded", "learn 100 frames"]
+    cases = dict.fromkeys(row["case"] for row in rows[1:])
     assert list(cases) == [
         "learn 100 frames",
         "learn 200 frames",
         "learn 300 frames",
         "localize 5 queries, 200 places",
     ]
-    assert [row.contender for row in rows[1:]] == list(CONTENDERS) * len(cases)
-    assert [(row.case, row.contender) for row in rows] == [(task.case, task.contender) for task in stub.tasks]
+    assert [row["contender"] for row in rows[1:]] == list(CONTENDERS) * len(cases)
+    assert [(row["case"], row["contender"]) for row in rows] == [
+        (task.case, task.contender) for task in stub.tasks
+    ]
     assert max(stub.files) < len(CONTENDERS)  # files that nothing reads any more do not pile up
 
 
@@ -145,7 +147,7 @@ def test_every_contender_finds_the_places(name: str, drives: Path, tmp_path: Pat
     route, queries = (np.load(drives / f"{which}.npy") for which in ("places", "queries"))
     shown = shown_by(50, 200)
     CONTENDERS[name].learn(Drive(route, torch.arange(200)), tmp_path / "route")
-    found = CONTENDERS[name].localize(tmp_path / "route", Drive(queries, shown))
+    found = localize(CONTENDERS[name], tmp_path / "route", Drive(queries, shown))
     assert ((found - shown).abs() <= TOLERANCE).double().mean() > 0.9
 
 
@@ -157,14 +159,3 @@ def test_why_a_process_failed_that_does_not_import_from_the_current_folder(
     facts = measured(Task("HOG, float32", 150, 10, 1), drives)  # nothing learned so many
     assert list(facts) == ["skipped"]
     assert "150" in facts["skipped"]
-
-
-def test_the_table() -> None:
-    rows = [
-        footprint.Row("learn", "dejavu", 2.0, peak_bytes=3_000_000, bytes=10_000, recall_at_1=0.5),
-        footprint.Row("learn", "faiss, HOG", skipped="no faiss"),
-    ]
-    assert memory_table(rows)[1:] == [
-        ["learn: dejavu", "3.0", "0.01", "2.0", "0.500", ""],
-        ["learn: faiss, HOG", "", "", "", "", "skipped: no faiss"],
-    ]

@@ -11,7 +11,8 @@ from command_line import benchmark
 from helpers import refused
 
 from benchmarks import train as train_speed
-from benchmarks.train import Rung, TrainRow, bench_train, ladder, train_table
+from benchmarks.measure import Row
+from benchmarks.train import Rung, bench_train, ladder, train_table
 from dejavu_torch import open_source
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
@@ -24,23 +25,23 @@ def small() -> SmallCNN:
 
 
 @pytest.fixture(scope="module")
-def rows() -> list[TrainRow]:
+def rows() -> list[Row]:
     rungs = [Rung("plain", small, Augmentation), Rung("other", small, lambda: Augmentation(noise=0.0))]
     return bench_train(open_source(ROUTE), open_source(AGAIN), steps=3, seeds=(0, 1), rungs=rungs)
 
 
-def test_every_way_is_trained_with_every_seed(rows: list[TrainRow]) -> None:
-    assert [(row.contender, row.seed) for row in rows] == [
+def test_every_way_is_trained_with_every_seed(rows: list[Row]) -> None:
+    assert [(row["contender"], row["seed"]) for row in rows] == [
         ("plain", 0),
         ("plain", 1),
         ("other", 0),
         ("other", 1),
     ]
     for row in rows:
-        assert row.seconds > 0
-        assert row.auc.keys() == row.recall_at_1.keys() == {"2.4", "1"}
-        assert all(0 <= value <= 1 for value in row.auc.values())
-    assert rows[0].auc != rows[1].auc
+        assert row["seconds"] > 0
+        assert row["auc"].keys() == row["recall_at_1"].keys() == {"2.4", "1"}
+        assert all(0 <= value <= 1 for value in row["auc"].values())
+    assert rows[0]["auc"] != rows[1]["auc"]
     header, *lines = train_table(rows)
     assert [line[0] for line in lines] == ["plain", "other"]
     assert {len(line) for line in (header, *lines)} == {5}
@@ -66,7 +67,7 @@ def test_each_rung_of_the_ladder_changes_one_thing() -> None:
 
 
 def test_the_command_writes_them(
-    rows: list[TrainRow], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    rows: list[Row], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(train_speed, "bench_train", lambda *_, **__: rows)
     benchmark("train", ROUTE, AGAIN, "--out", tmp_path / "bench", "--steps", "3", "--seeds", "0", "1")

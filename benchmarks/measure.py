@@ -1,0 +1,286 @@
+"""What all benchmarks share: contenders, rows, time, memory, processes, and what is written."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import dejavu_torch
+from benchmarks.plots import plot_ratios
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.output import whole_folder
+from dejavu_torch.evaluation.plots import Plot
+from dejavu_torch.maps.distance import l1_backend
+from dejavu_torch.text import one_line
+
+COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu", "onnxruntime")
+PROCESS = Path("/proc/self")
+
+Row = dict[str, Any]  # a line of bench.json; what is not known of it is None
+KEYS = (
+    *("seconds", "seconds_first", "ratio_to_ours", "peak_bytes", "bytes", "threads", "difference"),
+    *("measured_rows", "skipped", "recall_at_1", "file_bytes", "cpu_seconds"),
+)
+Column = tuple[str, str] | tuple[str, str, float]  # key of a row, format, unit
+Run = Callable[[], Tensor]
+
+
+class Contender(NamedTuple):
+    """What is measured side by side.
+
+    name: ours start with "dejavu". prepare: imports what it needs and returns what does the work; what it
+    raises says why there are no figures. threads: that it may use. family: of those that make one front.
+    """
+
+    name: str
+    prepare: Callable[[], Callable[..., Any]]
+    threads: int = 1
+    family: str = ""
+
+
+class Found(NamedTuple):
+    """The best place of each query and its score, lower is better: (Q,), (Q,)."""
+
+    score: Tensor
+    place: Tensor
+
+
+Find = Callable[[Tensor], Found]
+
+
+class Opened(NamedTuple):
+    """A file that was loaded.
+
+    find: the places of queries, frames or descriptors. device: that it runs on. scanned: bytes that each
+    batch of queries goes through as a whole, asked for when there was one; None where it did not.
+    """
+
+    find: Find
+    device: str = "cpu"
+    scanned: Callable[[], int | None] = lambda: None
+
+
+class Store(ABC):
+    """A way to keep a route in a file and to find places on it, each in a process of its own."""
+
+    def prepare(self, route: IndexedTraverse) -> float | None:
+        """Choose by the route, which is no part of learning; the step of a map that learns with one."""
+        return None
+
+    @abstractmethod
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
+        """Keep a route in a file; how many bytes of it are the route's."""
+
+    @abstractmethod
+    def load(self, path: Path, device: str = "cpu") -> Opened:
+        """Make ready to find queries in a file; who cannot use the device takes the CPU."""
+
+
+def new_row(case: str, contender: str, keys: Sequence[str] = KEYS, **facts: Any) -> Row:
+    """A row of so many keys, of which these facts are known."""
+    return {"case": case, "contender": contender} | dict.fromkeys(keys) | facts
+
+
+def benchmark(case: str, contenders: Sequence[Contender], repeats: int) -> list[Row]:
+    """Time all in turn, round after round, and compare every result with that of the first, which is ours.
+
+    A result with fewer rows than the case has stands for a part of the work.
+
+    Convention: not counted are one run of each that loads and compiles, and one that measures memory.
+        An error of the first is raised; one of another is a row that names it.
+
+    Returns:
+        seconds: for the whole case, best of the repeats. seconds_first: of the first run, with all that is
+        loaded and compiled for it. ratio_to_ours: seconds over those of our fastest. peak_bytes: most memory
+        held during a run beyond what was held before. bytes: of the result. difference: largest to our
+        result. measured_rows: where only a part of the case was run: seconds and bytes are scaled up from
+        it, seconds_first and peak_bytes are its own. skipped: why there are no figures.
+    """
+    rows = [new_row(case, one.name) for one in contenders]
+    runs: list[tuple[Row, Run, float]] = []
+    expected: Tensor | None = None
+    bar = tqdm(total=len(contenders) * (1 + repeats), desc=case, disable=None, leave=False)
+    for row, contender in zip(rows, contenders, strict=True):
+        bar.update()
+        try:
+            began = time.perf_counter()
+            run = contender.prepare()
+            result = run()
+            row["seconds_first"] = time.perf_counter() - began
+            row["peak_bytes"] = peak_memory(run)
+            expected = result if expected is None else expected
+            row["difference"] = float((result - expected[: len(result)]).abs().max())
+        except Exception as error:  # whatever another program fails with
+            if expected is None:
+                raise
+            row |= new_row(case, contender.name, skipped=f"{type(error).__name__}: {one_line(error)}"[:200])
+            continue
+        scale = len(expected) / len(result)
+        row |= {"bytes": round(result.nbytes * scale), "threads": contender.threads}
+        row["measured_rows"] = len(result) if scale > 1 else None
+        runs.append((row, run, scale))
+        del result  # it would hide what the next one needs
+    for _ in range(repeats):
+        for row, run, scale in runs:
+            began = time.perf_counter()
+            run()
+            row["seconds"] = min(row["seconds"] or math.inf, scale * (time.perf_counter() - began))
+            bar.update()
+    bar.close()
+    return with_ratios(rows)
+
+
+def is_ours(row: Row) -> bool:
+    """Whether a row is of this package."""
+    return bool(row["contender"].startswith("dejavu"))
+
+
+def with_ratios(rows: Sequence[Row], ours: Callable[[Row], bool] = is_ours) -> list[Row]:
+    """The rows with their seconds over those of our fastest of the case."""
+    fastest: dict[str, float] = {}
+    for row in rows:
+        if ours(row) and row["seconds"]:
+            fastest[row["case"]] = min(row["seconds"], fastest.get(row["case"], math.inf))
+    ratios = [row["seconds"] and row["seconds"] / fastest.get(row["case"], math.nan) for row in rows]
+    return [
+        row | {"ratio_to_ours": None if ratio is None or math.isnan(ratio) else ratio}
+        for row, ratio in zip(rows, ratios, strict=True)
+    ]
+
+
+def in_one_thread(run: Run) -> Run:
+    """The same work where torch may use one thread only."""
+
+    def alone() -> Tensor:
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return run()
+        finally:
+            torch.set_num_threads(threads)
+
+    return alone
+
+
+def peak_memory(run: Callable[[], object]) -> int | None:
+    """Most bytes of memory during a run beyond those before it; None where the system does not tell."""
+    try:
+        (PROCESS / "clear_refs").write_text("5")  # Linux: the peak begins anew
+    except OSError:
+        run()
+        return None
+    before = resident()
+    run()
+    return resident("VmHWM") - before
+
+
+def resident(what: str = "VmRSS") -> int:
+    """Bytes of memory that this process holds now, or held at most ("VmHWM"); of Linux."""
+    lines = (PROCESS / "status").read_text().splitlines()
+    return 1024 * int(next(line.split()[1] for line in lines if line.startswith(what)))
+
+
+def give_back() -> None:
+    """Return to the system what is free in the heap, where its library can."""
+    gc.collect()
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def in_process(module: str, arguments: object) -> dict[str, Any]:
+    """What a module prints as JSON, run by itself on arguments; where it fails why, as `skipped`."""
+    # without the current folder, from which nothing is imported
+    search = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", module, json.dumps(arguments)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": search},
+        preexec_fn=end_with_parent if sys.platform == "linux" else None,
+    )
+    if done.returncode < 0:
+        return {"skipped": f"ended by signal {-done.returncode}, such as for want of memory"}
+    if done.returncode:
+        return {"skipped": (done.stderr.strip().splitlines() or ["it failed"])[-1][:200]}
+    facts: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return facts
+
+
+def end_with_parent() -> None:
+    """Have the system end this process when its parent ends, as by Ctrl-C."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
+def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **facts: Any) -> None:
+    """Write bench.json, and bench.png where there is a picture, into a folder: all of it or nothing."""
+    content = {"rows": rows} | facts | programs()
+    with whole_folder(out) as folder:
+        (folder / "bench.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        if picture is not None:
+            picture[0].savefig(folder / "bench.png")
+
+
+def programs() -> dict[str, Any]:
+    """What figures depend on beside the machine, as bench.json names it."""
+    return {
+        "threads": torch.get_num_threads(),
+        "l1_backend": l1_backend(),
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "version": dejavu_torch.__version__,
+        "versions": {"dejavu_torch": dejavu_torch.__version__} | {name: _version(name) for name in COMPARED},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **label: str) -> Plot | None:
+    """A figure of each row that has it, by case and contender; None where no row does."""
+    cases: dict[str, dict[str, float]] = {}
+    for row in rows:
+        if row[key] is not None:
+            cases.setdefault(row["case"], {})[row["contender"]] = row[key] / unit
+    return plot_ratios(cases, **label) if cases else None
+
+
+def table(
+    rows: Sequence[Row], columns: Mapping[str, Column], name: str = "{case}: {contender}"
+) -> list[list[str]]:
+    """The figures as rows of text, the header first, and at the end why there are none.
+
+    Example:
+        >>> table([{"case": "l1", "contender": "dejavu", "bytes": 2e6}], {"MB": ("bytes", ".1f", 1e6)})
+        [['', 'MB', ''], ['l1: dejavu', '2.0', '']]
+    """
+
+    def text(value: float | None, form: str, unit: float = 1.0) -> str:
+        return "" if value is None else format(value / unit, form)
+
+    body = []
+    for row in rows:
+        figures = [text(row[key], *form) for key, *form in columns.values()]
+        note = f"{row['measured_rows']} measured" if row.get("measured_rows") else ""
+        note = f"skipped: {row['skipped']}" if row.get("skipped") else note
+        body.append([name.format(**row), *figures, note])
+    return [["", *columns, ""], *body]
