@@ -76,7 +76,7 @@ def names_in(folder: Path) -> set[str]:
 
 
 def test_ctrl_c_at_any_moment_is_one_line_and_130(folder: Path) -> None:
-    moments = [0, 0.2, 0.7, 1.4, 2.1]
+    moments = [0, 0.7, 1.6]
     before = names_in(folder)
     for twice, moment in enumerate(moments):
         process = start(folder, *REPORT_OF_ARRAYS)
@@ -125,7 +125,7 @@ def test_a_training_that_is_interrupted_leaves_a_map(folder: Path) -> None:
     )
     process = start(folder, "train", "fit", "--config", "train.yaml")
     wait_for(process, lambda: list((folder / "run").rglob("config.yaml")))
-    time.sleep(2)
+    time.sleep(1)
     process.send_signal(signal.SIGINT)
     out, said = process.communicate(timeout=60)
     lines = said.splitlines(keepends=True)

@@ -130,9 +130,9 @@ def test_batches_are_gathered_in_order(drives: Path) -> None:
     assert torch.equal(whole, torch.cat([batch.mean((1, 2, 3)) for batch in drive.batches(70)]))
 
 
-def test_a_process_learns_and_another_finds_the_places(drives: Path) -> None:
+def test_places_are_learned_and_found(drives: Path) -> None:
     name = "HOG, float32"
-    learned, found = (measured(Task(name, 200, queries, 1), drives) for queries in (0, 50))
+    learned, found = (footprint.measure(Task(name, 200, queries, 1), drives) for queries in (0, 50))
     assert learned["bytes"] == found["bytes"] == Task(name, 200, 0, 1).file(drives).stat().st_size
     assert found["recall_at_1"] > 0.9
     assert not list(drives.glob("*.trial"))
