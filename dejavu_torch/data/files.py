@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import stat
 import warnings
 from collections.abc import Iterator
@@ -101,6 +102,25 @@ def read_text(path: Path, expected: str) -> str:
     if "\0" in text:
         raise InputError(f"{path} is no text; expected {expected}")
     return text
+
+
+def read_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
+    """Number and cells of each line of a csv that is not blank.
+
+    Cells are separated by semicolons, tabs, commas or spaces: by the first of these that the first line with
+    several cells has. Where semicolons separate, a comma may be a decimal one, and stays in its cell.
+
+    Raises:
+        InputError: see `read_text`, or quotes that do not fit.
+    """
+    lines = read_text(path, expected).splitlines()
+    separator = next((sign for line in lines for sign in ";\t," if sign in line), " ")
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    try:
+        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}, line {reader.line_num}: {error}; expected {expected}") from error
+    return [(number, cells) for number, cells in rows if any(cells)]
 
 
 def as_number(text: str) -> float | None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from dejavu_torch.data.arrays import HEADER, read_header
-from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_text, reading
+from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse
 
@@ -428,15 +428,10 @@ def _listed(path: Path, frames: int | None, interpolate: bool) -> dict[int, list
 
 def _table_rows(path: Path) -> list[tuple[int, list[str]]]:
     """Number and cells of each line that is not blank, without the header."""
-    text = read_text(path, "lines of query,place").replace('"', "")
-    # where semicolons separate, a comma may be a decimal one: it stays in its cell and is refused
-    separator = next((sign for sign in ";\t," if sign in text), None)
-    rows = []
-    for number, line in enumerate(text.split("\n"), 1):
-        cells = [cell.strip() for cell in line.strip(" ").split(separator)]
-        while cells and not cells[-1]:
+    rows = read_rows(path, "lines of query,place")
+    for _, cells in rows:
+        while not cells[-1]:
             del cells[-1]
-        rows += [(number, cells)] if cells else []
     if rows and all(as_number(cell) is None for cell in rows[0][1]):
         number, names = rows.pop(0)
         first, *others = [name.lower() for name in names]

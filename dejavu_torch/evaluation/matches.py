@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import as_number, read_text
+from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.output import whole_file
 from dejavu_torch.maps.frame_table import Route
 from dejavu_torch.text import printable
@@ -184,25 +184,18 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Where each row stands, and its cells by name."""
-    reader = csv.reader(read_text(path, EXPECTED).splitlines(), skipinitialspace=True)
     names: list[str] = []
-    try:
-        for row in reader:
-            cells = [cell.strip() for cell in row]
-            where = f"{path}, line {reader.line_num}"
-            if not any(cells):
-                continue
-            if not names:
-                names = [name.lower() for name in cells]
-                missing = [name for name in ("query", "place", "score") if name not in names]
-                if missing:
-                    raise InputError(f"{where}: no column {missing[0]}; expected {EXPECTED}")
-            elif len(cells) < len(names):
-                raise InputError(f"{where}: {len(cells)} cells; expected {len(names)} as in the header")
-            else:
-                yield where, dict(zip(names, cells, strict=False))
-    except csv.Error as error:
-        raise InputError(f"{path}, line {reader.line_num}: {error}; expected {EXPECTED}") from error
+    for number, cells in read_rows(path, EXPECTED):
+        where = f"{path}, line {number}"
+        if not names:
+            names = [name.lower() for name in cells]
+            missing = [name for name in ("query", "place", "score") if name not in names]
+            if missing:
+                raise InputError(f"{where}: no column {missing[0]}; expected {EXPECTED}")
+        elif len(cells) < len(names):
+            raise InputError(f"{where}: {len(cells)} cells; expected {len(names)} as in the header")
+        else:
+            yield where, dict(zip(names, cells, strict=False))
 
 
 def _whole(text: str, name: str, least: int, where: str) -> int:

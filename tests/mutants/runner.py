@@ -31,7 +31,16 @@ from .by_tester import MUTANTS as BY_TESTER
 from .mutant import Mutant
 
 ROOT = Path(__file__).parents[2]
-COPIED = ("dejavu_torch", "configs", "tests", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")
+COPIED = (
+    "dejavu_torch",
+    "benchmarks",
+    "configs",
+    "tests",
+    "docs",
+    "README.md",
+    "CONTRIBUTING.md",
+    "pyproject.toml",
+)
 MUTANTS: list[Mutant] = [*BY_READER, *BY_TESTER]
 SLOW_IMPORTS = ("torch", "kornia", "numpy", "pytest", "hypothesis", "PIL.Image", "safetensors.torch")
 LIMIT = 120  # seconds; a mutant whose tests take longer counts as killed
