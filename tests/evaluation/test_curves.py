@@ -88,6 +88,22 @@ def test_every_distinct_score_is_a_threshold(queries: list[tuple[float, bool, bo
     assert recall_at_full_precision(curve) == max((r for p, r, _ in expected if p == 1), default=0.0)
 
 
+def test_by_hand() -> None:
+    """Five queries: right, right, wrong, right, and one that reports nothing; all had an answer."""
+    score = torch.tensor([1.0, 2.0, 3.0, 4.0, INF])
+    right = torch.tensor([True, True, False, True, False])
+    answerable = torch.ones(5, dtype=torch.bool)
+    every, reported = pr_curve(score, right, answerable), pr_curve(score, right, answerable, "reported")
+    assert every.precision.tolist() == [1, 1, 2 / 3, 3 / 4]
+    assert every.recall.tolist() == pytest.approx([1 / 5, 2 / 5, 2 / 5, 3 / 5])
+    assert every.threshold.tolist() == [1, 2, 3, 4]
+    assert reported.recall.tolist() == pytest.approx([1 / 5, 2 / 5, 2 / 4, 3 / 4])
+    # the steps of recall times the mean precision, no point added at recall 0
+    assert area(every) == pytest.approx(1 / 5 * 1 + 0 + 1 / 5 * (2 / 3 + 3 / 4) / 2)
+    assert area(reported) == pytest.approx(1 / 5 + 1 / 10 * (1 + 2 / 3) / 2 + 1 / 4 * (2 / 3 + 3 / 4) / 2)
+    assert recall_at_full_precision(every) == pytest.approx(2 / 5)
+
+
 @BOTH
 @given(queries=QUERIES, order=st.randoms())
 def test_the_order_of_queries_changes_nothing(

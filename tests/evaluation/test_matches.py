@@ -86,6 +86,11 @@ def test_other_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
     assert told(written(tmp_path, text)) == told(written(tmp_path, PLAIN))
 
 
+def test_without_the_column_every_finite_score_is_accepted(tmp_path: Path) -> None:
+    path = written(tmp_path, "query,place,score\n5,1,0.25\n3,2,inf\n4,-1,0.5\n")
+    assert told(path) == [(3, -1, INF, False), (4, -1, INF, False), (5, 1, 0.25, True)]
+
+
 def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path: Path) -> None:
     path = written(tmp_path, "query,place,score,accepted\n0,-1,0.5,1\n1,4,inf,1\n")
     assert told(path) == [(0, -1, INF, False), (1, -1, INF, False)]
