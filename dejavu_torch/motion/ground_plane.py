@@ -18,9 +18,10 @@ FLAT = (0.25 / 255) ** 2  # variance of the pixels below which a patch shows not
 
 def check_corners(corners: Corners) -> None:
     """Refuse what is not a convex quadrilateral inside the frame, in clockwise order from far left."""
-    if len(corners) != 4 or any(len(corner) != 2 for corner in corners):
+    pairs = len(corners) == 4 and all(len(corner) == 2 for corner in corners)
+    if not pairs or not all(isinstance(side, (int, float)) for corner in corners for side in corner):
         raise InputError(
-            f"the ground has {len(corners)} corners; "
+            f"the ground has {len(corners)} corners, {corners!s:.100}; "
             "expected four of (x, y): far left, far right, near right, near left"
         )
     text = "ground corners " + " ".join(f"({x:g}, {y:g})" for x, y in corners)

@@ -346,10 +346,11 @@ def _filled(random: Random, tensor: Tensor) -> Tensor:
             else (torch.iinfo(tensor.dtype).min, torch.iinfo(tensor.dtype).max)
         )
         value = min(max(int(value) if math.isfinite(value) else -1, limits[0]), limits[1])
+    filling = torch.tensor(value).to(tensor.dtype)  # inf where halves hold no such number
     if tensor.numel() and random.random() < 0.6:
-        tensor.view(-1)[random.randrange(tensor.numel())] = value
+        tensor.view(-1)[random.randrange(tensor.numel())] = filling
         return tensor
-    return tensor.fill_(value)
+    return tensor.copy_(filling)
 
 
 def _shuffled(random: Random, tensor: Tensor) -> Tensor:

@@ -164,6 +164,7 @@ def test_colours_become_grey() -> None:
 def test_corners_that_are_no_region_are_refused() -> None:
     for corners, words in (
         (TRAPEZIUM[:3], ("3 corners", "four")),
+        ((*TRAPEZIUM[:3], (0.1, "far")), ("4 corners", "far", "(x, y)")),
         ((*TRAPEZIUM[:3], (0.1, 0.2, 0.3)), ("4 corners", "(x, y)")),
         ((*TRAPEZIUM[:3], (-0.05, 0.98)), ("(-0.05, 0.98)", "outside the frame", "0 to 1")),
         ((*TRAPEZIUM[:3], (math.nan, 0.98)), ("nan", "outside the frame")),
