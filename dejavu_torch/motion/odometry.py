@@ -21,6 +21,7 @@ from dejavu_torch.types import InputError, Traverse
 log = logging.getLogger("dejavu_torch")
 
 NAMED = 6  # segments without common ground that a warning lists
+LARGEST = 1024  # pixels: more rows than frames show of the ground, and shifts take their square
 
 
 class Odometry(NamedTuple):
@@ -37,7 +38,7 @@ class GroundOdometry(nn.Module):
     Args:
         corners: (x, y) of a region of ground in fractions of the frame: far left, far right, near right,
             near left. Its sides should be parallel on the ground, as two rails are.
-        size: (rows, columns) of the patch it becomes, pixels, at least 32 x 32. The longest step that can be
+        size: (rows, columns) of the patch it becomes, pixels, 32 to 1024 each. The longest step that can be
             measured is about 0.42 of its rows.
         step: pixels of ground from one resampled frame to the next; None is the median of the steps not 0.
         least: confidence below which a step is interpolated, in [0, 1]. The default finds a cut in patches of
@@ -71,8 +72,8 @@ class GroundOdometry(nn.Module):
     ) -> None:
         super().__init__()
         check_corners(corners)
-        if len(size) != 2 or min(size) < 32:
-            raise InputError(f"size is {tuple(size)}; expected (rows, columns) of at least 32 each")
+        if len(size) != 2 or min(size) < 32 or max(size) > LARGEST:
+            raise InputError(f"size is {tuple(size)}; expected (rows, columns) of 32 to {LARGEST} each")
         if step is not None and not 0 < step < math.inf:
             raise InputError(f"step is {step}; expected pixels of ground above 0, or None")
         if not 0 <= least <= 1:
