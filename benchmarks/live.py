@@ -12,18 +12,17 @@ from typing import Any
 import numpy as np
 import torch
 from torch.nn.functional import interpolate
+from torch.utils.benchmark import Timer
 from tqdm import tqdm
 
 from benchmarks.measure import Column, Row, table, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.camera import shots_of
-from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.video import Video
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import InputError
 
 RATE = 30  # frames a second
 CAMERA = (480, 640)
@@ -49,16 +48,13 @@ def bench_live(
     sizes: Sequence[tuple[int, int]] = SIZES,
     camera: tuple[int, int] = CAMERA,
     numbers: int = NUMBERS,
-    progress: bool = False,
 ) -> list[Row]:
     """Localize the frames of a video one by one on a map of many places, with HOG and the filter.
 
     Args:
         places: of the map. frames: of the video.
         sizes: (height, width) of the frames that a map is learned from, a case each.
-        camera: size of the video's frames.
-        numbers: of a descriptor.
-        progress: show a progress bar on a terminal.
+        camera: size of the video's frames. numbers: of a descriptor.
 
     Convention: the route is the video once, and for the rest its descriptors turned at random, block by
         block: other places that change as a real route does. Only the time is of interest: the frames are
@@ -69,29 +65,16 @@ def bench_live(
         seconds_p99: the longest but for 1 %. rate: frames a second from the file to the place, decoding
         beside it; cpu_seconds: that a frame takes of all cores together, which other programs change little.
         dropped: of the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of
-        decoding, features, whitening, scores and filter, each by itself, the best of some.
-
-    Raises:
-        InputError: fewer places than frames, or fewer frames than are timed.
+        decoding, features, whitening, scores and filter, each by itself, the median of some.
     """
-    if not WARM < frames <= places or frames <= numbers:
-        raise InputError(
-            f"bench live got {frames} frames on {places} places with {numbers} numbers each; expected more "
-            f"frames than numbers and than {WARM}, and as many places"
-        )
-    rows = []
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / "drive.mkv"
         write_drive(path, frames, camera)
-        for size in tqdm(sizes, desc="live", disable=None if progress else True, leave=False):
-            rows.append(_case(path, size, camera, places, frames, numbers))
-    return rows
+        shown = tqdm(sizes, desc="live", disable=None, leave=False)
+        return [live_row(Video(path, width=w, height=h), camera, places, numbers) for h, w in shown]
 
 
-def _case(
-    path: Path, size: tuple[int, int], camera: tuple[int, int], places: int, frames: int, numbers: int
-) -> Row:
-    video = Video(path, width=size[1], height=size[0])
+def live_row(video: Video, camera: tuple[int, int], places: int, numbers: int) -> Row:
     model, first = long_model(video, places, numbers)
     localizer = LiveLocalizer(model)
     found, milliseconds = 0, []
@@ -102,6 +85,7 @@ def _case(
             match = localizer(shot.pixels)
             milliseconds.append(match.milliseconds)
             found += abs(match.place - first - shot.number) <= NEAR
+    frames = len(milliseconds)
     rate = (frames - WARM) / (time.perf_counter() - began)
     cpu = (time.process_time() - busy) / (frames - WARM)
     p50, p99 = (float(p) / 1e3 for p in np.percentile(milliseconds[WARM:], (50, 99)))
@@ -109,9 +93,9 @@ def _case(
     with FrameReader(in_real_time(shots_of(video), "drive"), newest=True) as feed:
         for shot in feed:
             localizer(shot.pixels)
-    by = " x ".join(map(str, size))
+    height, width = video.frame_shape[1:]
     return {
-        "case": f"{camera[0]} x {camera[1]} on a map of {by}",
+        "case": f"{camera[0]} x {camera[1]} on a map of {height} x {width}",
         "contender": "dejavu",
         "seconds": p50,
         "seconds_p99": p99,
@@ -171,20 +155,18 @@ def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
     return model, middle * len(own)
 
 
-def parts_of(model: DejaVu, video: Video, repeats: int = 30) -> dict[str, float]:
-    """Seconds of each part of a frame's way by itself, the best of some."""
-    localizer = LiveLocalizer(model)
+def parts_of(model: DejaVu, video: Video) -> dict[str, float]:
+    """Seconds of each part of a frame's way by itself, the median of some runs."""
+    localizer, whitening = LiveLocalizer(model), model.whitening
+    assert whitening is not None
+    assert localizer.sequence is not None
     began = time.perf_counter()
     decoded = sum(1 for _ in video.batches(1))
     seconds = {"decoding": (time.perf_counter() - began) / decoded}
     (frame,) = video.between(0, 1)
-    whitening = model.whitening
-    assert whitening is not None
-    features = model.describe(frame)
-    unpacked = whitening.unpacked()
+    features, unpacked = model.describe(frame), whitening.unpacked()
     descriptor = whitening(features, unpacked)
     scores = model.map.scores(descriptor)
-    assert localizer.sequence is not None
     filter, state = localizer.sequence, localizer.sequence.start(model.map.places)
     works: dict[str, Callable[[], object]] = {
         "features": lambda: model.describe(frame),
@@ -193,23 +175,18 @@ def parts_of(model: DejaVu, video: Video, repeats: int = 30) -> dict[str, float]
         "filter": lambda: filter.step(scores, state),
     }
     for name, work in works.items():
-        times = []
-        for _ in range(repeats):
-            began = time.perf_counter()
-            work()
-            times.append(time.perf_counter() - began)
-        seconds[name] = min(times)
+        timer = Timer("work()", globals={"work": work}, num_threads=torch.get_num_threads())
+        seconds[name] = timer.blocked_autorange().median
     return seconds
 
 
-def run_live(out: Path, places: int = 100_000, frames: int = 300) -> list[Row]:
-    """Run the bench, and write bench.json and bench.png into the folder `out`.
+def run_live(*, out: Path) -> list[str]:
+    """Time of single frames of a video on a map of 100000 places.
 
-    Raises:
-        InputError: as `bench_live`, or a folder that cannot be made or written in.
+    Args:
+        out: folder for bench.json and bench.png
     """
-    check_output_folder(out)
-    rows = bench_live(places, frames, progress=True)
+    rows = bench_live()
     drawn = {
         row["case"]: {
             name: 1e3 * value for name, value in ({"dejavu": row["seconds"]} | row["parts"]).items()
@@ -218,11 +195,7 @@ def run_live(out: Path, places: int = 100_000, frames: int = 300) -> list[Row]:
     }
     picture = plot_ratios(drawn, "milliseconds a frame (p50), and of each part by itself")
     write_bench(out, rows, picture, rate=RATE)
-    return rows
-
-
-def live_table(rows: Sequence[Row]) -> list[list[str]]:
-    """The figures as rows of text, the header first."""
-    flat = [row | row["parts"] for row in rows]
     parts: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
-    return table(flat, COLUMNS | parts, "{case}")
+    figures = table([row | row["parts"] for row in rows], COLUMNS | parts, "{case}")
+    note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
+    return [figures, note]

@@ -5,17 +5,16 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from benchmarks.measure import Column, Contender, Row, Run, bars, benchmark, in_one_thread, write_bench
-from dejavu_torch.data.output import check_output_folder
+from benchmarks.measure import Column, Contender, Row, Run, bars, benchmark, table, write_bench
 from dejavu_torch.features.hog import HOG, hog
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.distance import phase_distances
@@ -25,7 +24,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import FrequencyLayer, InputError
+from dejavu_torch.types import FrequencyLayer
 
 BATCH = 64
 AT_MOST = 60  # seconds for all runs of one contender together
@@ -43,20 +42,31 @@ COLUMNS: dict[str, Column] = {
     "difference": ("difference", ".1e"),
 }
 
-Sizes = Sequence[tuple[int, int]]
+
+def run_matcher(*, out: Path) -> list[str]:
+    """Time of HOG, L1 distances, sequences, filters and exported maps.
+
+    Args:
+        out: folder for bench.json and bench.png
+    """
+    rows = list(bench_matcher())
+    write_bench(out, rows, bars(rows))
+    absent = any("No module" in (row["skipped"] or "") for row in rows)
+    hint = ["what is skipped needs pip install '.[bench,export]'"] * absent
+    return [table(rows, COLUMNS), *hint, "x ours: seconds / those of the fastest dejavu"]
 
 
+@torch.no_grad()
 def bench_matcher(
     frames: int = 2000,
     repeats: int = 3,
-    images: Sizes = ((64, 64), (256, 192)),
+    images: Sequence[tuple[int, int]] = ((64, 64), (256, 192)),
     distances: Sequence[tuple[int, int, int]] = ((512, 2640, 1000),),
     sequences: Sequence[tuple[int, int, int]] = ((64, 21, 100_000),),
     filters: Sequence[tuple[int, int]] = ((200, 100_000),),
     exports: Sequence[tuple[int, int, int, int]] = ((50, 64, 64, 3072), (20, 480, 640, 100_000)),
     torch_compile: bool = True,
-    seed: int = 0,
-) -> list[Row]:
+) -> Iterator[Row]:
     """Time HOG beside scikit-image, L1 distances beside torch, scipy and faiss; sequences, filters two ways;
     frames one by one beside the same in onnxruntime.
 
@@ -71,60 +81,42 @@ def bench_matcher(
         exports: frames, their height and width, and places of each case of single frames, found one behind
             the other on a spectral map, beside its ONNX file.
         torch_compile: also a sum that `torch.compile` makes a loop of; compiling takes its time.
-        seed: of the random frames and features.
 
     Convention: one process, float32, and the same number of threads, torch.get_num_threads(), for all
         that can use several; ours with one thread as well.
-
-    Raises:
-        InputError: a number below 1.
     """
-    if (
-        min(
-            frames,
-            repeats,
-            *(n for size in (*images, *distances, *sequences, *filters, *exports) for n in size),
-        )
-        < 1
-    ):
-        raise InputError(
-            f"the bench got frames={frames}, repeats={repeats}, images {images}, distances {distances}, "
-            f"sequences {sequences}, filters {filters} and exports {exports}; expected at least 1 of each"
-        )
-    generator = torch.Generator().manual_seed(seed)
-    rows = []
-    with torch.no_grad():
-        for height, width in images:
-            some = torch.rand(min(frames, BATCH), 1, height, width, generator=generator)
-            rows += _hog_case(f"hog {height} x {width}", some, frames, repeats)
-        for q, f, p in distances:
-            query, templates = (torch.rand(n, f, generator=generator) for n in (q, p))
-            rows += _l1_case(f"l1 {q} x {f} x {p}", query, templates, repeats, torch_compile)
-        for q, length, places in sequences:
-            query, templates = (torch.rand(n, len(PERIODS), generator=generator) for n in (q, max(PERIODS)))
-            rows += _sequence_case(
-                f"sequence {q} x {length} x {places}", query, templates, length, places, repeats
-            )
-        for q, places in filters:
-            route = _smooth(torch.randn(places, WIDE, generator=generator))
-            noise = torch.randn(q, WIDE, generator=generator)
-            rows += _filter_case(f"filter {q} x {places}", route, noise, repeats)
-        for count, height, width, places in exports:
-            some = torch.rand(count, 1, height, width, generator=generator)
-            route = _smooth(torch.randn(places, NUMBERS, generator=generator))
-            case = f"single frames {count} x {height} x {width} on {places}"
-            rows += _export_case(case, some, route, repeats, generator)
-    return rows
+    generator = torch.Generator().manual_seed(0)
+    for height, width in images:
+        some = torch.rand(min(frames, BATCH), 1, height, width, generator=generator)
+        yield from benchmark(f"hog {height} x {width}", hog_contenders(some, frames, repeats), repeats)
+    for q, f, p in distances:
+        query, templates = (torch.rand(n, f, generator=generator) for n in (q, p))
+        yield from benchmark(f"l1 {q} x {f} x {p}", l1_contenders(query, templates, torch_compile), repeats)
+    for q, length, places in sequences:
+        query, templates = (torch.rand(n, len(PERIODS), generator=generator) for n in (q, max(PERIODS)))
+        contenders = sequence_contenders(query, templates, length, places)
+        yield from benchmark(f"sequence {q} x {length} x {places}", contenders, repeats)
+    for q, places in filters:
+        route = smooth(torch.randn(places, WIDE, generator=generator))
+        noise = torch.randn(q, WIDE, generator=generator)
+        yield from benchmark(f"filter {q} x {places}", filter_contenders(route, noise), repeats)
+    for count, height, width, places in exports:
+        some = torch.rand(count, 1, height, width, generator=generator)
+        model = random_model(some, smooth(torch.randn(places, NUMBERS, generator=generator)), generator)
+        sizes: list[int] = []
+        case = f"single frames {count} x {height} x {width} on {places}"
+        *ours, exported = benchmark(case, export_contenders(model, some, sizes), repeats)
+        yield from (*ours, exported | {"file_bytes": sizes[0] if sizes else None})
 
 
-def _ours(run: Run) -> list[Contender]:
+def both(run: Run) -> list[Contender]:
     """Our work with all threads and, where there are several, with one."""
     threads = torch.get_num_threads()
-    alone = Contender("dejavu (one thread)", lambda: in_one_thread(run), 1)
-    return [Contender("dejavu", lambda: run, threads), *([alone] if threads > 1 else [])]
+    alone = Contender("dejavu (one thread)", lambda: run)
+    return [Contender("dejavu", lambda: run, threads), *[alone] * (threads > 1)]
 
 
-def _hog_case(case: str, some: Tensor, frames: int, repeats: int) -> list[Row]:
+def hog_contenders(some: Tensor, frames: int, repeats: int) -> list[Contender]:
     """All `frames`, of which `some` differ."""
     dimension = hog(some[:1]).shape[1]
 
@@ -153,10 +145,10 @@ def _hog_case(case: str, some: Tensor, frames: int, repeats: int) -> list[Row]:
 
         return run
 
-    return benchmark(case, [*_ours(ours), Contender("scikit-image", skimage, 1)], repeats)
+    return [*both(ours), Contender("scikit-image", skimage)]
 
 
-def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_compile: bool) -> list[Row]:
+def l1_contenders(query: Tensor, templates: Tensor, torch_compile: bool) -> list[Contender]:
     threads = torch.get_num_threads()
 
     def eager() -> Run:
@@ -188,20 +180,17 @@ def _l1_case(case: str, query: Tensor, templates: Tensor, repeats: int, torch_co
         pairwise = partial(faiss.pairwise_distances, metric=faiss.METRIC_L1)
         return lambda: torch.from_numpy(pairwise(query.numpy(), templates.numpy()))
 
-    contenders = [
-        *_ours(partial(phase_distances, query, templates)),
+    return [
+        *both(partial(phase_distances, query, templates)),
         Contender("dejavu (eager torch)", eager, threads),
         Contender("torch.cdist", lambda: partial(torch.cdist, query, templates, p=1.0), threads),
         Contender("torch.compile", compiled, threads),
-        Contender("scipy cdist", scipy, 1),
+        Contender("scipy cdist", scipy),
         Contender("faiss", faiss, threads),
     ]
-    return benchmark(case, contenders, repeats)
 
 
-def _sequence_case(
-    case: str, query: Tensor, templates: Tensor, length: int, places: int, repeats: int
-) -> list[Row]:
+def sequence_contenders(query: Tensor, templates: Tensor, length: int, places: int) -> list[Contender]:
     """A feature a layer, so that it is not the distances that take the time."""
     plan = tuple(FrequencyLayer(Fraction(tau), tau, 0, places, (j,)) for j, tau in enumerate(PERIODS))
     blocks = [templates[:tau, j, None] for j, tau in enumerate(PERIODS)]
@@ -215,72 +204,56 @@ def _sequence_case(
         return torch.cat(rows)[:, length:]  # before it some are +inf
 
     one_by_one = Contender("dejavu (a query at a time)", lambda: partial(drive, 1), torch.get_num_threads())
-    return benchmark(case, [*_ours(partial(drive, len(query))), one_by_one], repeats)
+    return [*both(partial(drive, len(query))), one_by_one]
 
 
-def _smooth(steps: Tensor) -> Tensor:
+def smooth(steps: Tensor) -> Tensor:
     """A route whose descriptors change little from place to place: the mean of 16 random steps. (N,K)"""
     summed = F.pad(steps.T, (15, 0))[None]
     return F.avg_pool1d(summed, 16, 1)[0].T * 4
 
 
-def _filter_case(case: str, route: Tensor, noise: Tensor, repeats: int) -> list[Row]:
+def filter_contenders(route: Tensor, noise: Tensor) -> list[Contender]:
     """A drive along the middle of a route, seen with as much noise as there is route."""
     spectral = SpectralMapper(None, step=2.0, chunk=1024)(route)
     first = max(0, (len(route) - len(noise)) // 2)
     queries = (route[first : first + len(noise)] + noise).split(16)
 
     def drive(every: int) -> Tensor:
-        with torch.no_grad():
-            rows: list[Tensor] = []
-            matching = Matching(PlaceFilter(search_every=every), on_scores=rows.append)
-            localizer = Localizer(spectral, matching)
-            for part in queries:
-                localizer(part)
-            return torch.cat([(-row).exp() for row in rows])
+        rows: list[Tensor] = []
+        localizer = Localizer(spectral, Matching(PlaceFilter(search_every=every), on_scores=rows.append))
+        for part in queries:
+            localizer(part)
+        return torch.cat([(-row).exp() for row in rows])
 
     beside = Contender("dejavu (all places)", lambda: partial(drive, 1), torch.get_num_threads())
-    return benchmark(case, [*_ours(partial(drive, 50)), beside], repeats)
+    return [*both(partial(drive, 50)), beside]
 
 
-def _export_case(
-    case: str, frames: Tensor, route: Tensor, repeats: int, generator: torch.Generator
-) -> list[Row]:
+def random_model(frames: Tensor, route: Tensor, generator: torch.Generator) -> DejaVu:
     """HOG, a whitening and a map made of random numbers: what they find takes as long as what is right."""
     whitening = Whitening(numbers=NUMBERS)
     model = DejaVu(HOG(), whitening, SpectralMapper(None, step=0.05))
     features = model.describe(frames[:1]).shape[1]
     projection = torch.randn(features, NUMBERS, generator=generator)
     whitening.take(torch.rand(features, generator=generator), projection, None)
-    model.learn_features(nn.functional.normalize(route, dim=1))
+    model.learn_features(F.normalize(route, dim=1))
     model.eval().frame_shape = tuple(frames.shape[1:])
-    threads, size = torch.get_num_threads(), 0
+    return model
 
-    def ours() -> Tensor:
-        return torch.cat([model(frame) for frame in frames.split(1)])
+
+def export_contenders(model: DejaVu, frames: Tensor, sizes: list[int]) -> list[Contender]:
+    """Frames one by one; the bytes of the exported file are put into `sizes`."""
+    threads = torch.get_num_threads()
 
     def exported() -> Run:
-        nonlocal size
         from dejavu_torch.export import export_onnx, run_session, session_of
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "map.onnx"
-            size = export_onnx(model, path).bytes
+            sizes.append(export_onnx(model, path).bytes)
             session = session_of(str(path), threads)
         return lambda: torch.cat([run_session(session, frame) for frame in frames.split(1)])
 
-    rows = benchmark(case, [*_ours(ours), Contender("onnxruntime", exported, threads)], repeats)
-    rows[-1]["file_bytes"] = size or None
-    return rows
-
-
-def run_matcher(out: Path) -> list[Row]:
-    """`bench_matcher`, written as bench.json and bench.png into the folder `out`.
-
-    Raises:
-        InputError: a folder that cannot be made or written in.
-    """
-    check_output_folder(out)  # before the long work
-    rows = bench_matcher()
-    write_bench(out, rows, bars(rows))
-    return rows
+    ours = both(lambda: torch.cat([model(frame) for frame in frames.split(1)]))
+    return [*ours, Contender("onnxruntime", exported, threads)]

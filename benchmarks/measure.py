@@ -12,8 +12,8 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,11 +27,13 @@ from benchmarks.plots import plot_ratios
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.plots import Plot
+from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.text import one_line
 
 COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu", "onnxruntime")
 PROCESS = Path("/proc/self")
+OURS = "dejavu"  # what the names of our contenders start with
 
 Row = dict[str, Any]  # a line of bench.json; what is not known of it is None
 KEYS = (
@@ -40,6 +42,7 @@ KEYS = (
 )
 Column = tuple[str, str] | tuple[str, str, float]  # key of a row, format, unit
 Run = Callable[[], Tensor]
+Find = Callable[[Tensor], tuple[Tensor, Tensor]]  # of queries the best score, lower is better, and place
 
 
 class Contender(NamedTuple):
@@ -55,28 +58,6 @@ class Contender(NamedTuple):
     family: str = ""
 
 
-class Found(NamedTuple):
-    """The best place of each query and its score, lower is better: (Q,), (Q,)."""
-
-    score: Tensor
-    place: Tensor
-
-
-Find = Callable[[Tensor], Found]
-
-
-class Opened(NamedTuple):
-    """A file that was loaded.
-
-    find: the places of queries, frames or descriptors. device: that it runs on. scanned: bytes that each
-    batch of queries goes through as a whole, asked for when there was one; None where it did not.
-    """
-
-    find: Find
-    device: str = "cpu"
-    scanned: Callable[[], int | None] = lambda: None
-
-
 class Store(ABC):
     """A way to keep a route in a file and to find places on it, each in a process of its own."""
 
@@ -89,13 +70,29 @@ class Store(ABC):
         """Keep a route in a file; how many bytes of it are the route's."""
 
     @abstractmethod
-    def load(self, path: Path, device: str = "cpu") -> Opened:
+    def load(self, path: Path, device: str = "cpu") -> Find:
         """Make ready to find queries in a file; who cannot use the device takes the CPU."""
 
 
 def new_row(case: str, contender: str, keys: Sequence[str] = KEYS, **facts: Any) -> Row:
     """A row of so many keys, of which these facts are known."""
     return {"case": case, "contender": contender} | dict.fromkeys(keys) | facts
+
+
+def failure(error: Exception) -> str:
+    """What a row says of an error that left it without figures."""
+    return f"{type(error).__name__}: {one_line(error)}"[:200]
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """In the block torch uses so many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def benchmark(case: str, contenders: Sequence[Contender], repeats: int) -> list[Row]:
@@ -114,69 +111,49 @@ def benchmark(case: str, contenders: Sequence[Contender], repeats: int) -> list[
         it, seconds_first and peak_bytes are its own. skipped: why there are no figures.
     """
     rows = [new_row(case, one.name) for one in contenders]
-    runs: list[tuple[Row, Run, float]] = []
+    runs: list[tuple[Row, Run, float, int]] = []
     expected: Tensor | None = None
-    bar = tqdm(total=len(contenders) * (1 + repeats), desc=case, disable=None, leave=False)
-    for row, contender in zip(rows, contenders, strict=True):
-        bar.update()
+    for row, contender in tqdm(list(zip(rows, contenders, strict=True)), case, disable=None, leave=False):
         try:
-            began = time.perf_counter()
-            run = contender.prepare()
-            result = run()
-            row["seconds_first"] = time.perf_counter() - began
-            row["peak_bytes"] = peak_memory(run)
+            with threads(contender.threads):
+                began = time.perf_counter()
+                run = contender.prepare()
+                result = run()
+                row["seconds_first"] = time.perf_counter() - began
+                row["peak_bytes"] = peak_memory(run)
             expected = result if expected is None else expected
             row["difference"] = float((result - expected[: len(result)]).abs().max())
         except Exception as error:  # whatever another program fails with
             if expected is None:
                 raise
-            row |= new_row(case, contender.name, skipped=f"{type(error).__name__}: {one_line(error)}"[:200])
+            row |= new_row(case, contender.name, skipped=failure(error))
             continue
         scale = len(expected) / len(result)
         row |= {"bytes": round(result.nbytes * scale), "threads": contender.threads}
         row["measured_rows"] = len(result) if scale > 1 else None
-        runs.append((row, run, scale))
+        runs.append((row, run, scale, contender.threads))
         del result  # it would hide what the next one needs
     for _ in range(repeats):
-        for row, run, scale in runs:
-            began = time.perf_counter()
-            run()
-            row["seconds"] = min(row["seconds"] or math.inf, scale * (time.perf_counter() - began))
-            bar.update()
-    bar.close()
+        for row, run, scale, count in runs:
+            with threads(count):
+                began = time.perf_counter()
+                run()
+                row["seconds"] = min(row["seconds"] or math.inf, scale * (time.perf_counter() - began))
     return with_ratios(rows)
 
 
-def is_ours(row: Row) -> bool:
-    """Whether a row is of this package."""
-    return bool(row["contender"].startswith("dejavu"))
-
-
-def with_ratios(rows: Sequence[Row], ours: Callable[[Row], bool] = is_ours) -> list[Row]:
-    """The rows with their seconds over those of our fastest of the case."""
+def with_ratios(rows: Sequence[Row]) -> list[Row]:
+    """The rows with their seconds over those of our fastest of the case; not of ours in another family."""
     fastest: dict[str, float] = {}
     for row in rows:
-        if ours(row) and row["seconds"]:
+        ours = row["contender"].startswith(OURS) and row.get("family", OURS) == OURS
+        if ours and row["seconds"]:
             fastest[row["case"]] = min(row["seconds"], fastest.get(row["case"], math.inf))
-    ratios = [row["seconds"] and row["seconds"] / fastest.get(row["case"], math.nan) for row in rows]
-    return [
-        row | {"ratio_to_ours": None if ratio is None or math.isnan(ratio) else ratio}
-        for row, ratio in zip(rows, ratios, strict=True)
-    ]
-
-
-def in_one_thread(run: Run) -> Run:
-    """The same work where torch may use one thread only."""
-
-    def alone() -> Tensor:
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            return run()
-        finally:
-            torch.set_num_threads(threads)
-
-    return alone
+    told = []
+    for row in rows:
+        known = row["seconds"] and row["case"] in fastest
+        told.append(row | {"ratio_to_ours": row["seconds"] / fastest[row["case"]] if known else None})
+    return told
 
 
 def peak_memory(run: Callable[[], object]) -> int | None:
@@ -229,30 +206,26 @@ def end_with_parent() -> None:
 
 
 def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **facts: Any) -> None:
-    """Write bench.json, and bench.png where there is a picture, into a folder: all of it or nothing."""
-    content = {"rows": rows} | facts | programs()
-    with whole_folder(out) as folder:
-        (folder / "bench.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        if picture is not None:
-            picture[0].savefig(folder / "bench.png")
+    """Write bench.json, and bench.png where there is a picture, into a folder: all of it or nothing.
 
-
-def programs() -> dict[str, Any]:
-    """What figures depend on beside the machine, as bench.json names it."""
-    return {
+    With the rows stands what figures depend on beside the machine.
+    """
+    versions: dict[str, str | None] = {"dejavu_torch": dejavu_torch.__version__}
+    for package in COMPARED:
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    programs = {
         "threads": torch.get_num_threads(),
         "l1_backend": l1_backend(),
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "version": dejavu_torch.__version__,
-        "versions": {"dejavu_torch": dejavu_torch.__version__} | {name: _version(name) for name in COMPARED},
+        "versions": dict.fromkeys(COMPARED) | versions,
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    with whole_folder(out) as folder:
+        text = json.dumps({"rows": rows} | facts | programs, indent=1)
+        (folder / "bench.json").write_text(text + "\n", encoding="utf-8")
+        if picture is not None:
+            picture[0].savefig(folder / "bench.png")
 
 
 def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **label: str) -> Plot | None:
@@ -264,14 +237,13 @@ def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **l
     return plot_ratios(cases, **label) if cases else None
 
 
-def table(
-    rows: Sequence[Row], columns: Mapping[str, Column], name: str = "{case}: {contender}"
-) -> list[list[str]]:
-    """The figures as rows of text, the header first, and at the end why there are none.
+def table(rows: Sequence[Row], columns: Mapping[str, Column], name: str = "{case}: {contender}") -> str:
+    """The figures as aligned text, the header first, and at the end why there are none.
 
     Example:
-        >>> table([{"case": "l1", "contender": "dejavu", "bytes": 2e6}], {"MB": ("bytes", ".1f", 1e6)})
-        [['', 'MB', ''], ['l1: dejavu', '2.0', '']]
+        >>> print(table([{"case": "l1", "contender": "dejavu", "bytes": 2e6}], {"MB": ("bytes", ".1f", 1e6)}))
+                     MB
+        l1: dejavu  2.0
     """
 
     def text(value: float | None, form: str, unit: float = 1.0) -> str:
@@ -283,4 +255,4 @@ def table(
         note = f"{row['measured_rows']} measured" if row.get("measured_rows") else ""
         note = f"skipped: {row['skipped']}" if row.get("skipped") else note
         body.append([name.format(**row), *figures, note])
-    return [["", *columns, ""], *body]
+    return text_table([["", *columns, ""], *body])

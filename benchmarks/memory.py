@@ -6,7 +6,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,11 +18,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from benchmarks import scale_contenders
 from benchmarks.measure import (
+    OURS,
     PROCESS,
     Column,
-    Found,
-    Opened,
+    Find,
     Row,
     Store,
     bars,
@@ -31,11 +32,13 @@ from benchmarks.measure import (
     new_row,
     peak_memory,
     resident,
+    table,
     with_ratios,
     write_bench,
 )
+from benchmarks.scale_contenders import Mapped
 from dejavu_torch.data.frame_range import IndexedTraverse
-from dejavu_torch.data.output import check_output_folder, temporary_folder
+from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.distance import l1_backend
@@ -51,7 +54,6 @@ PIECE = 4096  # frames painted at a time
 TRIAL = 16  # frames of the route that loads what is loaded late
 TOLERANCE = 5  # frames
 NAMES = ("places", "queries")  # of the two drives' files
-OURS = "dejavu"
 LOADED = "programs loaded"
 BATCH = 64  # queries
 COLUMNS: dict[str, Column] = {
@@ -60,27 +62,6 @@ COLUMNS: dict[str, Column] = {
     "seconds": ("seconds", ".1f"),
     "recall@1": ("recall_at_1", ".3f"),
 }
-
-
-class Mapped(Store):
-    """Ours: a map."""
-
-    def __init__(self, mapper: TemplateMapper | SpectralMapper) -> None:
-        self.mapper = mapper
-
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        model = DejaVu(mapper=self.mapper).learn(route)
-        model.save(path)
-        return model.summary().route_bytes
-
-    def load(self, path: Path, device: str = "cpu") -> Opened:
-        model = DejaVu.load(path)
-
-        def find(frames: Tensor) -> Found:
-            match = model.localize(frames)
-            return Found(match.score, match.index)
-
-        return Opened(find)
 
 
 class Held(Store):
@@ -93,58 +74,45 @@ class Held(Store):
         return DejaVu(whitening=Whitening() if self.whitened else "none").eval()
 
     def learn(self, route: IndexedTraverse, path: Path) -> int:
-        model = self.model()
-        fixed = {}
+        model, fixed = self.model(), {}
         if model.whitening is None:
             held = gathered(model.describer.descriptors(route), route)
         else:
-            held = model.describe_reference(route)
-            fixed = model.whitening.state_dict()
+            held, fixed = model.describe_reference(route), model.whitening.state_dict()
         save_file({"held": held, **fixed}, path)
         return held.nbytes
 
-    def load(self, path: Path, device: str = "cpu") -> Opened:
+    def load(self, path: Path, device: str = "cpu") -> Find:
         model, state = self.model(), load_file(path)
         held = state.pop("held")
         if model.whitening is not None:
             model.whitening.load_state_dict(state)
         lengths = torch.linalg.vector_norm(held, dim=1).square()
 
-        def find(frames: Tensor) -> Found:
-            return Found(*(lengths - 2 * model.whitened(model.describe(frames)) @ held.T).min(1))
+        def find(frames: Tensor) -> tuple[Tensor, Tensor]:
+            score, place = (lengths - 2 * model.whitened(model.describe(frames)) @ held.T).min(1)
+            return score, place
 
-        return Opened(find)
+        return find
 
 
-class Faiss(Store):
-    """HOG of all frames in a flat index of faiss."""
+class Faiss(scale_contenders.Faiss):
+    """HOG of all frames in an index of faiss."""
 
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
-        import faiss
+    def __init__(self) -> None:
+        super().__init__("Flat")
+        self.model = DejaVu(whitening="none").eval()
 
-        index: Any = None
-        for part in DejaVu(whitening="none").describer.descriptors(route):
-            index = faiss.IndexFlatL2(part.shape[1]) if index is None else index
-            index.add(part.numpy())
-        faiss.write_index(index, str(path))
-        return path.stat().st_size
+    def parts(self, route: IndexedTraverse) -> Iterable[Tensor]:
+        return self.model.describer.descriptors(route)
 
-    def load(self, path: Path, device: str = "cpu") -> Opened:
-        import faiss
-
-        faiss.omp_set_num_threads(torch.get_num_threads())
-        index, model = faiss.read_index(str(path)), DejaVu(whitening="none").eval()
-
-        def find(frames: Tensor) -> Found:
-            score, place = index.search(model.describe(frames).numpy(), 1)
-            return Found(torch.from_numpy(score[:, 0]), torch.from_numpy(place[:, 0]))
-
-        return Opened(find)
+    def describe(self, queries: Tensor) -> Tensor:
+        return self.model.describe(queries)
 
 
 CONTENDERS: dict[str, Store] = {
-    OURS: Mapped(SpectralMapper()),
-    "dejavu templates": Mapped(TemplateMapper()),
+    OURS: Mapped(SpectralMapper(), None),
+    "dejavu templates": Mapped(TemplateMapper(), None),
     "whitened, float32": Held(whitened=True),
     "HOG, float32": Held(whitened=False),
     "faiss, HOG": Faiss(),
@@ -154,8 +122,8 @@ CONTENDERS: dict[str, Store] = {
 @torch.no_grad()
 def localize(store: Store, path: Path, queries: Traverse) -> Tensor:
     """The place of each query on the route of a file, (Q,)."""
-    find = store.load(path).find
-    return gathered((find(part).place for part in queries.batches(BATCH)), queries)
+    find = store.load(path)
+    return gathered((find(part)[1] for part in queries.batches(BATCH)), queries)
 
 
 def gathered(parts: Iterator[Tensor], traverse: Traverse) -> Tensor:
@@ -277,14 +245,8 @@ def measure(task: Task, folder: Path) -> dict[str, Any]:
     peak = peak_memory(run)
     facts = {"seconds": time.perf_counter() - began, "peak_bytes": peak, "bytes": file.stat().st_size}
     if task.queries:
-        right = (found - shown).abs() <= TOLERANCE
-        facts["recall_at_1"] = float(right.double().mean())
+        facts["recall_at_1"] = float(((found - shown).abs() <= TOLERANCE).double().mean())
     return facts
-
-
-def measured(task: Task, folder: Path) -> dict[str, Any]:
-    """`measure` in a process of its own; why there are no figures where it fails."""
-    return in_process(__name__, [task, str(folder)])
 
 
 def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -> Iterator[Row]:
@@ -301,14 +263,11 @@ def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -
         of the file. seconds: of the only run.
 
     Raises:
-        InputError: fewer than `FEWEST` places, or no query.
+        InputError: fewer than `FEWEST` places.
     """
     sizes = sorted(set(places or PLACES))
-    if sizes[0] < FEWEST or min(queries) < 1:
-        raise InputError(
-            f"bench memory got places {sizes} and queries {list(queries)}; "
-            f"expected at least {FEWEST} places and 1 query"
-        )
+    if sizes[0] < FEWEST:
+        raise InputError(f"bench memory got places {sizes}; expected at least {FEWEST} each")
     threads, middle = torch.get_num_threads(), sizes[len(sizes) // 2]
     cases = [(n, 0) for n in sizes] + [(middle, q) for q in queries]
     tasks = [Task(OURS, 0, 0, threads)]
@@ -316,23 +275,23 @@ def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -
     with temporary_folder(Path(tempfile.gettempdir())) as folder:
         paint_drives(folder, sizes[-1])
         for task in tqdm(tasks, "memory", disable=None, leave=False):
-            facts = measured(task, folder)
+            facts = in_process(__name__, [task, str(folder)])
             if not task.queries and task.places != middle:
                 task.file(folder).unlink(missing_ok=True)
             yield new_row(task.case, task.contender, **{"threads": threads} | facts)
 
 
-def run_memory(out: Path, places: Sequence[int] = ()) -> list[Row]:
-    """`bench_memory`, written as bench.json and bench.png into the folder `out`.
+def run_memory(*, out: Path, places: Sequence[int] = ()) -> list[str]:
+    """Memory of learning a route and of localizing on it.
 
-    Raises:
-        InputError: as `bench_memory`, or a folder that cannot be made or written in.
+    Args:
+        out: folder for bench.json and bench.png
+        places: frames that are learned; 1000, 10000 and 50000 if not given
     """
-    check_output_folder(out)  # before the long work
     rows = with_ratios(list(bench_memory(places)))
     drawn = [row for row in rows if row["case"] != LOADED]
     write_bench(out, rows, bars(drawn, "peak_bytes", 1e6, label="memory at most, in MB; less is better"))
-    return rows
+    return [table(rows, COLUMNS), "peak: beyond that of the programs loaded"]
 
 
 if __name__ == "__main__":

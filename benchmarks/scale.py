@@ -19,18 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.made import Likeness, MadeRoute, likeness
-from benchmarks.measure import (
-    Find,
-    Found,
-    Opened,
-    Row,
-    Store,
-    give_back,
-    in_process,
-    peak_memory,
-    with_ratios,
-    write_bench,
-)
+from benchmarks.measure import Row, give_back, in_process, peak_memory, with_ratios, write_bench
 from benchmarks.plots import plot_growth
 from benchmarks.repeating import TiledRoute, tiles_of
 from benchmarks.scale_contenders import (
@@ -45,12 +34,14 @@ from benchmarks.scale_contenders import (
     ROTATED,
     ROWS,
     TRAINED,
+    Mapped,
 )
-from benchmarks.scale_report import RECALL, exponents, pictured, scale_row
+from benchmarks.scale_report import RECALL, exponents, pictured, scale_row, scale_tables
 from benchmarks.template_search import PLACES as TEMPLATES
 from benchmarks.template_search import bench_templates
+from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
-from dejavu_torch.data.output import check_output_folder, temporary_folder
+from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.maps import codec, distance
@@ -58,7 +49,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match
 
 PLACES = (10_000, 100_000, 1_000_000)
-FEWEST = 500
+FEWEST, MOST = 500, 10**8
 RENDERED = 100_000  # places that are drawn; beyond them descriptors are made
 DESCRIBED = 10_000  # places that the whitening has seen
 QUERIES, SINGLE, BATCH = 2000, 20, 256  # in all, those of them that are timed one by one, of a batch
@@ -93,15 +84,8 @@ class Task(NamedTuple):
     room: float = 0.0
     step: float = 0.0
 
-    def made(self) -> Store:
-        return CONTENDERS[self.contender](self.room, self.step)
-
     def file(self, folder: Path) -> Path:
         return folder / f"kept-{list(CONTENDERS).index(self.contender)}"
-
-    def found(self, folder: Path) -> Path:
-        """The places that its queries were given."""
-        return folder / f"found-{self.case}-{self.contender}.npy"
 
 
 class Kept(IndexedTraverse):
@@ -121,25 +105,20 @@ class Kept(IndexedTraverse):
 def learn(task: Task, folder: Path) -> dict[str, Any]:
     """Keep the descriptors; the figures of a row that this tells."""
     torch.set_num_threads(task.threads)
-    contender, file = task.made(), task.file(folder)
+    contender, file = CONTENDERS[task.contender](task.room, task.step), task.file(folder)
     route = Kept(folder / f"{task.source}.npy", task.places)
     step = contender.prepare(route)
     give_back()
-    size = 0
-
-    def run() -> None:
-        nonlocal size
-        size = contender.learn(route, file)
-
+    sizes: list[int] = []
     began = time.perf_counter()
-    peak = peak_memory(run)
+    peak = peak_memory(lambda: sizes.append(contender.learn(route, file)))
     return {
         "step": step,
         "learn_rate": task.places / (time.perf_counter() - began),
         "learn_peak_bytes": peak,
         "bytes": file.stat().st_size,
-        "route_bytes": size,
-        "bytes_per_place": size / task.places,
+        "route_bytes": sizes[0],
+        "bytes_per_place": sizes[0] / task.places,
     }
 
 
@@ -148,48 +127,42 @@ def localize(task: Task, folder: Path) -> dict[str, Any]:
     torch.set_num_threads(1)
     state = load_file(folder / f"{task.case}.safetensors")
     queries, truth = state["queries"], state["truth"]
-    one: list[float] = []
-    batch: list[float] = []
-    found: list[Found] = []
-    opened: Opened
-    loaded = 0.0
-
-    def timed(find: Find, part: Tensor) -> tuple[float, Found]:
-        began = time.perf_counter()
-        result = find(part)
-        return time.perf_counter() - began, result
+    contender = CONTENDERS[task.contender](task.room, task.step)
+    parts = [queries[:1], *queries[:SINGLE].split(1), *queries.split(BATCH)]  # the first loads what is late
+    alone = 1 + len(queries[:SINGLE])
+    seconds: list[float] = []
+    found: list[tuple[Tensor, Tensor]] = []
 
     def run() -> None:
-        nonlocal opened, loaded
         began = time.perf_counter()
-        opened = task.made().load(task.file(folder), task.device)
-        opened.find(queries[:1])  # loads what is loaded late
-        loaded = time.perf_counter() - began
-        one.extend(timed(opened.find, query)[0] for query in queries[:SINGLE].split(1))
-        for part in queries.split(BATCH):
-            seconds, result = timed(opened.find, part)
-            found.append(result)
-            if len(part) == min(BATCH, len(queries)):
-                batch.append(seconds)
+        find = contender.load(task.file(folder), task.device)
+        for part in parts:
+            found.append(find(part))
+            seconds.append(time.perf_counter() - began)
+            began = time.perf_counter()
 
-    peak = peak_memory(run)
-    if opened.device.startswith("cuda"):
-        peak = torch.cuda.max_memory_allocated(opened.device)
-    score, index = (torch.cat(parts) for parts in zip(*found, strict=True))
-    np.save(task.found(folder), index.numpy())
+    peak, device, share = peak_memory(run), "cpu", None
+    whole = [taken for taken, part in zip(seconds, parts, strict=True) if len(part) == len(parts[alone])]
+    batch = float(np.median(whole))
+    if isinstance(contender, Mapped):
+        device = task.device
+        scanned = sum(buffer.nbytes for buffer in contender.model.map.buffers())
+        share = scanned / batch / bandwidth(device)
+    if device.startswith("cuda"):
+        peak = torch.cuda.max_memory_allocated(device)
+    score, index = (torch.cat(columns) for columns in zip(*found[alone:], strict=True))
     match = Match(index, score, torch.ones(len(index), dtype=torch.bool))
     scores = evaluate(match, truth[:, None], TOLERANCE)
-    seconds, scanned = float(np.median(batch)), opened.scanned()
     return {
-        "seconds": seconds / min(BATCH, len(queries)),
-        "seconds_one": float(np.median(one)),
-        "seconds_load": loaded,
+        "seconds": batch / len(parts[alone]),
+        "seconds_one": float(np.median(seconds[1:alone])),
+        "seconds_load": seconds[0],
         "peak_bytes": peak,
         "recall_at_1": scores.recall_at_1,
         "auc": scores.auc,
         "queries": len(queries),
-        "device": opened.device,
-        "bandwidth_share": None if scanned is None else scanned / seconds / bandwidth(opened.device),
+        "device": device,
+        "bandwidth_share": share,
     }
 
 
@@ -225,37 +198,26 @@ class Folder:
     two tiles, see `TiledRoute`, and of frames.
 
     Args:
-        path: an empty folder. sizes: places of the cases.
+        path: an empty folder. drawn: places of `sim:aerial`, whose first ones the whitening is learned from.
     """
 
-    def __init__(self, path: Path, sizes: Sequence[int], progress: bool = False) -> None:
-        self.path, self.progress = path, progress
-        drawn = [n for n in sizes if n <= RENDERED]
-        self.drawn = RENDERED if len(drawn) < len(sizes) else max(drawn)
-        self.model = DejaVu()
-        self.second: AerialRoad
-        self.like: Likeness
-
-    def draw(self) -> None:
-        """`sim:aerial`, its first places for the whitening, and what made descriptors are to be like."""
-        first = AerialRoad(frames=self.drawn)
-        self.model.describe_reference(FrameRange(first, 0, min(self.drawn, DESCRIBED)))
-        self._keep("drawn", self.drawn, self._seen(first, range(self.drawn)))
-        self.second = AerialRoad(frames=self.drawn, traverse=1)
-        shown, places = spread(self.drawn), torch.from_numpy(np.load(self.path / "drawn.npy"))
-        self.like = likeness(places, self._described(self.second, shown), shown)
+    def __init__(self, path: Path, drawn: int) -> None:
+        self.path, self.model = path, DejaVu()
+        first, self.second = AerialRoad(frames=drawn), AerialRoad(frames=drawn, traverse=1)
+        self.model.describe_reference(FrameRange(first, 0, min(drawn, DESCRIBED)))
+        self.keep("drawn", drawn, self.seen(first, range(drawn)))
+        shown, places = spread(drawn), torch.from_numpy(np.load(path / "drawn.npy"))
+        self.like: Likeness = likeness(places, self.described(self.second, shown), shown)
 
     def make(self, places: int) -> None:
         """Descriptors like those drawn; shorter routes are the first of them."""
-        self._keep("made", places, MadeRoute(self.like, places).batches(ROWS))
+        self.keep("made", places, MadeRoute(self.like, places).batches(ROWS))
 
     def draw_again(self, places: int, flown: int) -> None:
         """The ground that repeats: of its tiles, and of a flight over its first places."""
-        tiles = TiledRoute(**tiles_of(self.model), length=places)
-        self._keep("tiles", places, tiles.batches(ROWS))
+        self.keep("tiles", places, TiledRoute(**tiles_of(self.model), length=places).batches(ROWS))
         if flown:
-            road = AerialRoad(frames=flown, ground="repeat")
-            self._keep("flown", flown, self._seen(road, range(flown)))
+            self.keep("flown", flown, self.seen(AerialRoad(frames=flown, ground="repeat"), range(flown)))
 
     def ask(self, case: str, source: str, places: int) -> None:
         """Describe the queries of a case: the second flight, evenly along the route."""
@@ -263,27 +225,27 @@ class Folder:
         if source == "made":
             queries = MadeRoute(self.like, places).seen_again(shown)
         elif source == "drawn":
-            queries = self._described(self.second, shown)
+            queries = self.described(self.second, shown)
         else:
-            queries = self._described(AerialRoad(frames=places, ground="repeat", traverse=1), shown)
+            queries = self.described(AerialRoad(frames=places, ground="repeat", traverse=1), shown)
         save_file({"queries": queries, "truth": shown}, self.path / f"{case}.safetensors")
 
-    def _described(self, road: AerialRoad, shown: Tensor) -> Tensor:
+    def described(self, road: AerialRoad, shown: Tensor) -> Tensor:
         step = int(shown[1] - shown[0])
-        return torch.cat(list(self._seen(road, range(0, step * len(shown), step))))
+        return torch.cat(list(self.seen(road, range(0, step * len(shown), step))))
 
     @torch.no_grad()
-    def _seen(self, road: AerialRoad, frames: range) -> Iterator[Tensor]:
+    def seen(self, road: AerialRoad, frames: range) -> Iterator[Tensor]:
         for part in road.select(frames, 64):
             yield self.model.whitened(self.model.describe(part))
 
-    def _keep(self, name: str, places: int, parts: Iterator[Tensor]) -> None:
+    def keep(self, name: str, places: int, parts: Iterator[Tensor]) -> None:
         """Write descriptors as they are made.
 
         Raises:
             InputError: no room for them.
         """
-        bar = tqdm(total=places, desc=name, disable=None if self.progress else True, leave=False)
+        bar = tqdm(total=places, desc=name, disable=None, leave=False)
         try:
             with bar, (self.path / f"{name}.npy").open("wb") as file:
                 for part in parts:
@@ -306,13 +268,11 @@ def spread(places: int) -> Tensor:
     return torch.arange(count) * (places // count)
 
 
-def bench_scale(places: Sequence[int] = (), device: str = "cpu", progress: bool = False) -> Iterator[Row]:
+def bench_scale(places: Sequence[int] = (), device: str = "cpu") -> Iterator[Row]:
     """All contenders at all sizes, a row at a time.
 
     Args:
-        places: N of each size, `PLACES` where none is given.
-        device: that our maps localize on.
-        progress: show progress bars on a terminal.
+        places: N of each size, `PLACES` where none is given. device: that our maps localize on.
 
     Yields:
         Rows of the cases `places=N`: up to `RENDERED` places `sim:aerial`, beyond it descriptors that are
@@ -323,78 +283,61 @@ def bench_scale(places: Sequence[int] = (), device: str = "cpu", progress: bool 
         InputError: too few places or too many, or no room for their descriptors.
     """
     sizes = sorted(set(places or PLACES))
-    longest = 10**8
-    if sizes[0] < FEWEST or sizes[-1] > longest:
-        raise InputError(f"bench scale got places {sizes}; expected {FEWEST} to {longest} each")
-    threads = torch.get_num_threads()
-    made = min((n for n in sizes if n > RENDERED), default=None)  # ahead of which they are checked
+    if sizes[0] < FEWEST or sizes[-1] > MOST:
+        raise InputError(f"bench scale got places {sizes}; expected {FEWEST} to {MOST} each")
+    made = [n for n in sizes if n > RENDERED]
     whole = [] if places else [LONGEST["repeat"]]  # cycles of both tiles
     repeating = [n for n in sizes if n <= LONGEST["repeat"]] + whole
     with temporary_folder(Path(tempfile.gettempdir())) as path:
-        folder = Folder(path, sizes, progress)
-        folder.draw()
+        folder = Folder(path, RENDERED if made else sizes[-1])
         if made:
             folder.make(sizes[-1])
         if repeating:
             folder.draw_again(repeating[-1], max([n for n in repeating if n <= RENDERED], default=0))
         for n in sizes:
-            if n == made:
-                yield from _case(folder, f"made={CHECKED}", "made", CHECKED, threads, device)
-            yield from _case(folder, f"places={n}", "drawn" if n <= RENDERED else "made", n, threads, device)
+            if n in made[:1]:  # ahead of which made descriptors are checked
+                yield from rows_of(folder, "made", "made", CHECKED, device)
+            yield from rows_of(folder, "places", "made" if n in made else "drawn", n, device)
             if n in repeating:
-                yield from _repeating(folder, n, threads, device)
+                yield from rows_of(folder, "repeat", "tiles", n, device)
         for n in whole:
-            yield from _repeating(folder, n, threads, device)
-    for found in bench_templates(sizes if places else TEMPLATES):
-        yield from map(_of_templates, found)
+            yield from rows_of(folder, "repeat", "tiles", n, device)
+    for row in bench_templates(sizes if places else TEMPLATES):  # a query by itself takes as long as of many
+        count, size = int(row["case"].partition("=")[2]), row["file_bytes"]
+        same = {key: row[key] for key in ("seconds", "peak_bytes", "threads", "skipped", "difference")}
+        same |= {"seconds_one": row["seconds"], "route_bytes": size, "bytes_per_place": size and size / count}
+        yield scale_row(row["case"], row["contender"], count, **same)
 
 
-def _of_templates(row: Row) -> Row:
-    """A row of template search: a query by itself takes as long as one of many."""
-    places, size = int(row["case"].partition("=")[2]), row["file_bytes"]
-    same = {key: row[key] for key in ("seconds", "peak_bytes", "threads", "skipped", "difference")}
-    same |= {"seconds_one": row["seconds"], "route_bytes": size, "bytes_per_place": size and size / places}
-    return scale_row(row["case"], row["contender"], places, **same)
-
-
-def _case(folder: Folder, case: str, source: str, places: int, threads: int, device: str) -> Iterator[Row]:
+def rows_of(folder: Folder, kind: str, source: str, places: int, device: str) -> Iterator[Row]:
+    """The contenders of a case, `kind=places`."""
+    case, threads = f"{kind}={places}", torch.get_num_threads()
     folder.ask(case, source, places)
-    for name in PLACED:
-        task = Task(case, name, source, places, threads, device)
-        if name.startswith("null") and places > SHUFFLED:
-            yield scale_row(case, name, places, skipped=f"shuffled orders are of at most {SHUFFLED} places")
-        else:
-            yield measured(task, folder.path)
-
-
-def _repeating(folder: Folder, places: int, threads: int, device: str) -> Iterator[Row]:
-    case = f"repeat={places}"
-    folder.ask(case, "tiles", places)
     room = step = 0.0
-    for name in REPEATED:
-        source = "flown" if name == FLOWN else "tiles"
-        if (name in (FLOWN, "null")) and places > SHUFFLED:
+    for name in REPEATED if kind == "repeat" else PLACED:
+        if places > SHUFFLED and (name == FLOWN or name.startswith("null")):
             why = "noisy frames are drawn" if name == FLOWN else "shuffled orders are"
             yield scale_row(case, name, places, skipped=f"{why} of at most {SHUFFLED} places")
             continue
-        row = measured(Task(case, name, source, places, threads, device, room, step), folder.path)
+        of = "flown" if name == FLOWN else source
+        row = measured(Task(case, name, of, places, threads, device, room, step), folder.path)
         if name == ONE_CHUNK:
             room, step = row["bytes_per_place"] or 0.0, row["step"] or 0.0
         yield row
 
 
-def run_scale(
-    out: Path, places: Sequence[int] = (), device: str = "cpu", progress: bool = False
-) -> list[Row]:
-    """`bench_scale`, written into a folder: bench.json at each row that is finished, bench.png at the end.
+def run_scale(*, out: Path, places: Sequence[int] = (), device: str = "cpu") -> list[str]:
+    """Time, memory, bytes and accuracy over the number of places, beside the indexes of faiss.
 
-    Raises:
-        InputError: as `bench_scale`, or a folder that cannot be made or written in.
+    Args:
+        out: folder for bench.json and bench.png
+        places: 10000, 100000 and 1000000 if not given
+        device: what localizes: as of `dejavu localize`
     """
-    check_output_folder(out)
+    device = str(device_of(device))
     rows: list[Row] = []
     facts: dict[str, Any] = {"tolerance": TOLERANCE, "device": device, "faiss": FAISS}
-    bar = tqdm(bench_scale(places, device, progress), "rows", disable=None if progress else True, leave=False)
+    bar = tqdm(bench_scale(places, device), "rows", disable=None, leave=False)
     try:
         for row in bar:
             rows = with_ratios([*rows, row])
@@ -406,7 +349,7 @@ def run_scale(
         if panels:
             picture = plot_growth(panels, linear=[RECALL])
             write_bench(out, rows, picture, exponents=exponents(rows), **facts)
-    return rows
+    return [*scale_tables(rows), f"recall within {TOLERANCE} places; localized on one thread"]
 
 
 def limit_memory() -> None:

@@ -3,52 +3,52 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from benchmarks.measure import Found, Opened, Store
+from benchmarks.measure import OURS, Find, Store
 from benchmarks.repeating import step_that_holds
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 
 ROWS = 8192  # descriptors read at a time
 CHUNK = 8192
 SHARE = 0.8  # of the variance of a repeating route
-OURS = "dejavu"
 TRAINED, ROTATED = 100_000, 20_000  # samples at most of an index of faiss, of its rotation
 CELLS_PER_PROBE, PROBED_AT_LEAST = 32, 32  # of an inverted file
 EF_SEARCH = 64  # candidates while a graph is searched
 
 
 class Mapped(Store):
-    """Ours: a spectral map.
+    """Ours: a map, of frames with the default whitening (None), or of descriptors as they are.
 
     Args:
-        budget: route bytes per place. chunk: places. step: in place of the budget.
         shuffled: in random order, the null.
     """
 
+    model: DejaVu  # once it is loaded
+
     def __init__(
         self,
-        budget: float | None,
-        chunk: int,
-        step: float | None = None,
+        mapper: SpectralMapper | TemplateMapper,
+        whitening: Literal["none"] | None = "none",
         shuffled: bool = False,
     ) -> None:
-        self.mapper, self.shuffled = SpectralMapper(budget, step, chunk), shuffled
+        self.mapper, self.whitening, self.shuffled = mapper, whitening, shuffled
 
     def prepare(self, route: IndexedTraverse) -> float | None:
-        return self.mapper.step
+        return getattr(self.mapper, "step", None)
 
     def learn(self, route: IndexedTraverse, path: Path) -> int:
-        model = DejaVu(whitening="none", mapper=self.mapper)
+        model = DejaVu(whitening=self.whitening, mapper=self.mapper)
         if self.shuffled:
             order = torch.randperm(route.length, generator=torch.Generator().manual_seed(0))
             rows = torch.cat(list(route.batches(ROWS)))
@@ -59,23 +59,23 @@ class Mapped(Store):
         model.save(path)
         return model.map.summary().route_bytes
 
-    def load(self, path: Path, device: str = "cpu") -> Opened:
-        model = DejaVu.load(path).to(device)
+    def load(self, path: Path, device: str = "cpu") -> Find:
+        self.model = DejaVu.load(path).to(device)
+        locate = self.model.localize_descriptors if self.whitening else self.model.localize
         order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
 
-        def find(queries: Tensor) -> Found:
-            match = model.localize_descriptors(queries.to(device))
+        def find(queries: Tensor) -> tuple[Tensor, Tensor]:
+            match = locate(queries.to(device))
             index = match.index.cpu()
-            return Found(match.score.cpu(), index if order is None else order[index])
+            return match.score.cpu(), index if order is None else order[index]
 
-        return Opened(find, device, lambda: sum(one.nbytes for one in model.map.buffers()))
+        return find
 
 
 class Held(Mapped):
     """Ours, in steps that keep so much of the variance of a route."""
 
-    def __init__(self, chunk: int) -> None:
-        super().__init__(None, chunk, step=1.0)
+    mapper: SpectralMapper
 
     def prepare(self, route: IndexedTraverse) -> float | None:
         self.mapper.step = step_that_holds(SHARE, route, self.mapper.chunk)
@@ -92,29 +92,36 @@ class Faiss(Store):
     def __init__(self, factory: str) -> None:
         self.factory = factory
 
+    def parts(self, route: IndexedTraverse) -> Iterable[Tensor]:
+        """What is kept of a route, batch by batch."""
+        return route.batches(ROWS)
+
+    def describe(self, queries: Tensor) -> Tensor:
+        return queries
+
     def learn(self, route: IndexedTraverse, path: Path) -> int:
         import faiss
 
         faiss.omp_set_num_threads(torch.get_num_threads())
         every = -(-route.length // TRAINED)
-        sample = torch.cat(list(route.select(range(0, route.length, every), ROWS)))
-        cells = max(1, min(4 * math.isqrt(route.length), len(sample) // 40))
-        index: Any = faiss.index_factory(sample.shape[1], self.factory.format(cells=cells))
+        cells = max(1, min(4 * math.isqrt(route.length), -(-route.length // every) // 40))
+        numbers = self.describe(route.read(range(1))).shape[1]
+        index: Any = faiss.index_factory(numbers, self.factory.format(cells=cells))
         if isinstance(index, faiss.IndexPreTransform):  # else training it takes longer than all the rest
             chain: Any = index.chain
             rotation: Any = faiss.downcast_VectorTransform(chain.at(0))
             rotation.max_train_points = ROTATED
-        index.train(sample.numpy())
-        del sample
+        if not index.is_trained:
+            index.train(torch.cat(list(route.select(range(0, route.length, every), ROWS))).numpy())
         faiss.write_index(index, str(path))
         empty = path.stat().st_size
-        for part in route.batches(ROWS):
+        for part in self.parts(route):
             index.add(part.numpy())
         faiss.write_index(index, str(path))
         names = 8 * route.length if "IVF" in self.factory else 0
         return path.stat().st_size - empty - names
 
-    def load(self, path: Path, device: str = "cpu") -> Opened:
+    def load(self, path: Path, device: str = "cpu") -> Find:
         import faiss
 
         faiss.omp_set_num_threads(torch.get_num_threads())
@@ -125,11 +132,11 @@ class Faiss(Store):
         elif "HNSW" in self.factory:
             index.hnsw.efSearch = EF_SEARCH
 
-        def find(queries: Tensor) -> Found:
-            score, place = index.search(queries.numpy(), 1)
-            return Found(torch.from_numpy(score[:, 0]), torch.from_numpy(place[:, 0]))
+        def find(queries: Tensor) -> tuple[Tensor, Tensor]:
+            score, place = index.search(self.describe(queries).numpy(), 1)
+            return torch.from_numpy(score[:, 0]), torch.from_numpy(place[:, 0])
 
-        return Opened(find)
+        return find
 
 
 class Interpolated(Store):
@@ -141,7 +148,7 @@ class Interpolated(Store):
     def learn(self, route: IndexedTraverse, path: Path) -> int:
         from dejavu_torch.evaluation.baselines import as_int8, keyframes
 
-        each = len(next(route.batches(1))[0])
+        each = route.frame_shape[0]
         k = max(1, math.ceil((route.length - 1) / max(1, self.room * route.length // each - 1)))
         chosen = keyframes(route.length, k)
         rows = torch.cat([route.read(range(i, i + 1)) for i in chosen.tolist()])
@@ -150,14 +157,14 @@ class Interpolated(Store):
         save_file({"keys": small, "scale": scale.view(1), "k": torch.tensor([k, route.length])}, path)
         return small.nbytes
 
-    def load(self, path: Path, device: str = "cpu") -> Opened:
+    def load(self, path: Path, device: str = "cpu") -> Find:
         from dejavu_torch.evaluation.baselines import between_keyframes
 
         state = load_file(path)
         keys = state["keys"].float() * state["scale"]
         k, places = state["k"].tolist()
 
-        def find(queries: Tensor) -> Found:
+        def find(queries: Tensor) -> tuple[Tensor, Tensor]:
             best = torch.full((len(queries),), -math.inf)
             index = torch.zeros(len(queries), dtype=torch.int64)
             pieces = max(1, ROWS // k)
@@ -167,9 +174,9 @@ class Interpolated(Store):
                 score, at = (queries @ torch.nn.functional.normalize(rows, dim=1).T).max(1)
                 index = torch.where(score > best, at + start, index)
                 best = torch.maximum(best, score)
-            return Found(-best, index)
+            return -best, index
 
-        return Opened(find)
+        return find
 
 
 WHOLE = 2**31 - 1  # places of a chunk, more than any route has
@@ -181,12 +188,12 @@ FLOWN = f"{OURS}, one chunk, of noisy frames"
 # it is to take the same. "np" leaves out the training of faiss's filter by Hamming distances, which takes
 # long and is not used here
 PLACED: dict[str, Callable[[float, float], Store]] = {
-    f"{OURS} 1 B": lambda *_: Mapped(1.0, CHUNK),
-    f"{OURS} 4 B": lambda *_: Mapped(4.0, CHUNK),
-    f"{OURS} 1 B, one chunk": lambda *_: Mapped(1.0, WHOLE),
-    f"{OURS} 4 B, one chunk": lambda *_: Mapped(4.0, WHOLE),
-    "null 1 B": lambda *_: Mapped(1.0, CHUNK, shuffled=True),
-    "null 4 B": lambda *_: Mapped(4.0, CHUNK, shuffled=True),
+    f"{OURS} 1 B": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK)),
+    f"{OURS} 4 B": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK)),
+    f"{OURS} 1 B, one chunk": lambda *_: Mapped(SpectralMapper(1.0, chunk=WHOLE)),
+    f"{OURS} 4 B, one chunk": lambda *_: Mapped(SpectralMapper(4.0, chunk=WHOLE)),
+    "null 1 B": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK), shuffled=True),
+    "null 4 B": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK), shuffled=True),
     "faiss flat": lambda *_: Faiss("Flat"),
     "faiss IVF-PQ, 4 B": lambda *_: Faiss("IVF{cells},PQ4np"),
     "faiss IVF-PQ, 8 B": lambda *_: Faiss("IVF{cells},PQ8np"),
@@ -196,11 +203,11 @@ PLACED: dict[str, Callable[[float, float], Store]] = {
     "faiss HNSW": lambda *_: Faiss("HNSW16,Flat"),
 }
 REPEATED: dict[str, Callable[[float, float], Store]] = {
-    ONE_CHUNK: lambda *_: Held(WHOLE),
-    FIXED: lambda *_: Held(CHUNK),
-    FLOWN: lambda room, step: Mapped(None, WHOLE, step),
-    "null": lambda room, step: Mapped(room, WHOLE, shuffled=True),
-    "interpolated frames": lambda room, step: Interpolated(room),
+    ONE_CHUNK: lambda *_: Held(SpectralMapper(None, 1.0, WHOLE)),
+    FIXED: lambda *_: Held(SpectralMapper(None, 1.0, CHUNK)),
+    FLOWN: lambda _, step: Mapped(SpectralMapper(None, step, WHOLE)),
+    "null": lambda room, _: Mapped(SpectralMapper(room, chunk=WHOLE), shuffled=True),
+    "interpolated frames": lambda room, _: Interpolated(room),
 }
 CONTENDERS = PLACED | REPEATED
 GIVEN = CONTENDERS.keys() - {ONE_CHUNK, FIXED, FLOWN}  # those whose bytes per place are given, and no result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,12 @@ COLUMNS: dict[str, Column] = {
     "learned/s": ("learn_rate", ".0f"),
 }
 GROWING = ("bytes_per_place", "route_bytes", "seconds", "seconds_one", "peak_bytes", "learn_rate")
+PANELS = {
+    RECALL: ("places", "recall_at_1", 1.0),
+    "milliseconds of a query in a batch": ("places", "seconds", 1e3),
+    "MB while localizing": ("places", "peak_bytes", 1e-6),
+    "route bytes of ground that repeats": ("repeat", "route_bytes", 1.0),
+}
 
 
 def scale_row(case: str, contender: str, places: int, **facts: Any) -> Row:
@@ -65,7 +71,7 @@ def grown(rows: Iterable[Row], kind: str, key: str) -> dict[str, list[tuple[int,
     for row in rows:
         name, value = row["contender"], row[key]
         given = key in ("bytes_per_place", "route_bytes") and name in GIVEN
-        whole = kind_of(row) == "repeat" and row["places"] == LONGEST["repeat"]
+        whole = kind == "repeat" and row["places"] == LONGEST["repeat"]
         if kind_of(row) == kind and value is not None and not given and not whole:
             found.setdefault(name, []).append((row["places"], value))
     return found
@@ -94,31 +100,22 @@ def exponents(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float]]]]:
     """What is drawn over the number of places: heading -> contender -> points."""
-    panels = {
-        RECALL: ("places", "recall_at_1", 1.0),
-        "milliseconds of a query in a batch": ("places", "seconds", 1e3),
-        "MB while localizing": ("places", "peak_bytes", 1e-6),
-        "route bytes of ground that repeats": ("repeat", "route_bytes", 1.0),
-    }
-    found = {
-        heading: {
-            name: [(float(places), unit * value) for places, value in points]
-            for name, points in grown(rows, kind, key).items()
-        }
-        for heading, (kind, key, unit) in panels.items()
-    }
+    found = {}
+    for heading, (kind, key, unit) in PANELS.items():
+        lines = grown(rows, kind, key).items()
+        found[heading] = {name: [(float(n), unit * value) for n, value in points] for name, points in lines}
     return {heading: lines for heading, lines in found.items() if lines}
 
 
-def scale_tables(rows: Sequence[Row]) -> Iterator[tuple[str, list[list[str]]]]:
-    """A table of each case, and one of the exponents: a heading and rows of text.
-
-    Example:
-        >>> next(scale_tables([scale_row("places=100", "dejavu", 100, bytes_per_place=1.0)]))[1][1][:2]
-        ['dejavu', '1']
-    """
+def scale_tables(rows: Sequence[Row]) -> list[str]:
+    """A table of each case under its heading, and one of the exponents."""
+    found = []
     for case in dict.fromkeys(row["case"] for row in rows):
-        yield case, table([row for row in rows if row["case"] == case], COLUMNS, "{contender}")
+        found.append(
+            f"{case}\n{table([row for row in rows if row['case'] == case], COLUMNS, '{contender}')}\n"
+        )
     for kind, fitted in exponents(rows).items():
         lines = [new_row(kind, name, GROWING, **one) for name, one in fitted.items()]
-        yield f"{kind}=N: exponents of N", table(lines, {key: (key, ".2f") for key in GROWING}, "{contender}")
+        figures = table(lines, {key: (key, ".2f") for key in GROWING}, "{contender}")
+        found.append(f"{kind}=N: exponents of N\n{figures}\n")
+    return found

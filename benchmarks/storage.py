@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,21 +14,22 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.coded_video import CodedVideo
-from benchmarks.measure import Contender, Row, new_row, peak_memory, with_ratios, write_bench
+from benchmarks.measure import Contender, Row, failure, new_row, peak_memory, with_ratios, write_bench
 from benchmarks.plots import plot_frontiers
 from benchmarks.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.data.ground_truth import GroundTruth
-from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.contenders import LENGTHS, evaluate_each, lengths_beside, sequences_as_json
+from dejavu_torch.evaluation.plots import Plot
+from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.evaluation.reproduce import paper_model
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.text import one_line
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, Traverse
 
 BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
@@ -41,14 +42,15 @@ CODE_BYTES, CODE_SPACED = (4, 8, 16, 32), (2, 3, 4, 5, 8)
 BIT_SPACED = (1, 2, 3, 4, 5, 8, 10, 16)
 QUALITIES, VIDEO_SPACED = (24, 32, 40, 51), (1, 4, 8)  # crf
 BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames, 0 the whole route
-WHITENINGS: Mapping[str, Mapping[str, int]] = {  # other settings than the defaults
+WHITENINGS: dict[str, dict[str, Any]] = {  # other settings than the defaults
     "16 bits": {"bits": 16},
     "8 bits": {"bits": 8},
     "64 numbers": {"numbers": 64},
     "32 numbers": {"numbers": 32},
 }
 WHITENED = 5.0  # route bytes per place of the map behind each of them
-LEVEL = 0.95  # an area that tells stores apart: near 1 it hangs on single queries
+AT, LEVEL = 1.6, 0.95  # the area of ours at so many bytes is asked of others, but at most this: near 1 it
+# hangs on single queries
 TOLERANCE = 5
 KEYS = (
     *("family", "seconds", "peak_bytes", "bytes", "fixed_bytes", "route_bytes", "route_bytes_per_place"),
@@ -56,11 +58,16 @@ KEYS = (
 )
 OURS, NULL, OTHERS = "dejavu", "null", "dejavu, other whitenings"
 
+Store = tuple[str, str, Callable[[], Kept]]  # name, family, and what it gives back of the descriptors
+Answer = tuple[Match, int, int]  # what a contender finds, its bytes that grow with the route, and all others
+Points = Sequence[tuple[float, float]]  # bytes per place and area
+
 
 class Route(NamedTuple):
     """A route described: places (N,K) and queries (Q,K), whitened alike.
 
-    reference: the frames of the places. fixed: bytes of the whitening, which every contender needs.
+    reference: the frames of the places. fixed: bytes of the whitening, which every contender needs. other:
+    the route of the free codebooks and of a whitening that is shared; None leaves them out, and says so.
     """
 
     name: str
@@ -71,14 +78,47 @@ class Route(NamedTuple):
     queries: Tensor
     truth: GroundTruth
     fixed: int
+    other: Traverse | None
+
+    def another(self, what: str) -> Traverse:
+        """The other route, which something is learned on."""
+        if self.other is None:
+            raise InputError(f"no other route to {what}; expected --codebooks SOURCE")
+        self.model.describer.check_sizes(self.reference, self.other)
+        return self.other
 
 
-class Answer(NamedTuple):
-    """What a contender finds, and its bytes: those that grow with the route, and all others."""
+def run_storage(
+    sources: Sequence[str] = (),
+    *,
+    out: Path,
+    map: Path | None = None,
+    codebooks: str | None = None,
+    whitening: Path | None = None,
+    places: Sequence[int] = (),
+) -> list[str]:
+    """Accuracy over bytes of ways to store the descriptors of a route.
 
-    found: Match
-    route: int
-    fixed: int
+    Args:
+        sources: pairs REFERENCE QUERY; the built-in routes if not given
+        out: folder for bench.json and bench.png
+        map: a map of the REFERENCE to set beside the others
+        codebooks: another route, where codebooks and a whitening are learned that count nothing
+        whitening: a map whose whitening describes all routes; each learns its own if not given
+        places: frames of the built-in sim:aerial; 3072 and 10000 if not given
+
+    Raises:
+        InputError: sources that are no pairs or do not fit each other, and what the sources raise.
+    """
+    given = None if map is None else DejaVu.load(map)
+    shared = None if whitening is None else DejaVu.load(whitening)
+    rows: list[Row] = []
+    for row in bench_storage(sources, places, codebooks, given, shared):  # written as rows are finished
+        rows = with_ratios([*rows, row])
+        write_bench(out, rows, equal_auc=equal_areas(rows), tolerance=TOLERANCE)
+    write_bench(out, rows, pictured(rows), equal_auc=equal_areas(rows), tolerance=TOLERANCE)
+    note = "the best of each family, T queries matched together"
+    return [*storage_tables(rows), *skipped_lines(rows), note]
 
 
 def bench_storage(
@@ -87,19 +127,8 @@ def bench_storage(
     codebooks: str | None = None,
     given: DejaVu | None = None,
     whitening: DejaVu | None = None,
-    seed: int = 0,
-    progress: bool = False,
 ) -> Iterator[Row]:
-    """Accuracy over bytes of all contenders on all routes, a row at a time.
-
-    Args:
-        sources: REFERENCE QUERY, any number of pairs; none are the built-in routes.
-        places: frames of `sim:aerial`, in place of 3072 and 10000.
-        codebooks: another route of frames of the same size, on which codebooks of product quantisers are
-            trained that then count nothing. The built-in routes have seed 1 of the same simulator.
-        given: a model with a map of the one pair's reference, set beside the others.
-        whitening: a model whose whitening describes all routes; None learns one for each.
-        seed: of the whitening and the null. progress: show progress bars on a terminal.
+    """Accuracy over bytes of all contenders on all routes, a row at a time; see `run_storage`.
 
     Yields:
         family: of contenders that make one front. seconds: to store the route and match all queries; of what
@@ -108,53 +137,51 @@ def bench_storage(
         ratio_to_ours: seconds over those of our fastest. bytes: of all, with the whitening; those that do not
         grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
         together. skipped: why there are no figures.
-
-    Raises:
-        InputError: sources that are no pairs or do not fit each other, and what the sources raise.
     """
-    routes = _routes(sources, places, codebooks, given)
+    routes = routes_of(sources, places, codebooks, given)
     for _, reference, query, _ in routes:
-        for model in (_model(whitening), given):
+        for model in (model_by(whitening), given):
             if model is not None:
-                _check(model, reference, query)
+                check(model, reference, query)
     for name, reference, query, other in routes:
-        route = described(name, reference, query, _model(whitening), seed, progress)
-        contenders = list(contenders_of(route, other, given, seed))
-        for contender in tqdm(contenders, name, disable=None if progress else True, leave=False):
+        route = described(name, reference, query, model_by(whitening), other)
+        for contender in tqdm(list(contenders_of(route, given)), name, disable=None, leave=False):
             yield judged(route, contender)
 
 
-def _routes(
+def routes_of(
     sources: Sequence[str], places: Sequence[int], codebooks: str | None, given: DejaVu | None
 ) -> list[tuple[str, Traverse, Traverse, Traverse | None]]:
     """Name, reference, query and the route of the free codebooks of each route; all refused early."""
+    pairs = list(zip(sources[::2], sources[1::2], strict=False))
+    twice = [f"{a} and {b}" for i, (a, b) in enumerate(pairs) if (a, b) in pairs[:i]]
     if len(sources) % 2:
         raise InputError(f"bench storage got {len(sources)} sources; expected pairs, REFERENCE QUERY ...")
-    if given is not None and len(sources) != 2:
+    if given is not None and len(pairs) != 1:
         raise InputError(f"a map is of one route, and there are {len(sources)} sources; expected one pair")
     if sources and places:
         raise InputError("--places are of the built-in sim:aerial; expected none beside sources")
     if places and min(places) < 2:
         raise InputError(f"--places {' '.join(map(str, places))}; expected at least 2 each")
+    if twice:
+        raise InputError(f"the pair {twice[0]} is given twice; expected it once")
     if sources:
         other = None if codebooks is None else open_source(codebooks)
-        pairs = list(zip(sources[::2], sources[1::2], strict=True))
-        twice = next((pair for i, pair in enumerate(pairs) if pair in pairs[:i]), None)
-        if twice:
-            raise InputError(f"the pair {_name(*twice)} is given twice; expected it once")
-        return [(_name(a, b), open_source(a), open_source(b), other) for a, b in pairs]
+        return [(f"{a} and {b}", open_source(a), open_source(b), other) for a, b in pairs]
     if codebooks is not None:
         raise InputError("--codebooks are of pairs of sources; the built-in routes have seed 1 of their own")
-    found = []
+    found: list[tuple[str, Traverse, Traverse, Traverse | None]] = []
     for kind, sizes in (BUILT_IN | ({"aerial": tuple(places)} if places else {})).items():
         for size in sizes:
             address = f"sim:{kind}?" + (f"frames={size}&" if size else "")
-            own = [open_source(f"{address}seed={s}&traverse={t}") for s, t in ((0, 0), (0, 1), (1, 0))]
-            found.append((f"sim:{kind}, {own[0].length} places", *own))
-    return found  # type: ignore[return-value]  # mypy sees no triple
+            a, b, other = (
+                open_source(f"{address}seed={s}&traverse={t}") for s, t in ((0, 0), (0, 1), (1, 0))
+            )
+            found.append((f"sim:{kind}, {a.length} places", a, b, other))
+    return found
 
 
-def _model(whitening: DejaVu | None) -> DejaVu:
+def model_by(whitening: DejaVu | None) -> DejaVu:
     """One with the defaults, or with the whitening of another."""
     model = DejaVu()
     if whitening is not None:
@@ -162,7 +189,7 @@ def _model(whitening: DejaVu | None) -> DejaVu:
     return model
 
 
-def _check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
+def check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
     """Refuse, before the long work, a pair that does not fit the model or each other."""
     features, whitening = model.describer.check_sizes(reference, query), model.whitening
     if whitening is not None and whitening.learned and len(whitening.projection) != features:
@@ -171,7 +198,7 @@ def _check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
             "a frame; expected as many, as frames of one size give"
         )
     if reference.length is not None and query.length is not None:
-        _truth(reference, query, reference.length, query.length)
+        truth_of(reference, query, reference.length, query.length)
     if model.map.places and reference.length is not None and model.map.places != reference.length:
         raise InputError(
             f"the map holds {model.map.places} places and {reference.name} {reference.length}; expected the "
@@ -179,7 +206,7 @@ def _check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
         )
 
 
-def _truth(reference: Traverse, query: Traverse, frames: int, queries: int) -> GroundTruth:
+def truth_of(reference: Traverse, query: Traverse, frames: int, queries: int) -> GroundTruth:
     """What the sources say, or frame i is place i."""
     truth = ground_truth_of(None, reference, query, frames, queries, aligned=True)
     if truth is None:
@@ -190,67 +217,47 @@ def _truth(reference: Traverse, query: Traverse, frames: int, queries: int) -> G
     return truth
 
 
-def _name(reference: str, query: str) -> str:
-    return f"{reference} and {query}"
-
-
 def described(
     name: str,
     reference: Traverse,
     query: Traverse,
     model: DejaVu | None = None,
-    seed: int = 0,
-    progress: bool = False,
+    other: Traverse | None = None,
 ) -> Route:
-    """A route's whitened descriptors.
-
-    Args:
-        model: makes them; None is one with the defaults.
-        seed: of a whitening that is learned here.
-
-    Raises:
-        InputError: frames that differ in size, or nothing that says which places are right.
-    """
+    """A route's descriptors by a model, which learns its whitening where it has none; None is the default."""
     model = DejaVu() if model is None else model
     assert model.whitening is not None  # of the defaults
-    if not model.whitening.fixed:
-        model.whitening.seed = seed
-    places = model.describe_reference(reference, None, "describing" if progress else None)
-    queries = model.extract_all(query, "describing the query" if progress else None)
-    truth = _truth(reference, query, len(places), len(queries))
+    places = model.describe_reference(reference, None, "describing")
+    queries = model.extract_all(query, "describing the query")
+    truth = truth_of(reference, query, len(places), len(queries))
     fixed = sum(buffer.nbytes for buffer in model.whitening.buffers())
-    return Route(name, model, reference, query, places.float(), queries.float(), truth, fixed)
+    return Route(name, model, reference, query, places.float(), queries.float(), truth, fixed, other)
 
 
-def contenders_of(
-    route: Route, other: Traverse | None, given: DejaVu | None = None, seed: int = 0
-) -> Iterator[Contender]:
-    """All that is set side by side on a route, ours first.
-
-    Args:
-        other: the route of the free codebooks and of a whitening that is shared; None leaves them out, and
-            says so.
-        given: see `bench_storage`.
-    """
-    for name, family, keep in _stores(route, other, seed):
-        yield Contender(name, partial(partial, _among, route, keep), family=family)
-    yield from _other_whitenings(route, other, seed)
+def contenders_of(route: Route, given: DejaVu | None = None) -> Iterator[Contender]:
+    """All that is set side by side on a route, ours first; given: see `run_storage`."""
+    for name, family, keep in stores_of(route):
+        yield Contender(name, partial(partial, among, route, keep), family=family)
+    assert route.model.whitening is not None
+    if not route.model.whitening.fixed:  # else it was given, and there is none to change
+        for name in (*WHITENINGS, "of another route"):
+            answer = partial(partial, by_other_whitening, route, name)
+            yield Contender(f"dejavu {WHITENED:g}, whitening {name}", answer, family=OTHERS)
     if given is not None:
-        found = partial(partial, _by_map, route, given)
+        found = partial(partial, by_map, route, lambda: given)
         yield Contender("dejavu, the map that was given", found, family="dejavu, given")
-    yield Contender("the paper", partial(partial, _by_paper, route), family="the paper")
+    # template means of the features themselves at frequencies found in them, frame by frame
+    paper = partial(partial, by_map, route, lambda: paper_model().learn(route.reference))
+    yield Contender("the paper", paper, family="the paper")
 
 
-Store = tuple[str, str, Callable[[], Kept]]  # name, family, and what it gives back of the descriptors
-
-
-def _stores(route: Route, other: Traverse | None, seed: int) -> Iterator[Store]:
+def stores_of(route: Route) -> Iterator[Store]:
     """Ways to keep the very same descriptors."""
     places, numbers = route.places, route.places.shape[1]
     for budget in BUDGETS:
         yield f"dejavu {budget:g}", OURS, partial(spectral, places, budget)
     for budget in BUDGETS:
-        yield f"null {budget:g}", NULL, partial(spectral, places, budget, seed)
+        yield f"null {budget:g}", NULL, partial(spectral, places, budget, seed=0)
     for k in SPACED:
         name = "whole database" if k == 1 else every(k, "frame")
         yield f"{name}, float", "frames", partial(every_kth, places, k, 4 * numbers)
@@ -266,23 +273,20 @@ def _stores(route: Route, other: Traverse | None, seed: int) -> Iterator[Store]:
         for between in (False, True) if k > 1 else (False,):
             keep = partial(every_kth, places, k, -(-numbers // 8), signs, between)
             yield f"signs of {every(k, 'frame')}{', interpolated' * between}", "binary", keep
-    yield from _product_quantisers(route, other)
+    yield from product_quantisers(route)
     for codec in ("libx264", "libx265"):
         for crf in QUALITIES:
             for k in VIDEO_SPACED:
                 name = f"{codec[3:]}, crf {crf}, {every(k, 'frame')}{', interpolated' * (k > 1)}"
-                yield name, "video", partial(_video, route, codec, crf, k)
+                yield name, "video", partial(video, route, codec, crf, k)
 
 
-def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Store]:
+def product_quantisers(route: Route) -> Iterator[Store]:
     """PQ and OPQ, by codebooks of another route, which count nothing, and by the route's own, which do."""
 
     @cache
     def elsewhere() -> Tensor:
-        if other is None:
-            raise InputError("no other route to train codebooks on; expected --codebooks SOURCE")
-        route.model.describer.check_sizes(route.reference, other)
-        return route.model.extract_all(other).float()
+        return route.model.extract_all(route.another("train codebooks on")).float()
 
     @cache  # one training for all strides
     def quantiser(m: int, rotated: bool, own: bool) -> ProductQuantiser:
@@ -300,7 +304,7 @@ def _product_quantisers(route: Route, other: Traverse | None) -> Iterator[Store]
             yield name, family, partial(keep, k, m, rotated, own, between)
 
 
-def _video(route: Route, codec: str, crf: int, k: int) -> Kept:
+def video(route: Route, codec: str, crf: int, k: int) -> Kept:
     """Every k-th frame coded and described again, straight lines between the descriptors."""
     coded = CodedVideo(route.reference, codec, crf, step=k)
     keys, count = route.model.extract_all(coded).float(), len(route.places)
@@ -309,62 +313,38 @@ def _video(route: Route, codec: str, crf: int, k: int) -> Kept:
     return Kept(between_keyframes(keys, count, k) if k > 1 else keys, coded.bytes)
 
 
-def _other_whitenings(route: Route, other: Traverse | None, seed: int) -> Iterator[Contender]:
-    """The map of the same frames by other whitenings, one of them another route's."""
-    assert route.model.whitening is not None
-    if route.model.whitening.fixed:  # given: there is none to change
-        return
-
-    def learned(settings: Mapping[str, int]) -> DejaVu:
-        return DejaVu(whitening=Whitening(**settings))  # type: ignore[arg-type]  # all are whole numbers
-
-    def shared() -> DejaVu:
-        if other is None:
-            raise InputError("no other route to learn a whitening on; expected --codebooks SOURCE")
-        route.model.describer.check_sizes(route.reference, other)
-        source, model = DejaVu(), DejaVu()
-        assert source.whitening is not None
-        source.whitening.seed = seed
-        source.describe_reference(other)
+def by_other_whitening(route: Route, name: str, matching: Matching) -> Answer:
+    """The map of the same frames by another whitening."""
+    model = DejaVu(whitening=Whitening(**WHITENINGS.get(name, {})))
+    if name not in WHITENINGS:
+        source = DejaVu()
+        source.describe_reference(route.another("learn a whitening on"))
         model.take_whitening(source)
-        return model
-
-    def answer(model: Callable[[], DejaVu], matching: Matching) -> Answer:
-        again = described(route.name, route.reference, route.query, model(), seed)
-        return _among(again, partial(spectral, again.places, WHITENED), matching)
-
-    models: dict[str, Callable[[], DejaVu]]
-    models = {name: partial(learned, settings) for name, settings in WHITENINGS.items()}
-    for name, model in (models | {"of another route": shared}).items():
-        whitened = partial(partial, answer, model)
-        yield Contender(f"dejavu {WHITENED:g}, whitening {name}", whitened, family=OTHERS)
+    again = described(route.name, route.reference, route.query, model)
+    return among(again, partial(spectral, again.places, WHITENED), matching)
 
 
-def _among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer:
+def among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer:
     """Nearest of the descriptors that a store gives back, by cosine."""
     kept = keep()
     found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", matching=matching)
-    return Answer(found, kept.route, kept.fixed + route.fixed)
+    return found, kept.route, kept.fixed + route.fixed
 
 
-def _by_map(route: Route, model: DejaVu, matching: Matching) -> Answer:
+def by_map(route: Route, made: Callable[[], DejaVu], matching: Matching) -> Answer:
     """A map on descriptors of its own."""
-    found = model.localize_descriptors(model.extract_all(route.query), matching).renumbered(
-        model.map.table.scored
-    )
+    model = made()
+    found = model.localize_descriptors(model.extract_all(route.query), matching)
     summary = model.summary()
-    return Answer(found, summary.route_bytes, summary.fixed_bytes)
-
-
-def _by_paper(route: Route, matching: Matching) -> Answer:
-    """Template means of the features themselves at frequencies found in them, frame by frame."""
-    return _by_map(route, paper_model().learn(route.reference), matching)
+    return found.renumbered(model.map.table.scored), summary.route_bytes, summary.fixed_bytes
 
 
 def judged(route: Route, contender: Contender) -> Row:
-    """Store a route, match all queries, and score them."""
+    """Store a route, match all queries, and score them: single ones, and sequences of each T with room."""
     row = new_row(route.name, contender.name, KEYS, family=contender.family)
-    matching = _matching(len(route.places), len(route.queries))
+    count = len(route.places)
+    sequence = SequenceMatcher(max(length for length in LENGTHS if length <= count))
+    matching = Matching(sequence, lengths_beside(sequence, len(route.queries), count))
     answers: list[Answer] = []
     began = time.perf_counter()
     try:
@@ -373,27 +353,38 @@ def judged(route: Route, contender: Contender) -> Row:
     except InputError as error:
         return row | {"skipped": str(error)}
     except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
-        return row | {"skipped": f"{type(error).__name__}: {one_line(error)}"[:200]}
-    seconds, (answer,) = time.perf_counter() - began, answers
-    scores = evaluate_each(answer.found.sequences, route.truth, TOLERANCE)
+        return row | {"skipped": failure(error)}
+    seconds, ((found, size, fixed),) = time.perf_counter() - began, answers
+    scores = evaluate_each(found.sequences, route.truth, TOLERANCE)
     return row | {
         "seconds": seconds,
         "peak_bytes": peak,
-        "bytes": answer.route + answer.fixed,
-        "fixed_bytes": answer.fixed,
-        "route_bytes": answer.route,
-        "route_bytes_per_place": answer.route / len(route.places),
+        "bytes": size + fixed,
+        "fixed_bytes": fixed,
+        "route_bytes": size,
+        "route_bytes_per_place": size / count,
         "recall_at_1": scores[1].recall_at_1,
         "auc": scores[1].auc,
         "sequences": sequences_as_json(scores),
     }
 
 
-def _matching(places: int, queries: int) -> Matching:
-    """Single queries, and beside them sequences of each T that there is room for."""
-    longest = max(length for length in LENGTHS if length <= places)
-    sequence = SequenceMatcher(longest)
-    return Matching(sequence, lengths_beside(sequence, queries, places))
+def front(rows: Sequence[Row], length: int = 1) -> list[tuple[float, float]]:
+    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries.
+
+    Example:
+        >>> sizes = {2.0: 0.7, 1.0: 0.5, 4.0: 0.6}
+        >>> front([{"route_bytes_per_place": size, "sequences": {"1": {"auc": auc}}, "skipped": None}
+        ...        for size, auc in sizes.items()])
+        [(1.0, 0.5), (2.0, 0.7)]
+    """
+    ran = [row for row in rows if row["skipped"] is None]
+    points = [(row["route_bytes_per_place"] or 0.0, area(row, length) or 0.0) for row in ran]
+    best: list[tuple[float, float]] = []
+    for size, auc in sorted(points, key=lambda point: (point[0], -point[1])):
+        if not best or auc > best[-1][1]:
+            best.append((size, auc))
+    return best
 
 
 def area(row: Row, length: int) -> float | None:
@@ -402,68 +393,38 @@ def area(row: Row, length: int) -> float | None:
     return auc
 
 
-class Point(NamedTuple):
-    """An area that is reached with so many route bytes per place."""
-
-    size: float
-    auc: float
-
-
-def front(rows: Sequence[Row], length: int = 1) -> list[Point]:
-    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries.
-
-    Example:
-        >>> sizes = {2.0: 0.7, 1.0: 0.5, 4.0: 0.6}
-        >>> rows = [new_row("", "", KEYS, route_bytes_per_place=size, sequences={"1": {"auc": auc}})
-        ...         for size, auc in sizes.items()]
-        >>> [tuple(point) for point in front(rows)]
-        [(1.0, 0.5), (2.0, 0.7)]
-    """
-    best: list[Point] = []
-    points = (Point(row["route_bytes_per_place"] or 0, area(row, length) or 0) for row in rows if _ran(row))
-    for point in sorted(points, key=lambda point: (point.size, -point.auc)):
-        if not best or point.auc > best[-1].auc:
-            best.append(point)
-    return best
-
-
-def bytes_for(auc: float, points: Sequence[Point]) -> float | None:
+def bytes_for(auc: float, points: Points) -> float | None:
     """Bytes per place at which a front reaches an area, on straight lines over the logarithm of bytes.
 
     None where it never does. Where its smallest point does, that point's, which it may need less than.
 
     Example:
-        >>> bytes_for(0.6, [Point(1.0, 0.5), Point(4.0, 0.7)])
+        >>> bytes_for(0.6, [(1.0, 0.5), (4.0, 0.7)])
         2.0
     """
-    for i, after in enumerate(points):
-        if after.auc >= auc:
-            if i == 0 or after.size <= 0:
-                return after.size
-            before = points[i - 1]
-            share = (auc - before.auc) / (after.auc - before.auc)
-            return math.exp((1 - share) * math.log(before.size) + share * math.log(after.size))
-    return None
+    i = next((i for i, point in enumerate(points) if point[1] >= auc), None)
+    if i is None:
+        return None
+    after, reached = points[i]
+    if i == 0 or after <= 0:
+        return after
+    before, missed = points[i - 1]
+    share = (auc - missed) / (reached - missed)
+    return math.exp((1 - share) * math.log(before) + share * math.log(after))
 
 
-def _ran(row: Row) -> bool:
-    return row["skipped"] is None
+def by(key: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """The rows that have figures by their case or family, in order."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if row["skipped"] is None:
+            found.setdefault(row[key], []).append(row)
+    return found
 
 
-def _families(rows: Sequence[Row]) -> dict[str, list[Row]]:
+def families(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """The rows of each family but `OTHERS`, which differ in what does not grow with the route."""
-    found: dict[str, list[Row]] = {}
-    for row in rows:
-        if _ran(row) and row["family"] != OTHERS:
-            found.setdefault(row["family"], []).append(row)
-    return found
-
-
-def _cases(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    found: dict[str, list[Row]] = {}
-    for row in rows:
-        found.setdefault(row["case"], []).append(row)
-    return found
+    return {name: some for name, some in by("family", rows).items() if name != OTHERS}
 
 
 def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -474,11 +435,10 @@ def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
         None where it never gets there, and `null_over_ours`.
     """
     found = []
-    for case, own in _cases(rows).items():
-        families = _families(own)
+    for case, own in by("case", rows).items():
         for length in LENGTHS:
-            fronts = {name: front(some, length) for name, some in families.items() if name != OURS}
-            for row in families.get(OURS, ()):
+            fronts = {name: front(some, length) for name, some in families(own).items() if name != OURS}
+            for row in families(own).get(OURS, ()):
                 auc, size = area(row, length), row["route_bytes_per_place"]
                 if auc is None or size is None:
                     continue
@@ -497,99 +457,61 @@ def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return found
 
 
-class Whitened(NamedTuple):
-    """The area of our map by one whitening, and the bytes that this takes once."""
-
-    name: str
-    fixed_bytes: int
-    auc: float
-
-
-def whitenings(rows: Sequence[Row]) -> dict[str, list[Whitened]]:
-    """For each route with other whitenings than its own: that one, the first, and the others."""
-    found: dict[str, list[Whitened]] = {}
-    for case, own in _cases(rows).items():
-        others = [row for row in own if _ran(row) and row["family"] == OTHERS]
-        ours = [row for row in own if _ran(row) and row["contender"] == f"{OURS} {WHITENED:g}"]
+def whitenings(rows: Sequence[Row]) -> dict[str, list[tuple[str, int, float]]]:
+    """Name, fixed bytes and area of our map by each whitening, for each route with others than its own."""
+    found = {}
+    for case, own in by("case", rows).items():
+        ours = [row for row in own if row["contender"] == f"{OURS} {WHITENED:g}"]
+        others = [row for row in own if row["family"] == OTHERS]
         if others and ours:
             names = ["the default", *(row["contender"].rpartition("whitening ")[2] for row in others)]
-            found[case] = [
-                Whitened(name, row["fixed_bytes"] or 0, row["auc"] or 0)
-                for name, row in zip(names, ours + others, strict=True)
-            ]
+            shown = zip(names, ours + others, strict=True)
+            found[case] = [(name, row["fixed_bytes"] or 0, row["auc"] or 0) for name, row in shown]
     return found
 
 
-def run_storage(
-    out: Path,
-    sources: Sequence[str] = (),
-    places: Sequence[int] = (),
-    codebooks: str | None = None,
-    given: DejaVu | None = None,
-    whitening: DejaVu | None = None,
-    progress: bool = False,
-) -> list[Row]:
-    """`bench_storage`, written into a folder as rows are finished: bench.json, and bench.png at the end.
-
-    Raises:
-        InputError: as `bench_storage`, or a folder that cannot be made or written in.
-    """
-    check_output_folder(out)
-    rows: list[Row] = []
-    for row in bench_storage(sources, places, codebooks, given, whitening, progress=progress):
-        rows = with_ratios([*rows, row], lambda row: row["family"] == OURS)
-        write_bench(out, rows, equal_auc=equal_areas(rows), tolerance=TOLERANCE)
-    picture = plot_frontiers(pictured(rows), whitenings(rows))
-    write_bench(out, rows, picture, equal_auc=equal_areas(rows), tolerance=TOLERANCE)
-    return rows
-
-
-def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """The front of each family on each route, as `plot_frontiers` takes them."""
-    return {
-        case: {name: [(p.size, p.auc) for p in front(some)] for name, some in _families(own).items()}
-        for case, own in _cases(rows).items()
+def pictured(rows: Sequence[Row]) -> Plot:
+    """The front of each family on each route."""
+    cases = {
+        case: {name: front(some) for name, some in families(own).items()}
+        for case, own in by("case", rows).items()
     }
+    return plot_frontiers(cases, whitenings(rows))
 
 
-def storage_tables(rows: Sequence[Row], at: float = 1.6) -> Iterator[tuple[str, list[list[str]]]]:
-    """For each route: a heading and rows of text, the best area of each family in so many bytes per place.
+def storage_tables(rows: Sequence[Row], at: float = AT) -> Iterator[str]:
+    """For each route, as aligned text, the best area of each family in so many bytes per place.
 
     A second table has the bytes per place that each family needs, by T, for our area at `at` bytes or, where
     that is larger, for `LEVEL`; a third the areas by other whitenings.
     """
     others = whitenings(rows)
-    for case, own in _cases(rows).items():
-        families = _families(own)
+    for case, own in by("case", rows).items():
         table = [["route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
-        for name, some in families.items():
+        for name, some in families(own).items():
             sizes = [(row["route_bytes_per_place"] or 0, row["auc"] or 0) for row in some]
             fits = ([auc for size, auc in sizes if size <= NEAR * budget] for budget in SHOWN)
             table.append([name, *(f"{max(areas):.3f}" if areas else "" for areas in fits)])
-        yield f"{case}: AUC", table
-        levels = {}
-        for length in LENGTHS:
-            ours = [point.auc for point in front(families.get(OURS, ()), length) if point.size <= NEAR * at]
-            if ours:
-                levels[length] = min(max(ours), LEVEL)
+        yield f"{printable(case)}: AUC\n{text_table(table)}\n"
+        ours = {
+            T: [p[1] for p in front(families(own).get(OURS, ()), T) if p[0] <= NEAR * at] for T in LENGTHS
+        }
+        levels = {length: min(max(areas), LEVEL) for length, areas in ours.items() if areas}
         if levels:
             table = [["queries together:", *(f"T = {length}" for length in levels)]]
             table.append(["AUC", *(f"{level:.3f}" for level in levels.values())])
-            for name, some in families.items():
-                needed = (_needed(level, front(some, length)) for length, level in levels.items())
-                table.append([name, *needed])
-            yield "route bytes per place for an AUC", table
+            for name, some in families(own).items():
+                table.append([name, *(needed(auc, front(some, length)) for length, auc in levels.items())])
+            yield f"route bytes per place for an AUC\n{text_table(table)}\n"
         if case in others:
             table = [["whitening:", "fixed kB", "AUC"]]
-            table += [[one.name, f"{one.fixed_bytes / 1000:.0f}", f"{one.auc:.3f}"] for one in others[case]]
-            yield f"AUC of dejavu at {WHITENED:g} bytes per place", table
+            table += [[name, f"{size / 1000:.0f}", f"{auc:.3f}"] for name, size, auc in others[case]]
+            yield f"AUC of dejavu at {WHITENED:g} bytes per place\n{text_table(table)}\n"
 
 
-def _needed(auc: float, points: Sequence[Point]) -> str:
+def needed(auc: float, points: Points) -> str:
     size = bytes_for(auc, points)
-    if size is None:
-        return "never"
-    return f"{'<' * (points[0].auc > auc)}{size:.2f}"
+    return "never" if size is None else f"{'<' * (points[0][1] > auc)}{size:.2f}"
 
 
 def skipped_lines(rows: Sequence[Row]) -> list[str]:
@@ -599,6 +521,6 @@ def skipped_lines(rows: Sequence[Row]) -> list[str]:
         if row["skipped"]:
             reasons.setdefault((row["case"], row["skipped"]), []).append(row["contender"])
     return [
-        f"{case}: skipped {names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {reason}"
+        printable(f"{case}: skipped {names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {reason}")
         for (case, reason), names in reasons.items()
     ]

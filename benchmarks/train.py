@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import tempfile
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import pytorch_lightning as pl
 import torch
 from torch import nn
 from tqdm import tqdm
@@ -18,16 +16,13 @@ from tqdm import tqdm
 from benchmarks.measure import Row, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.ground_truth import GroundTruth
-from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.motion.resampling import ground_truth_of
-from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import has_bf16
-from dejavu_torch.training.task import PlaceRecognitionTask
 from dejavu_torch.types import InputError, Traverse
 
 ROUTE = ("sim:aerial?frames=1000", "sim:aerial?frames=1000&traverse=1")
@@ -35,7 +30,7 @@ STEPS = 600
 SEEDS = (0, 1, 2)
 BUDGETS = (2.4, 1.0, 0.4)  # route bytes per place of the maps that are made of a descriptor
 TOLERANCE = 5
-STRENGTHS = {"shift": (0.02, 0.08), "occlusion": 0.5}  # of configs/train_road.yaml
+STRENGTHS: dict[str, Any] = {"shift": (0.02, 0.08), "occlusion": 0.5}  # of configs/train_road.yaml
 WEIGHT_DECAY = 0.5
 LEARNING_RATE = 6e-3  # of configs/train_road.yaml
 RATE = 0.3  # of a bit per place, there
@@ -59,43 +54,22 @@ def network() -> SmallCNN:
 
 def ladder() -> list[Rung]:
     """Each rung changes one thing of the one before; 16 bits only where the processor has them."""
+    from dejavu_torch.training.export import has_bf16
 
-    def fused() -> Augmentation:
-        return Augmentation(**STRENGTHS)  # type: ignore[arg-type]
-
-    rungs = [
-        Rung("fused augmentation", network, fused),
-        Rung("twice the learning rate", network, fused, lr=LEARNING_RATE),
-    ]
+    rungs = [Rung("fused augmentation", network, lambda: Augmentation(**STRENGTHS))]
+    rungs.append(rungs[-1]._replace(name="twice the learning rate", lr=LEARNING_RATE))
     if has_bf16():
         rungs.append(rungs[-1]._replace(name="16 bits", precision="bf16-mixed"))
     return [*rungs, rungs[-1]._replace(name="a rate in the loss", rate=RATE)]
 
 
-class Clock(pl.Callback):
-    """Seconds of the steps of a training."""
-
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self.began = time.perf_counter()
-
-    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self.seconds = time.perf_counter() - self.began
-
-
 def bench_train(
-    reference: Traverse,
-    query: Traverse,
-    steps: int = STEPS,
-    seeds: Sequence[int] = SEEDS,
-    rungs: Sequence[Rung] | None = None,
-    progress: bool = False,
+    reference: Traverse, query: Traverse, steps: int, seeds: Sequence[int], rungs: Sequence[Rung]
 ) -> list[Row]:
     """Train a descriptor of the reference in several ways, on the CPU, and find the query on maps of it.
 
     Args:
-        reference, query: traverses of one route.
-        steps: of each training. seeds: a training each. rungs: `ladder` if None.
-        progress: show a progress bar on a terminal.
+        reference, query: traverses of one route. steps: of each training. seeds: a training each.
 
     Returns:
         seconds: of the steps alone. auc, recall_at_1: by route bytes per place of the map, where they suffice
@@ -104,7 +78,7 @@ def bench_train(
     Raises:
         InputError: no steps or seeds, or nothing that tells the right places.
     """
-    if steps < 1 or not seeds or not all(0 <= seed < 2**32 for seed in seeds):
+    if steps < 1 or not all(0 <= seed < 2**32 for seed in seeds):
         seen = f"bench train got {steps} steps and seeds {list(seeds)}"
         raise InputError(f"{seen}; expected at least one each, and seeds from 0 to 2^32 - 1")
     truth = ground_truth_of(None, reference, query, aligned=True)
@@ -114,37 +88,40 @@ def bench_train(
             f"{reference.length}; expected as many"
         )
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-    works = [(rung, seed) for rung in (ladder() if rungs is None else rungs) for seed in seeds]
-    shown = tqdm(works, desc="train", disable=None if progress else True, leave=False)
-    return [_trained(rung, seed, reference, query, truth, steps) for rung, seed in shown]
+    works = tqdm([(rung, seed) for rung in rungs for seed in seeds], "train", disable=None, leave=False)
+    return [trained(rung, seed, reference, query, truth, steps) for rung, seed in works]
 
 
-def _trained(
+def trained(
     rung: Rung, seed: int, reference: Traverse, query: Traverse, truth: GroundTruth, steps: int
 ) -> Row:
+    import pytorch_lightning as pl
+    from pytorch_lightning.callbacks import Timer
+
+    from dejavu_torch.training.datamodule import RouteData
+    from dejavu_torch.training.task import PlaceRecognitionTask
+
     pl.seed_everything(seed, verbose=False)
     task = PlaceRecognitionTask(
         rung.backbone(), SpectralMapper(BUDGETS[0]), rate=rung.rate, lr=rung.lr, weight_decay=WEIGHT_DECAY
     )
     data = RouteData(reference, tolerance=TOLERANCE, augmentation=rung.augmentation(), held_out=0.0)
-    clock = Clock()
-    with tempfile.TemporaryDirectory() as folder:
-        trainer = pl.Trainer(
+    timer = Timer()
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*isinstance.treespec")  # Lightning's own
+        pl.Trainer(
             accelerator="cpu",
             max_steps=steps,
             precision=rung.precision,  # type: ignore[arg-type]
             gradient_clip_val=5.0,
-            callbacks=[clock],
+            callbacks=[timer],
             logger=False,
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
             limit_val_batches=0,
             default_root_dir=folder,
-        )
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*isinstance.treespec")  # Lightning's own
-            trainer.fit(task, datamodule=data)
+        ).fit(task, datamodule=data)
     model = task.deployed()
     places, queries = model.extract_all(reference), model.extract_all(query)
     auc, recall = {}, {}
@@ -161,7 +138,7 @@ def _trained(
         "contender": rung.name,
         "seed": seed,
         "steps": steps,
-        "seconds": clock.seconds,
+        "seconds": timer.time_elapsed("train"),
         "auc": auc,
         "recall_at_1": recall,
         "threads": torch.get_num_threads(),
@@ -169,44 +146,46 @@ def _trained(
 
 
 def run_train(
-    out: Path, sources: Sequence[str] = (), steps: int | None = None, seeds: Sequence[int] = ()
-) -> list[Row]:
-    """Run the bench, and write bench.json and bench.png into the folder `out`.
+    sources: Sequence[str] = (), *, out: Path, steps: int | None = None, seeds: Sequence[int] = ()
+) -> list[str]:
+    """Seconds of a training, and the accuracy of its descriptor.
 
     Args:
-        sources: REFERENCE QUERY; 1000 simulated places if empty. steps, seeds: see `bench_train`.
+        sources: REFERENCE QUERY; the built-in road if not given
+        out: folder for bench.json and bench.png
+        steps: those of each training; 600 if not given
+        seeds: a training each; 0, 1 and 2 if not given
 
     Raises:
-        InputError: as `bench_train`, other than two sources, or a folder that cannot be made or written in.
+        InputError: as `bench_train`, or other than two sources.
     """
+    from dejavu_torch.training.export import has_bf16
+
     if len(sources) not in (0, 2):
         raise InputError(f"bench train got {len(sources)} sources; expected REFERENCE QUERY, or none")
     reference, query = (open_source(source) for source in sources or ROUTE)
-    check_output_folder(out)
-    rows = bench_train(
-        reference, query, STEPS if steps is None else steps, tuple(seeds) or SEEDS, progress=True
-    )
-    title, axis = f"{rows[0]['steps']} steps", "seconds of a training, mean of the seeds"
-    write_bench(out, rows, plot_ratios({title: _means(rows)}, axis), bf16=has_bf16())
-    return rows
+    rows = bench_train(reference, query, STEPS if steps is None else steps, seeds or SEEDS, ladder())
+    means = {name: sum(row["seconds"] for row in own) / len(own) for name, own in by_rung(rows).items()}
+    picture = plot_ratios({f"{rows[0]['steps']} steps": means}, "seconds of a training, mean of the seeds")
+    write_bench(out, rows, picture, bf16=has_bf16())
+    seeded = ", ".join(dict.fromkeys(str(row["seed"]) for row in rows))
+    seen = f"{rows[0]['case']}, seeds {seeded}, threads: {rows[0]['threads']}"
+    return [train_table(rows, means), f"{seen}; each row changes one thing of the row above"]
 
 
-def _means(rows: Sequence[Row]) -> dict[str, float]:
-    seconds: dict[str, list[float]] = {}
-    for row in rows:
-        seconds.setdefault(row["contender"], []).append(row["seconds"])
-    return {name: sum(some) / len(some) for name, some in seconds.items()}
+def by_rung(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    names = dict.fromkeys(row["contender"] for row in rows)
+    return {name: [row for row in rows if row["contender"] == name] for name in names}
 
 
-def train_table(rows: Sequence[Row]) -> list[list[str]]:
-    """The figures as rows of text, the header first: means of the seeds, and their lowest and highest."""
+def train_table(rows: Sequence[Row], means: dict[str, float]) -> str:
+    """The figures as aligned text: means of the seeds, and their lowest and highest."""
     table = [["", "seconds", *(f"AUC at {budget:g} B" for budget in BUDGETS)]]
-    for name in dict.fromkeys(row["contender"] for row in rows):
-        own = [row for row in rows if row["contender"] == name]
-        line = [name, f"{_means(own)[name]:.1f}"]
+    for name, own in by_rung(rows).items():
+        line = [name, f"{means[name]:.1f}"]
         for budget in BUDGETS:
             found = [row["auc"][f"{budget:g}"] for row in own if f"{budget:g}" in row["auc"]]
             told = f"{sum(found) / len(found):.3f} ({min(found):.3f}-{max(found):.3f})" if found else "-"
             line.append(told)
         table.append(line)
-    return table
+    return text_table(table)

@@ -1,8 +1,9 @@
-"""`python -m benchmarks`: the contenders, what is compared, and what is written."""
+"""`python -m benchmarks matcher`, and what all benchmarks share: contenders, what is compared and written."""
 
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import time
@@ -10,26 +11,30 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import refused
-from matplotlib.figure import Figure
+from command_line import benchmark as command
+from drawn import render, texts
+from matplotlib.colors import to_rgb
+from torch import Tensor
 
-from benchmarks import matcher as bench
-from benchmarks.matcher import COLUMNS, bench_matcher, run_matcher
+from benchmarks import matcher
+from benchmarks.matcher import COLUMNS, bench_matcher
 from benchmarks.measure import Contender, Row, Run, benchmark, new_row, table, write_bench
-from benchmarks.plots import plot_ratios
+from benchmarks.plots import plot_growth, plot_ratios
+from benchmarks.scale_contenders import CONTENDERS
+from benchmarks.template_search import OURS, SCAN, bench_templates, random_map
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.plots import GREY
+
+L1, HOG, SEQUENCE, FILTER = "l1 9 x 40 x 410", "hog 24 x 16", "sequence 9 x 5 x 5000", "filter 40 x 3000"
+EXPORT = "single frames 3 x 24 x 16 on 200"
 
 
-def small(**options: object) -> list[Row]:
-    sizes = {
-        "frames": 70,
-        "repeats": 1,
-        "images": [(24, 16)],
-        "distances": [(9, 40, 410)],
-        "sequences": [(9, 5, 5000)],
-        "filters": [(40, 3000)],
-        "exports": [(3, 24, 16, 200)],
-    }
-    return bench_matcher(**{"torch_compile": False, **sizes, **options})  # type: ignore[arg-type]
+def small(*only: str) -> list[Row]:
+    """The rows of small cases, of these kinds alone if any are named."""
+    sizes = {"images": [(24, 16)], "distances": [(9, 40, 410)], "sequences": [(9, 5, 5000)]}
+    sizes |= {"filters": [(40, 3000)], "exports": [(3, 24, 16, 200)]}
+    sizes = {name: size if not only or name in only else [] for name, size in sizes.items()}
+    return list(bench_matcher(frames=70, repeats=1, torch_compile=False, **sizes))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -37,14 +42,7 @@ def rows() -> dict[tuple[str, str], Row]:
     return {(row["case"], row["contender"]): row for row in small()}
 
 
-L1 = "l1 9 x 40 x 410"
-HOG = "hog 24 x 16"
-SEQUENCE = "sequence 9 x 5 x 5000"
-FILTER = "filter 40 x 3000"
-EXPORT = "single frames 3 x 24 x 16 on 200"
-
-
-def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
+def test_all_contenders_of_all_cases_give_what_we_give(rows: dict[tuple[str, str], Row]) -> None:
     assert list(rows) == [
         (HOG, "dejavu"),
         (HOG, "scikit-image"),
@@ -61,96 +59,63 @@ def test_all_contenders_of_all_cases(rows: dict[tuple[str, str], Row]) -> None:
         (EXPORT, "dejavu"),
         (EXPORT, "onnxruntime"),
     ]
-
-
-def test_an_exported_map_has_the_size_of_its_file(rows: dict[tuple[str, str], Row]) -> None:
-    pytest.importorskip("onnxruntime")
-    assert rows[EXPORT, "dejavu"]["file_bytes"] is None
-    assert (rows[EXPORT, "onnxruntime"]["file_bytes"] or 0) > 200 * bench.NUMBERS * 4
-
-
-def test_without_onnxruntime_the_row_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    ours, theirs = small(images=[], distances=[], sequences=[], filters=[])
-    assert ours["seconds"] is not None
-    assert theirs["skipped"] is not None
-    assert "onnxruntime" in theirs["skipped"]
-    assert theirs["file_bytes"] is None
-
-
-def test_contenders_give_what_we_give(rows: dict[tuple[str, str], Row]) -> None:
     ran = {key: row for key, row in rows.items() if row["skipped"] is None}
     assert {(HOG, "scikit-image"), (L1, "scipy cdist"), (L1, "torch.cdist")} <= ran.keys()  # the test extra
     for (case, _), row in ran.items():
-        assert row["difference"] is not None
         assert row["difference"] < {HOG: 1e-6, FILTER: 0.05}.get(case, 1e-4)
-
-
-def test_a_size_is_that_of_the_result(rows: dict[tuple[str, str], Row]) -> None:
+        names = [name for of, name in ran if of == case and name.startswith("dejavu")]
+        assert row["ratio_to_ours"] == row["seconds"] / min(rows[case, name]["seconds"] for name in names)
     assert rows[HOG, "dejavu"]["bytes"] == rows[HOG, "scikit-image"]["bytes"] == 70 * (2 * 1 * 4 * 9) * 4
-    assert rows[L1, "dejavu"]["bytes"] == 9 * 410 * 4
-    assert rows[L1, "scipy cdist"]["bytes"] == 9 * 410 * 8
-
-
-def test_threads_are_reported(rows: dict[tuple[str, str], Row]) -> None:
-    assert rows[L1, "dejavu"]["threads"] == torch.get_num_threads()
+    assert (rows[L1, "dejavu"]["bytes"], rows[L1, "scipy cdist"]["bytes"]) == (9 * 410 * 4, 9 * 410 * 8)
     assert rows[L1, "scipy cdist"]["threads"] == rows[HOG, "scikit-image"]["threads"] == 1
+    assert rows[L1, "torch.compile"]["skipped"] == "RuntimeError: not asked for"
+    assert rows[EXPORT, "dejavu"]["file_bytes"] is None
+    assert rows[EXPORT, "onnxruntime"]["file_bytes"] > 200 * matcher.NUMBERS * 4
 
 
-def test_the_ratio_is_to_our_fastest(rows: dict[tuple[str, str], Row]) -> None:
-    for case in (HOG, L1, SEQUENCE, FILTER, EXPORT):
-        seconds = {name: row["seconds"] for (of, name), row in rows.items() if of == case and row["seconds"]}
-        ours = min(taken for name, taken in seconds.items() if name.startswith("dejavu"))
-        for name, taken in seconds.items():
-            assert rows[case, name]["ratio_to_ours"] == taken / ours
-
-
-def test_a_program_that_is_not_installed_is_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "faiss", None)
-    found = {row["contender"]: row for row in small(images=[], sequences=[], filters=[], exports=[])}
-    assert found["faiss"]["skipped"] is not None
-    assert "faiss" in found["faiss"]["skipped"]
-    assert found["faiss"] | {"skipped": None} == new_row(L1, "faiss")
-    assert found["torch.compile"]["skipped"] == "RuntimeError: not asked for"
-    assert found["torch.cdist"]["skipped"] is None
+@pytest.mark.parametrize(
+    ("module", "part", "contender"),
+    [("faiss", "distances", "faiss"), ("onnxruntime", "exports", "onnxruntime")],
+)
+def test_a_program_that_is_not_installed_is_a_row_that_says_so(
+    module: str, part: str, contender: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    found = {row["contender"]: row for row in small(part)}
+    assert module in found[contender]["skipped"]
+    assert found[contender] | {"skipped": None} == new_row(found["dejavu"]["case"], contender)
+    assert found["dejavu"]["seconds"] is not None
 
 
 def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "AT_MOST", 0)
-    ours, theirs = small(distances=[], sequences=[], filters=[], exports=[])
+    monkeypatch.setattr(matcher, "AT_MOST", 0)
+    ours, theirs = small("images")
     assert (ours["measured_rows"], theirs["measured_rows"]) == (None, 1)
     assert theirs["bytes"] == ours["bytes"]
-    assert theirs["difference"] is not None
     assert theirs["difference"] < 1e-6
-    assert theirs["seconds"] is not None
-    assert theirs["seconds_first"] is not None
 
 
-class Counted:
+def counted(name: str, value: Tensor, log: list[str], threads: int = 1, pause: float = 0.0) -> Contender:
     """Gives `value`, and remembers who ran in which order."""
 
-    def __init__(self, name: str, value: torch.Tensor, log: list[str], pause: float = 0.0) -> None:
-        self.name, self.value, self.log, self.pause = name, value, log, pause
+    def run() -> Tensor:
+        log.append(name)
+        return value
 
-    def ready(self) -> Run:
-        self.log.append(f"{self.name} ready")
-        time.sleep(self.pause)
-        return self.run
+    def ready() -> Run:
+        log.append(f"{name} ready")
+        time.sleep(pause)
+        return run
 
-    def run(self) -> torch.Tensor:
-        self.log.append(self.name)
-        return self.value
+    return Contender(name, ready, threads)
 
 
 def test_contenders_take_turns_after_the_warm_up() -> None:
     log: list[str] = []
-    a = Counted("a", torch.zeros(4), log, pause=0.2)
-    b = Counted("b", torch.tensor([0.0, 0.5]), log)
-    first, second = benchmark("case", [Contender("dejavu", a.ready, 1), Contender("other", b.ready, 2)], 3)
-    watched = 0 if first["peak_bytes"] is None else 1
-    assert log == ["a ready", *["a"] * (1 + watched), "b ready", *["b"] * (1 + watched), *["a", "b"] * 3]
-    assert first["seconds"] is not None
-    assert first["seconds_first"] is not None
+    ours = counted("dejavu", torch.zeros(4), log, pause=0.2)
+    first, second = benchmark("case", [ours, counted("b", torch.tensor([0.0, 0.5]), log, 2)], 3)
+    runs = 1 if first["peak_bytes"] is None else 2
+    assert log == ["dejavu ready", *["dejavu"] * runs, "b ready", *["b"] * runs, *["dejavu", "b"] * 3]
     assert first["seconds"] < 0.2 <= first["seconds_first"]  # getting ready counts in the first run only
     assert (first["difference"], second["difference"]) == (0.0, 0.5)
     assert (second["measured_rows"], second["bytes"], second["threads"]) == (2, 16, 2)
@@ -160,11 +125,11 @@ def test_an_error_of_ours_is_raised_and_one_of_theirs_is_a_row() -> None:
     def broken() -> Run:
         raise ZeroDivisionError("of\nno use")
 
-    fine = Counted("a", torch.zeros(2), [])
-    rows = benchmark("case", [Contender("dejavu", fine.ready, 1), Contender("other", broken, 1)], 1)
+    fine = counted("dejavu", torch.zeros(2), [])
+    rows = benchmark("case", [fine, Contender("other", broken)], 1)
     assert rows[1] == new_row("case", "other", skipped="ZeroDivisionError: of no use")
     with pytest.raises(ZeroDivisionError):
-        benchmark("case", [Contender("dejavu", broken, 1), Contender("other", fine.ready, 1)], 1)
+        benchmark("case", [Contender("dejavu", broken), fine], 1)
 
 
 def test_peak_memory_sees_what_is_freed_again() -> None:
@@ -184,23 +149,24 @@ def test_peak_memory_sees_what_is_freed_again() -> None:
     assert 60 * 2**20 < int(done.stdout) < 200 * 2**20
 
 
-def test_what_is_written(tmp_path: Path, rows: dict[tuple[str, str], Row]) -> None:
-    write_bench(tmp_path, list(rows.values()), plot_ratios({"one": {"dejavu": 1.0}}))
-    written = json.loads((tmp_path / "bench.json").read_text())
+def test_what_is_written_and_printed(
+    tmp_path: Path,
+    rows: dict[tuple[str, str], Row],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(matcher, "bench_matcher", rows.values)
+    command("matcher", "--out", tmp_path / "new")
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["bench.json", "bench.png"]
+    written = json.loads((tmp_path / "new" / "bench.json").read_text())
     assert written["rows"] == list(rows.values())
     assert written["threads"] == torch.get_num_threads()
     assert written["l1_backend"] in ("numba", "torch")
     assert written["versions"]["torch"].startswith(torch.__version__.split("+")[0])
-    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.json", "bench.png"]
-
-
-def test_a_bar_for_each_contender() -> None:
-    figure, axes = plot_ratios({"one": {"dejavu": 1.0, "other": 2.5}, "two": {"dejavu": 1.0}})
-    assert isinstance(figure, Figure)
-    assert [axis.get_title("left") for axis in axes] == ["one", "two"]
-    assert [[bar.get_width() for bar in axis.patches] for axis in axes] == [[1.0, 2.5], [1.0]]
-    assert [text.get_text() for text in axes[0].texts] == ["dejavu", "other", "1.0", "2.5"]
+    assert (tmp_path / "new" / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert f"next: open {tmp_path / 'new' / 'bench.png'}" in capsys.readouterr().out
+    write_bench(tmp_path, [], key="value")
+    assert json.loads((tmp_path / "bench.json").read_text())["key"] == "value"
 
 
 def test_the_table() -> None:
@@ -210,26 +176,48 @@ def test_the_table() -> None:
         new_row("l1", "slow", **done, measured_rows=7, file_bytes=4_000_000),
         new_row("l1", "absent", skipped="ImportError: no module"),
     ]
-    assert table(rows, COLUMNS)[1:] == [
-        ["l1: dejavu", "0.500", "1.0", "1.25", "2", "2.0", "1.0", "", "0.0e+00", ""],
-        ["l1: slow", "0.500", "1.0", "1.25", "2", "", "", "4.0", "0.0e+00", "7 measured"],
-        ["l1: absent", "", "", "", "", "", "", "", "", "skipped: ImportError: no module"],
+    shown = [" ".join(line.split()) for line in table(rows, COLUMNS).splitlines()]
+    assert shown[-3:] == [
+        "l1: dejavu 0.500 1.0 1.25 2 2.0 1.0 0.0e+00",
+        "l1: slow 0.500 1.0 1.25 2 4.0 0.0e+00 7 measured",
+        "l1: absent skipped: ImportError: no module",
     ]
 
 
-def test_a_run_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [new_row("l1", "dejavu", seconds=1.0, ratio_to_ours=1.0)]
-    monkeypatch.setattr(bench, "bench_matcher", lambda: rows)
-    assert run_matcher(tmp_path / "new") == rows
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["bench.json", "bench.png"]
-    (tmp_path / "file").touch()
-    with refused("file"):
-        run_matcher(tmp_path / "file")
+def test_a_bar_for_each_contender_in_its_colour() -> None:
+    figure, axes = plot_ratios({"one": {"dejavu (numba)": 1.0, "other": 2.5}, "two": {"uncompressed": 1.0}})
+    render(figure)
+    assert [axis.get_title("left") for axis in axes] == ["one", "two"]
+    assert [[bar.get_width() for bar in axis.patches] for axis in axes] == [[1.0, 2.5], [1.0]]
+    assert [text.get_text() for text in axes[0].texts] == ["dejavu (numba)", "other", "1.0", "2.5"]
+    colours = [bar.get_facecolor()[:3] for axis in axes for bar in axis.patches]
+    expected = [COLOURS["map"], GREY, COLOURS["uncompressed"]]
+    assert colours == [pytest.approx(to_rgb(colour)) for colour in expected]
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"frames": 0}, {"repeats": 0}, {"images": [(24, 0)]}, {"distances": [(1, 0, 1)]}]
-)
-def test_nothing_to_measure_is_refused(wrong: dict[str, object]) -> None:
-    with refused("at least 1"):
-        small(**wrong)
+def test_every_contender_that_grows_has_a_style_of_its_own() -> None:
+    shares = {name: [(1e4, 1.0), (1e5, 0.0)] for name in CONTENDERS}
+    figure, axes = plot_growth({"recall@1": shares, "ms": {"dejavu 1 B": [(1e4, 1.0)]}}, ["recall@1"])
+    render(figure)
+    styles = {(line.get_color(), line.get_marker(), line.get_linestyle()) for line in axes[0].lines}
+    assert len(styles) == len(CONTENDERS)
+    assert set(CONTENDERS) <= set(texts(figure))
+    assert [axis.get_yscale() for axis in axes] == ["linear", "log"]
+
+
+def test_template_search_times_both_ways_to_the_same_places() -> None:
+    rows = list(bench_templates((5000, 40_000), queries=2, repeats=1))
+    assert [(row["case"], row["contender"]) for row in rows] == [
+        (f"templates={places}", name) for places in (5000, 40_000) for name in (OURS, SCAN)
+    ]
+    for row, phases in zip(rows, (143, 143, 401, 401), strict=True):  # of 71 + 72 and 200 + 201
+        assert (row["difference"], row["skipped"], row["threads"]) == (0, None, 1)
+        assert 0 < row["seconds"] < 1
+        assert 0 <= row["file_bytes"] - 4 * 64 * phases < 1000  # float32, and a few bytes of the layers
+
+
+@pytest.mark.parametrize("places", [4, 6, 1000, 10**7])
+def test_the_periods_are_the_least_that_tell_the_places_apart(places: int) -> None:
+    short, long = (layer.period.numerator for layer in random_map(places, torch.Generator()).plan)
+    assert (math.gcd(short, long), long) == (1, short + 1)
+    assert short * long >= places > (short - 1) * short

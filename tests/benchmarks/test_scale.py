@@ -13,24 +13,16 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from command_line import benchmark, benchmark_fails
-from helpers import all_of, refused
+from command_line import benchmark
+from helpers import all_of
+from safetensors.torch import save_file
 from torch import Tensor
 
 from benchmarks import scale, scale_contenders
 from benchmarks.made import BLOCK, Likeness, MadeRoute, likeness
 from benchmarks.repeating import TiledRoute, step_that_holds, tiles_of
 from benchmarks.scale import Task, spread
-from benchmarks.scale_contenders import (
-    CONTENDERS,
-    FLOWN,
-    ONE_CHUNK,
-    PLACED,
-    REPEATED,
-    Faiss,
-    Interpolated,
-    Mapped,
-)
+from benchmarks.scale_contenders import FLOWN, ONE_CHUNK, PLACED, REPEATED, Faiss, Interpolated, Mapped
 from benchmarks.scale_report import exponents, scale_row, scale_tables
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
@@ -71,60 +63,44 @@ def test_any_part_of_a_made_route_is_made_by_itself(like: Likeness) -> None:
     assert not torch.allclose(all_of(MadeRoute(like, 64, seed=1)), whole[:64])
 
 
-def test_a_made_route_is_like_the_one_that_was_measured(like: Likeness) -> None:
+def test_a_made_route_and_its_queries_are_like_those_that_were_measured(like: Likeness) -> None:
     route, made = smooth(6000, 8), all_of(MadeRoute(like, 6000), 1000)
     assert torch.linalg.vector_norm(made, dim=1).allclose(torch.ones(6000))
     for apart in (1, 4, 8, 40):  # the triangle of a moving mean, and nothing beyond it
         own, theirs = (float((x[apart:] * x[:-apart]).sum(1).mean()) for x in (made, route))
         assert own == pytest.approx(theirs, abs=0.06)
     assert torch.allclose(made.T @ made / 6000, route.T @ route / 6000, atol=0.04)
-
-
-def test_made_queries_are_like_those_that_were_measured(like: Likeness) -> None:
-    route, shown = MadeRoute(like, 6000), torch.arange(0, 6000, 2)
-    again, own = route.seen_again(shown), all_of(route)[shown]
+    shown = torch.arange(0, 6000, 2)
+    again, seen = MadeRoute(like, 6000).seen_again(shown), made[shown]
     # scaled to length 1: what is left is told by the ratio of the two halves
-    rho = ((again - again.mean(0)) * (own - own.mean(0))).mean(0) / own.var(0)
+    rho = ((again - again.mean(0)) * (seen - seen.mean(0))).mean(0) / seen.var(0)
     assert float(rho[:4].mean() / rho[4:].mean()) == pytest.approx(2, abs=0.3)
     assert torch.equal(again, MadeRoute(like, 6000).seen_again(shown))
 
 
-def test_too_little_to_measure_is_refused() -> None:
-    with refused("4 places", "16"):
-        likeness(smooth(4, 3), smooth(4, 3), torch.arange(4))
-
-
-@pytest.fixture(scope="module")
-def tiled() -> tuple[DejaVu, dict[str, Tensor]]:
-    """A descriptor of ground that repeats, and its tiles."""
+def test_descriptors_of_tiles_are_those_of_the_frames() -> None:
     model = DejaVu(whitening=Whitening(numbers=16))
     assert model.whitening is not None
-    road = AerialRoad(frames=200, ground="repeat", noise=0, drift=0, yaw=0)
-    features = torch.cat([model.describe(part) for part in road.batches(64)])
+    still = {"ground": "repeat", "noise": 0, "drift": 0, "yaw": 0}
+    features = torch.cat([model.describe(part) for part in AerialRoad(frames=200, **still).batches(64)])  # type: ignore[arg-type]
     noise = torch.randn(features.shape, generator=torch.Generator().manual_seed(0))
     model.whitening.learn(features, [(features + 0.02 * noise, torch.arange(200))])
-    return model, tiles_of(model)
-
-
-def test_descriptors_of_tiles_are_those_of_the_frames(tiled: tuple[DejaVu, dict[str, Tensor]]) -> None:
-    model, tiles = tiled
-    road = AerialRoad(frames=math.lcm(*TILES), ground="repeat", noise=0, drift=0, yaw=0)
+    road = AerialRoad(frames=math.lcm(*TILES), **still)  # type: ignore[arg-type]
     at = range(100, 10**6, 99_991)
-    own = TiledRoute(**tiles, length=road.length).read(at)
+    own = TiledRoute(**tiles_of(model), length=road.length).read(at)
     drawn = model.whitened(model.describe(road.read(at)))
     assert (own * drawn).sum(1).min() > 0.97  # the light moves a few gradients to another bin
-    elsewhere = (own @ drawn.T).fill_diagonal_(0)
-    assert elsewhere.max() < (own * drawn).sum(1).min()
+    assert (own @ drawn.T).fill_diagonal_(0).max() < (own * drawn).sum(1).min()
 
 
-def test_a_step_holds_the_share_that_is_asked_for() -> None:
+@pytest.mark.parametrize("chunk", [10_000, 500])
+def test_a_step_holds_the_share_that_is_asked_for(chunk: int) -> None:
     route = smooth(2000, 32)
-    for chunk in (10_000, 500):
-        step = step_that_holds(0.8, ArrayTraverse(route), chunk)  # type: ignore[arg-type]
-        kept = SpectralMapper(None, step=step, chunk=chunk)(route)  # type: ignore[arg-type]
-        back = torch.cat([kept.decode(g) for g in range(len(kept.chunks))])
-        lost = (back - route).square().sum() / (route - route.mean(0)).square().sum()
-        assert float(lost) == pytest.approx(0.2, abs=0.02)
+    step = step_that_holds(0.8, ArrayTraverse(route), chunk)  # type: ignore[arg-type]
+    kept = SpectralMapper(None, step=step, chunk=chunk)(route)
+    back = torch.cat([kept.decode(g) for g in range(len(kept.chunks))])
+    lost = (back - route).square().sum() / (route - route.mean(0)).square().sum()
+    assert float(lost) == pytest.approx(0.2, abs=0.02)
 
 
 def test_interpolated_frames_are_those_of_the_baseline(
@@ -132,35 +108,33 @@ def test_interpolated_frames_are_those_of_the_baseline(
 ) -> None:
     monkeypatch.setattr(scale_contenders, "ROWS", 64)  # several pieces
     route, queries = smooth(501, 12), smooth(501, 12, seed=1)[:50]
-    size = Interpolated(12 * 30 / 501).learn(ArrayTraverse(route), tmp_path / "kept")
+    size = Interpolated(12 * 30 / 501).learn(ArrayTraverse(route), tmp_path / "kept")  # type: ignore[arg-type]
     back, k, keys = interpolated(as_int8(route), 12 * 30)
     assert size == 12 * keys <= 12 * 30
     expected = (queries @ F.normalize(back, dim=1).T).max(1)
-    found = Interpolated(0).load(tmp_path / "kept", "cpu").find(queries)
+    score, place = Interpolated(0).load(tmp_path / "kept")(queries)
     assert k > 1
-    assert torch.allclose(-found.score, expected.values, atol=1e-2)
-    assert ((found.place - expected.indices).abs() <= 1).double().mean() > 0.9
+    assert torch.allclose(-score, expected.values, atol=1e-2)
+    assert ((place - expected.indices).abs() <= 1).double().mean() > 0.9
 
 
 @pytest.mark.parametrize("factory", ["Flat", "IVF{cells},PQ4np", "HNSW16,Flat"])
 def test_an_index_finds_the_nearest_and_tells_its_bytes(factory: str, tmp_path: Path) -> None:
     pytest.importorskip("faiss")
     route = smooth(1200, 16)
-    size = Faiss(factory).learn(ArrayTraverse(route), tmp_path / "kept")
-    found = Faiss(factory).load(tmp_path / "kept", "cpu").find(route[::50])
-    assert ((found.place - torch.arange(0, 1200, 50)).abs() <= 5).double().mean() > 0.9
+    size = Faiss(factory).learn(ArrayTraverse(route), tmp_path / "kept")  # type: ignore[arg-type]
+    _, place = Faiss(factory).load(tmp_path / "kept")(route[::50])
+    assert ((place - torch.arange(0, 1200, 50)).abs() <= 5).double().mean() > 0.9
     code = 4 if "PQ" in factory else 64
-    assert code * 1200 <= size <= (code + 200) * 1200
-    if factory != "HNSW16,Flat":
-        assert size <= code * 1200 + 1000
+    assert code * 1200 <= size <= code * 1200 + (1200 * 200 if "HNSW" in factory else 1000)
 
 
 def test_a_null_tells_the_frames_that_it_shuffled(tmp_path: Path) -> None:
     route = smooth(600, 16)
-    null = Mapped(8.0, 10_000, shuffled=True)
-    null.learn(ArrayTraverse(route), tmp_path / "kept")
-    found = null.load(tmp_path / "kept", "cpu").find(route[::20])
-    assert ((found.place - torch.arange(0, 600, 20)).abs() <= 5).double().mean() > 0.9
+    null = Mapped(SpectralMapper(8.0, chunk=10_000), shuffled=True)
+    null.learn(ArrayTraverse(route), tmp_path / "kept")  # type: ignore[arg-type]
+    _, place = null.load(tmp_path / "kept")(route[::20])
+    assert ((place - torch.arange(0, 600, 20)).abs() <= 5).double().mean() > 0.9
 
 
 def in_this_process(module: str, arguments: Any) -> dict[str, Any]:
@@ -177,66 +151,45 @@ def in_this_process(module: str, arguments: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scale, "in_process", in_this_process)
     monkeypatch.setattr(scale, "give_back", lambda: None)  # of a process of its own
-    for name, value in {
-        "RENDERED": 600,
-        "SHUFFLED": 600,
-        "CHECKED": 520,
-        "QUERIES": 40,
-        "BATCH": 20,
-        "COPIED": 2**20,
-    }.items():
+    sizes = {"RENDERED": 600, "SHUFFLED": 600, "CHECKED": 520, "QUERIES": 40, "BATCH": 20, "COPIED": 2**20}
+    for name, value in sizes.items():
         monkeypatch.setattr(scale, name, value)
     monkeypatch.setattr(scale_contenders, "CHUNK", 128)
-    kept = ("dejavu 4 B", "dejavu 4 B, one chunk", "null 4 B", "faiss flat")
-    for name in list(PLACED):
-        if name not in kept:
-            monkeypatch.delitem(PLACED, name)
+    for name in PLACED.keys() - {"dejavu 4 B", "dejavu 4 B, one chunk", "null 4 B", "faiss flat"}:
+        monkeypatch.delitem(PLACED, name)
 
 
-def test_rows_of_all_cases_are_written(
-    small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("_small")
+def test_rows_of_all_cases_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     benchmark("scale", "--places", "600", "900", "--out", tmp_path)
     written = json.loads((tmp_path / "bench.json").read_text())
     rows = {(row["case"], row["contender"]): row for row in written["rows"]}
-    cases = [
-        "places=600",
-        "repeat=600",
-        "made=520",
-        "places=900",
-        "repeat=900",
-        "templates=600",
-        "templates=900",
-    ]
-    assert list(dict.fromkeys(case for case, _ in rows)) == cases
-    for case in ("places=600", "made=520", "places=900"):
+    placed = ("places=600", "made=520", "places=900")
+    repeated = ("repeat=600", "repeat=900", "templates=600", "templates=900")
+    assert {case for case, _ in rows} == {*placed, *repeated}
+    for case in placed:
         ours = rows[case, "dejavu 4 B"]
         assert 3.8 < ours["bytes_per_place"] <= 4.0
-        assert ours["recall_at_1"] > 0.8
-        assert ours["queries"] == 40
+        assert min(ours["recall_at_1"], rows[case, "dejavu 4 B, one chunk"]["recall_at_1"]) > 0.8
+        assert (ours["queries"], ours["device"]) == (40, "cpu")
         assert ours["ratio_to_ours"] >= 1
         shares = ("bandwidth_share", "learn_rate", "bytes")
         assert min(ours[key] for key in ("seconds", "seconds_one", "seconds_load", *shares)) > 0
-        assert ours["device"] == "cpu"
-        assert rows[case, "dejavu 4 B, one chunk"]["recall_at_1"] > 0.8
-    assert "600" in rows["places=900", "null 4 B"]["skipped"]
-    assert rows["repeat=600", "null"]["bytes_per_place"] == pytest.approx(
-        rows["repeat=600", ONE_CHUNK]["bytes_per_place"], rel=0.02
-    )
-    assert rows["repeat=600", FLOWN]["step"] == rows["repeat=600", ONE_CHUNK]["step"] > 0
-    assert rows["repeat=600", FLOWN]["bytes_per_place"] != rows["repeat=600", ONE_CHUNK]["bytes_per_place"]
+    whole, flown = rows["repeat=600", ONE_CHUNK], rows["repeat=600", FLOWN]
+    assert rows["repeat=600", "null"]["bytes_per_place"] == pytest.approx(whole["bytes_per_place"], rel=0.02)
+    assert flown["step"] == whole["step"] > 0
+    assert flown["bytes_per_place"] != whole["bytes_per_place"]
     assert "600" in rows["repeat=900", FLOWN]["skipped"]
+    assert "600" in rows["places=900", "null 4 B"]["skipped"]
     assert set(REPEATED) <= {name for _, name in rows}
     assert rows["templates=900", "dejavu two layers"]["seconds"] > 0
-    assert rows["templates=900", "dejavu two layers"]["difference"] == 0
     assert written["exponents"] == {}  # of two sizes
     assert {"faiss", "versions", "cpu_capability"} <= set(written)
     assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
-    shown = capsys.readouterr().out
-    assert "places=600" in shown
+    assert "places=600" in capsys.readouterr().out
 
 
 def test_rows_are_written_as_they_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,43 +201,28 @@ def test_rows_are_written_as_they_finish(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(scale, "bench_scale", two)
     with pytest.raises(RuntimeError, match="third"):
-        scale.run_scale(tmp_path)
+        scale.run_scale(out=tmp_path)
     assert len(json.loads((tmp_path / "bench.json").read_text())["rows"]) == 2
     assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_without_faiss_its_rows_say_so(small: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("_small")
+def test_without_faiss_its_rows_say_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
     np.save(tmp_path / "drawn.npy", smooth(600, 16).numpy())
     row = scale.measured(Task("places=600", "faiss flat", "drawn", 600, 1, "cpu"), tmp_path)
-    assert "faiss" in (row["skipped"] or "")
+    assert "faiss" in row["skipped"]
     assert row["seconds"] is None
 
 
 def test_a_process_learns_and_another_localizes(tmp_path: Path) -> None:
     route = smooth(600, 16)
     np.save(tmp_path / "drawn.npy", route.numpy())
-    scale.save_file(
-        {"queries": route[::20].contiguous(), "truth": spread(600)[::20].contiguous()},
-        tmp_path / "places=600.safetensors",
-    )
+    asked = {"queries": route[::20].contiguous(), "truth": spread(600)[::20].contiguous()}
+    save_file(asked, tmp_path / "places=600.safetensors")
     row = scale.measured(Task("places=600", "dejavu 4 B", "drawn", 600, 1, "cpu"), tmp_path)
-    assert row["skipped"] is None
-    assert row["recall_at_1"] == 1
+    assert (row["skipped"], row["recall_at_1"]) == (None, 1)
     assert not list(tmp_path.glob("kept*"))
-
-
-def test_bad_sizes_are_refused_ahead_of_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for given, word in (
-        (("--places", "7"), "500"),
-        (("sim:aerial",), "unrecognized"),
-        (("--device", "tpu"), "tpu"),
-    ):
-        error = benchmark_fails(capsys, "scale", *given, "--out", tmp_path / "out")
-        assert word in error
-    error = benchmark_fails(capsys, "memory", "--device", "cuda", "--out", tmp_path / "out")
-    assert "unrecognized" in error
-    assert not list(tmp_path.iterdir())
 
 
 def test_queries_lie_evenly_along_the_route() -> None:
@@ -294,24 +232,19 @@ def test_queries_lie_evenly_along_the_route() -> None:
 
 
 def test_exponents_and_tables() -> None:
-    rows = [
-        scale_row(f"{kind}={n}", "dejavu", n, seconds=1e-6 * n**power, route_bytes=7)
-        for kind, power in (("places", 0.5), ("repeat", 1.0))
-        for n in (100, 1000, 10_000)
-    ]
-    rows += [
-        scale_row(f"places={n}", "dejavu 1 B", n, seconds=1.0, route_bytes=n) for n in (100, 1000, 10_000)
-    ]
-    rows += [scale_row(f"places={n}", "null 1 B", n, seconds=1.0) for n in (100, 1000)]
-    rows += [scale_row(f"repeat={math.lcm(*TILES)}", "dejavu", math.lcm(*TILES), route_bytes=1)]
+    sizes, cycle = (100, 1000, 10_000), math.lcm(*TILES)
+    rows = [scale_row(f"places={n}", "dejavu", n, seconds=1e-6 * n**0.5, route_bytes=7) for n in sizes]
+    rows += [scale_row(f"repeat={n}", "dejavu", n, seconds=1e-6 * n, route_bytes=7) for n in sizes]
+    rows += [scale_row(f"places={n}", "dejavu 1 B", n, seconds=1.0, route_bytes=n) for n in sizes]
+    rows += [scale_row(f"places={n}", "null 1 B", n, seconds=1.0) for n in sizes[:2]]
+    rows += [scale_row(f"repeat={cycle}", "dejavu", cycle, route_bytes=1)]
     rows += [scale_row("places=100", "faiss flat", 100, skipped="no faiss")]
     found = exponents(rows)
     assert found["places"]["dejavu"]["seconds"] == pytest.approx(0.5)
     assert found["repeat"]["dejavu"] == pytest.approx({"seconds": 1, "route_bytes": 0}, abs=1e-9)
     assert found["places"]["dejavu 1 B"].keys() == {"seconds"}  # its bytes are given
     assert not found["places"].keys() & {"faiss flat", "null 1 B"}  # of two sizes at most
-    tables = dict(scale_tables(rows))
-    assert tables["places=100"][-1][0] == "faiss flat"
-    assert tables["places=100"][-1][-1] == "skipped: no faiss"
-    assert {len(line) for line in tables["places=100"]} == {len(tables["places=100"][0])}
-    assert set(CONTENDERS) == set(PLACED) | set(REPEATED)
+    first, *_, last = scale_tables(rows)
+    assert first.splitlines()[0] == "places=100"
+    assert first.splitlines()[-1].split() == ["faiss", "flat", "skipped:", "no", "faiss"]
+    assert last.startswith("repeat=N: exponents of N\n")

@@ -5,21 +5,21 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command_line import benchmark, benchmark_fails, run
-from helpers import refused
 from torch import Tensor
 
-from benchmarks import storage as frontier
+from benchmarks import storage
 from benchmarks.measure import PROCESS, Contender, Row, new_row
 from benchmarks.plots import plot_frontiers
 from benchmarks.quantisers import Kept
 from benchmarks.storage import (
     KEYS,
-    Point,
+    Route,
     bench_storage,
     bytes_for,
     contenders_of,
@@ -27,7 +27,6 @@ from benchmarks.storage import (
     equal_areas,
     front,
     judged,
-    run_storage,
     skipped_lines,
     storage_tables,
     whitenings,
@@ -35,7 +34,6 @@ from benchmarks.storage import (
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
-from dejavu_torch.recognition.localizer import Matching
 
 PLACES, NUMBERS = 300, 24
 
@@ -60,25 +58,27 @@ def rows(pair: tuple[str, str]) -> list[Row]:
     return list(bench_storage(pair))
 
 
-def test_all_families_are_there(rows: list[Row]) -> None:
+@pytest.fixture(scope="module")
+def route() -> Route:
+    """The pair in memory, and another route for codebooks and a whitening."""
+    reference, query, other = (ArrayTraverse(series(seed)) for seed in (0, 1, 5))
+    return described("pair", reference, query, other=other)
+
+
+def row_of(route: Route, name: str) -> Row:
+    return judged(route, next(one for one in contenders_of(route) if one.name == name))
+
+
+def test_all_families_are_there_and_what_is_skipped_says_why(rows: list[Row]) -> None:
     pytest.importorskip("faiss")
     ran = {row["family"] for row in rows if row["skipped"] is None}
     stores = {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
     assert ran == stores | {"dejavu, other whitenings"}
     assert [row["contender"] for row in rows[:2]] == ["dejavu 0.5", "dejavu 1"]
-    assert all("PQ" in row["contender"] for row in rows if "PQ" in row["family"])
     assert len({row["contender"] for row in rows}) == len(rows)
-
-
-def test_what_is_skipped_says_why(rows: list[Row]) -> None:
-    pytest.importorskip("faiss")
-    free = [row for row in rows if row["family"] == "PQ, codebooks of another route"]
-    assert {row["skipped"] for row in free} == {
-        "no other route to train codebooks on; expected --codebooks SOURCE"
-    }
-    assert free[0]["auc"] is free[0]["bytes"] is None
+    reasons = {row["skipped"] for row in rows if row["family"] == "PQ, codebooks of another route"}
+    assert reasons == {"no other route to train codebooks on; expected --codebooks SOURCE"}
     video = [row["skipped"] or "" for row in rows if row["family"] == "video"]
-    assert video
     assert all("ready features" in reason for reason in video)
     assert any("--codebooks" in line for line in skipped_lines(rows))
 
@@ -101,16 +101,17 @@ def test_all_bytes_are_counted_fixed_and_growing_apart(rows: list[Row]) -> None:
     assert found["signs of every frame"]["route_bytes"] == PLACES * 4  # of 25 bits
 
 
-def test_codebooks_count_where_they_are_of_the_route(pair: tuple[str, str], rows: list[Row]) -> None:
+def test_codebooks_count_where_they_are_of_the_route(route: Route) -> None:
     pytest.importorskip("faiss")
-    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
-    free = {one.name: one for one in contenders_of(route, ArrayTraverse(series(5)))}
-    row = judged(route, free["PQ, 4 bytes of every 3rd frame"])
-    assert (row["route_bytes"], row["skipped"]) == (100 * 4, None)
-    own = {row["contender"]: row for row in rows}["PQ, 4 bytes of every 3rd frame, own codebooks"]
-    assert own["route_bytes"] == 100 * 4 + 256 * 28  # 25 numbers, padded
-    own = {row["contender"]: row for row in rows}["OPQ, 4 bytes of every 3rd frame, own codebooks"]
-    assert own["route_bytes"] == 100 * 4 + 256 * 28 + 28 * 28
+    free, own, rotated = (
+        row_of(route, name)["route_bytes"] - 100 * 4
+        for name in (
+            "PQ, 4 bytes of every 3rd frame",
+            "PQ, 4 bytes of every 3rd frame, own codebooks",
+            "OPQ, 4 bytes of every 3rd frame, own codebooks",
+        )
+    )
+    assert (free, own, rotated) == (0, 256 * 28, 256 * 28 + 28 * 28)  # 25 numbers, padded
 
 
 def test_more_bytes_recognise_more_and_the_whole_database_most(rows: list[Row]) -> None:
@@ -132,33 +133,31 @@ def test_the_map_is_scored_as_compare_scores_it(rows: list[Row]) -> None:
     assert found["recall_at_1"] == pytest.approx(float(right.float().mean()), abs=0.01)
 
 
-def test_other_whitenings_take_other_fixed_bytes(pair: tuple[str, str], rows: list[Row]) -> None:
-    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
-    contenders = [one for one in contenders_of(route, ArrayTraverse(series(5))) if "whitening" in one.name]
-    others = {one.name.rpartition("whitening ")[2]: judged(route, one) for one in contenders}
+def test_other_whitenings_take_other_fixed_bytes(route: Route, rows: list[Row]) -> None:
+    names = (*storage.WHITENINGS, "of another route")
+    others = {name: row_of(route, f"dejavu 5, whitening {name}") for name in names}
     sizes = {name: row["fixed_bytes"] or 0 for name, row in others.items()}
     assert sizes["16 bits"] > sizes["8 bits"] > route.fixed == sizes["of another route"]
-    assert all(
-        row["route_bytes_per_place"] == pytest.approx(5, rel=0.02) for row in others.values() if row["auc"]
-    )
+    for row in others.values():
+        assert row["skipped"] or row["route_bytes_per_place"] == pytest.approx(5, rel=0.02)
     assert "numbers" in (others["64 numbers"]["skipped"] or "")  # of 24
     shown = whitenings([*rows, others["of another route"]])  # of another case than the rows
-    assert [[one.name for one in some] for some in shown.values()] == [["the default", "16 bits", "8 bits"]]
-    (table,) = [table for _, table in storage_tables(rows) if table[0][1] == "fixed kB"]
-    assert [row[0] for row in table[1:]] == ["the default", "16 bits", "8 bits"]
-    figure, _ = plot_frontiers(frontier.pictured(rows), shown)
-    texts = [text.get_text() for text in figure.axes[1].texts]
-    assert texts[-1] == f"16 bits, {sizes['16 bits'] / 1000:.0f} kB"
+    expected = ["the default", "16 bits", "8 bits"]
+    assert [[name for name, _, _ in some] for some in shown.values()] == [expected]
+    (table,) = [table for table in storage_tables(rows) if "fixed kB" in table]
+    assert [line.partition("  ")[0] for line in table.splitlines()[-3:]] == expected
+    axes = storage.pictured(rows)[0].axes
+    assert axes[1].texts[-1].get_text() == f"16 bits, {sizes['16 bits'] / 1000:.0f} kB"
 
 
 def test_a_whitening_that_is_given_describes_all(
     pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run("learn", pair[1], "--map", tmp_path / "map.safetensors")
-    monkeypatch.setattr(frontier, "_stores", lambda route, *_: [("all", "frames", lambda: store(route))])
+    monkeypatch.setattr(storage, "stores_of", lambda route: [("all", "frames", lambda: store(route))])
     whitened = []
 
-    def store(route: frontier.Route) -> Kept:
+    def store(route: Route) -> Kept:
         whitened.append(route.places)
         return Kept(route.places, len(route.places))
 
@@ -167,64 +166,36 @@ def test_a_whitening_that_is_given_describes_all(
     assert torch.equal(whitened[0], model.whitened(series(0)))
     written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
     assert [row["family"] for row in written] == ["frames", "the paper"]
-    raw = DejaVu(whitening="none").learn(series(0))
-    raw.save(tmp_path / "raw.safetensors")
-    error = benchmark_fails(
-        capsys,
-        "storage",
-        *pair,
-        "--whitening",
-        tmp_path / "raw.safetensors",
-        "--out",
-        tmp_path / "o",
-    )
-    assert "without whitening" in error
+    DejaVu(whitening="none").learn(series(0)).save(tmp_path / "raw.safetensors")
+    words = ("--whitening", tmp_path / "raw.safetensors", "--out", tmp_path / "o")
+    assert "without whitening" in benchmark_fails(capsys, "storage", *pair, *words)
 
 
-def test_the_paper_beside_them() -> None:
+def test_the_paper_beside_them(route: Route) -> None:
     period = torch.arange(1024)[:, None] % torch.tensor([16, 32])
     wave = (period < torch.tensor([8, 16])).float() + 0.01 * torch.rand(1024, 2)
-    route = described("wave", ArrayTraverse(wave), ArrayTraverse(wave + 0.01))
-    row = judged(route, paper_of(route))
+    row = row_of(described("wave", ArrayTraverse(wave), ArrayTraverse(wave + 0.01)), "the paper")
     assert row["skipped"] is None
-    assert (row["route_bytes"] or 0) > 0
-    short = described("short", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
-    assert "1024" in (judged(short, paper_of(short))["skipped"] or "")
+    assert row["route_bytes"] > 0
+    assert "1024" in row_of(route, "the paper")["skipped"]
 
 
-def paper_of(route: frontier.Route) -> Contender:
-    return next(one for one in contenders_of(route, None) if one.family == "the paper")
-
-
-def test_a_budget_below_the_least_and_too_few_places_are_rows() -> None:
-    pytest.importorskip("faiss")
-    route = described("short", *(ArrayTraverse(series(seed)[:40]) for seed in (0, 1)))
-    rows = [judged(route, one) for one in contenders_of(route, None)]
-    found = {row["contender"]: row["skipped"] or "" for row in rows}
-    assert "route_bytes_per_place is 0.5; expected more than" in found["dejavu 0.5"]
-    assert "40 places" in found["PQ, 4 bytes of every 2nd frame, own codebooks"]
-
-
-def test_without_faiss_its_rows_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "faiss", None)
-    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
-    quantisers = [one for one in contenders_of(route, None) if one.family == "PQ, own codebooks"]
-    skipped = judged(route, quantisers[0])["skipped"]
-    assert skipped is not None
-    assert "faiss" in skipped
-
-
-def test_a_codec_that_is_not_there_is_a_row() -> None:
-    route = described("pair", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
-
-    def missing(matching: Matching) -> None:
+def test_what_cannot_be_stored_is_a_row(route: Route, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing() -> Any:
         import av
 
         av.CodecContext.create("libx999", "w")
 
-    row = judged(route, Contender("x999", lambda: missing))
-    assert row["skipped"] is not None
-    assert "libx999" in row["skipped"]
+    assert "libx999" in judged(route, Contender("x999", missing))["skipped"]
+    short = described("short", *(ArrayTraverse(series(seed)[:40]) for seed in (0, 1)))
+    assert "route_bytes_per_place is 0.5; expected more than" in row_of(short, "dejavu 0.5")["skipped"]
+    assert "principal components" in row_of(short, "PCA, 32 numbers of every frame, int8")["skipped"]
+    name = "PQ, 4 bytes of every 2nd frame, own codebooks"
+    if not row_of(route, name)["skipped"]:
+        assert "40 places" in row_of(short, name)["skipped"]
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    assert "faiss" in row_of(route, name)["skipped"]
+    assert (row_of(route, "whole database, float")["peak_bytes"] is not None) == PROCESS.exists()
 
 
 def of(size: float, auc: float, family: str = "other") -> Row:
@@ -235,15 +206,9 @@ def of(size: float, auc: float, family: str = "other") -> Row:
 
 def test_a_front_is_what_nothing_smaller_reaches() -> None:
     points = front([of(4, 0.6), of(1, 0.2), of(2, 0.6), of(3, 0.5), of(8, 0.9), of(2, 0.4)])
-    assert [tuple(point) for point in points] == [(1, 0.2), (2, 0.6), (8, 0.9)]
-
-
-def test_bytes_for_an_area() -> None:
-    points = [Point(1, 0.2), Point(2, 0.6), Point(8, 0.9)]
-    assert bytes_for(0.6, points) == pytest.approx(2)
-    assert bytes_for(0.75, points) == pytest.approx(4)
-    assert bytes_for(0.1, points) == 1
-    assert bytes_for(0.95, points) is None
+    assert points == [(1, 0.2), (2, 0.6), (8, 0.9)]
+    areas = (0.6, 0.75, 0.1, 0.95)
+    assert [bytes_for(area, points) for area in areas] == pytest.approx([2, 4, 1, None])
     assert bytes_for(0.5, []) is None
 
 
@@ -256,20 +221,20 @@ def test_equal_areas() -> None:
 
 def test_the_tables() -> None:
     rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8), of(2, 0.99, "more")]
-    (title, best), (_, equal) = storage_tables(
-        [*rows, new_row("case", "none", KEYS, family="none", skipped="absent")], at=3.2
-    )
-    assert title == "case: AUC"
-    assert best[1:] == [
-        ["dejavu", "0.500", "0.500", "0.750", "0.750", "0.750"],
-        ["other", "0.400", "0.400", "0.400", "0.400", "0.800"],
-        ["more", "", "", "0.990", "0.990", "0.990"],
+    skipped = [new_row("case", name, KEYS, family="none", skipped="absent") for name in "abc"]
+    best, equal = storage_tables([*rows, *skipped], at=3.2)
+    assert best.startswith("case: AUC\n")
+    assert best.split()[-16:] == [
+        *("dejavu", "0.500", "0.500", "0.750", "0.750", "0.750"),
+        *("other", "0.400", "0.400", "0.400", "0.400", "0.800"),
+        *("more", "0.990", "0.990", "0.990"),
     ]
     other = f"{bytes_for(0.75, front(rows[2:4])):.2f}"
-    assert [row[1] for row in equal] == ["T = 1", "0.750", "3.20", other, "<2.00"]
-    (_, _), (_, equal) = storage_tables([of(1, 0.9, "dejavu"), of(1.6, 0.99, "dejavu"), of(2, 0.8)])
-    assert [row[1] for row in equal] == ["T = 1", "0.950", f"{1.6 ** (5 / 9):.2f}", "never"]
-    skipped = [new_row("case", name, KEYS, family="none", skipped="absent") for name in "abc"]
+    shown = [line.split()[:2] for line in equal.splitlines()]
+    assert shown[-4:] == [["AUC", "0.750"], ["dejavu", "3.20"], ["other", other], ["more", "<2.00"]]
+    _, equal = storage_tables([of(1, 0.9, "dejavu"), of(1.6, 0.99, "dejavu"), of(2, 0.8)])
+    shown = [line.split()[:2] for line in equal.splitlines()]
+    assert shown[-3:] == [["AUC", "0.950"], ["dejavu", f"{1.6 ** (5 / 9):.2f}"], ["other", "never"]]
     assert skipped_lines(skipped) == ["case: skipped a and 2 more: absent"]
     assert skipped_lines(skipped[:1]) == ["case: skipped a: absent"]
 
@@ -277,26 +242,24 @@ def test_the_tables() -> None:
 def test_rows_are_written_as_they_finish(
     pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = ("dejavu 5", "dejavu 10", "null 5")
     seen, out = [], tmp_path / "out"
 
-    def some(*arguments: object) -> list[Contender]:
-        return [one for one in contenders_of(*arguments) if one.name in names]  # type: ignore[arg-type]
+    def some(*arguments: Any) -> list[Contender]:
+        return [one for one in contenders_of(*arguments) if one.name in ("dejavu 5", "dejavu 10", "null 5")]
 
-    def watched(*arguments: object) -> Row:
+    def watched(*arguments: Any) -> Row:
         seen.append(len(json.loads((out / "bench.json").read_text())["rows"]) if out.exists() else 0)
-        return judged(*arguments)  # type: ignore[arg-type]
+        return judged(*arguments)
 
-    monkeypatch.setattr(frontier, "contenders_of", some)
-    monkeypatch.setattr(frontier, "judged", watched)
-    rows = run_storage(out, pair)
+    monkeypatch.setattr(storage, "contenders_of", some)
+    monkeypatch.setattr(storage, "judged", watched)
+    benchmark("storage", *pair, "--out", out)
     assert seen == [0, 1, 2]
-    written = json.loads((tmp_path / "out" / "bench.json").read_text())
-    assert written["rows"] == rows
+    written = json.loads((out / "bench.json").read_text())
     assert {entry["T"] for entry in written["equal_auc"]} == {1, 5, 11, 21}
-    assert min(row["ratio_to_ours"] or 0 for row in rows if row["family"] == "dejavu") == 1
-    assert (tmp_path / "out" / "bench.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["bench.json", "bench.png"]
+    assert min(row["ratio_to_ours"] for row in written["rows"] if row["family"] == "dejavu") == 1
+    assert (out / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in out.iterdir()) == ["bench.json", "bench.png"]
 
 
 def test_a_line_for_each_family_and_ours_the_thickest() -> None:
@@ -315,8 +278,8 @@ def test_a_map_that_is_given_is_set_beside(
     run("learn", pair[0], "--map", tmp_path / "map.safetensors")
     few = (1.0, 5.0)
     for name in ("SPACED", "BETWEEN", "COMPONENTS", "CODE_BYTES", "BIT_SPACED", "QUALITIES"):
-        monkeypatch.setattr(frontier, name, ())
-    monkeypatch.setattr(frontier, "BUDGETS", few)
+        monkeypatch.setattr(storage, name, ())
+    monkeypatch.setattr(storage, "BUDGETS", few)
     benchmark("storage", *pair, "--map", tmp_path / "map.safetensors", "--out", tmp_path / "out")
     written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
     found = {row["contender"]: row for row in written}
@@ -330,10 +293,10 @@ def test_a_map_that_is_given_is_set_beside(
 
 
 def test_built_in_routes() -> None:
-    names = [name for name, *_ in frontier._routes((), (64, 300), None, None)]
+    names = [name for name, *_ in storage.routes_of((), (64, 300), None, None)]
     assert names[:2] == ["sim:aerial, 64 places", "sim:aerial, 300 places"]
     assert [name.partition(",")[0] for name in names[2:]] == ["sim:outdoor", "sim:underground"]
-    *_, reference, query, other = frontier._routes((), (64,), None, None)[0]
+    *_, reference, query, other = storage.routes_of((), (64,), None, None)[0]
     assert "seed=0&traverse=0" in reference.name
     assert "seed=0&traverse=1" in query.name
     assert other is not None
@@ -344,12 +307,12 @@ def test_built_in_routes() -> None:
     ("words", "named"),
     [
         (["A"], ["1 sources", "pairs"]),
+        (["--map", "OF_SHORT"], ["0 sources", "one pair"]),
         (["A", "B", "--places", "64", "300"], ["--places", "sim:aerial"]),
         (["--places", "1"], ["--places 1", "at least 2"]),
         (["--codebooks", "A"], ["--codebooks", "pairs"]),
         (["A", "nowhere"], ["nowhere", "expected"]),
         (["A", "B", "A", "B"], ["given twice"]),
-        (["A", "B", "A", "SHORT"], ["300 frames", "200", "as many"]),
         (["A", "B", "--map", "OF_SHORT"], ["200 places", "300", "the reference"]),
         (["A", "B", "--map", "OF_NARROW"], ["24", "9"]),
         (["A", "B", "--whitening", "OF_NARROW"], ["a.npy gives 24", "9 features"]),
@@ -384,22 +347,30 @@ def test_what_is_refused(
 
 
 def test_pairs_of_other_lengths_that_know_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frontier, "contenders_of", lambda *_: [])
+    monkeypatch.setattr(storage, "contenders_of", lambda *_: [])
     pair = [f"sim:aerial?frames=60&stop={stop}&traverse={stop % 2}" for stop in (60, 51)]
     assert list(bench_storage(pair)) == []
 
 
-def test_the_matcher_takes_no_sources(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = benchmark_fails(capsys, "matcher", "sim:aerial", "--out", tmp_path / "out")
-    assert "unrecognized" in error
-
-
-def test_a_map_is_of_one_route() -> None:
-    with refused("0 sources", "one pair"):
-        list(bench_storage(given=DejaVu()))
-
-
-def test_memory_is_measured_where_the_system_tells() -> None:
-    route = described("route", *(ArrayTraverse(series(seed)) for seed in (0, 1)))
-    whole = next(one for one in contenders_of(route, None) if one.name == "whole database, float")
-    assert (judged(route, whole)["peak_bytes"] is not None) == PROCESS.exists()
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("matcher sim:aerial", ["unrecognized"]),
+        ("memory sim:aerial", ["unrecognized"]),
+        ("memory --places 7", ["7", "64"]),
+        ("memory --device cuda", ["unrecognized"]),
+        ("scale --places 7", ["7", "500"]),
+        ("scale sim:aerial", ["unrecognized"]),
+        ("scale --device tpu", ["tpu"]),
+        ("train sim:aerial", ["1 sources", "REFERENCE QUERY"]),
+        ("train --steps 0", ["0 steps"]),
+        ("train --seeds -1", ["seeds [-1]", "from 0"]),
+        ("nothing", ["'nothing' is no benchmark", "matcher, storage"]),
+    ],
+)
+def test_what_other_benchmarks_refuse(
+    words: str, named: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = benchmark_fails(capsys, *words.split(), "--out", tmp_path / "out")
+    assert [word for word in named if word not in error] == [], error
+    assert not list(tmp_path.iterdir())
