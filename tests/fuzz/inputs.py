@@ -49,41 +49,21 @@ def maps(folder: Path) -> None:
     periods = ImposedPeriods([3, 4, 5], bin=2)
     write_images(folder / "photos", pictures(40))
     ground = footage(40)
+    small = {"channels": 1, "resize": (16, 16), "widths": (4, 8), "squeeze": 4}
+    odometry = GroundOdometry(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)), (48, 48), step=6.0)
+    templates = TemplateMapper(periods)
+    network, rounded = (SmallCNN(8, **small) for _ in range(2))  # type: ignore[arg-type]
+    plan = TemplateMapper(periods, reduction="sum", metric="l2")
     models: dict[str, tuple[DejaVu, Any, np.ndarray]] = {
-        "templates": (DejaVu(mapper=TemplateMapper(periods)), frames, queries),
-        "plan": (
-            DejaVu(mapper=TemplateMapper(periods, reduction="sum", metric="l2")),
-            features,
-            features[:9].numpy(),
-        ),
+        "templates": (DejaVu(mapper=templates), frames, queries),
+        "plan": (DejaVu(mapper=plan), features, features[:9].numpy()),
         "spectral": (DejaVu(), frames, queries),
         "plain": (DejaVu(whitening="none"), features, features[:9].numpy()),
         "chunked": (DejaVu(mapper=SpectralMapper(chunk=16)), frames, queries),
         "named": (DejaVu(threshold=0.5), open_source(folder / "photos"), queries),
-        "learned": (
-            DejaVu(
-                SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4),
-                mapper=TemplateMapper(periods),
-            ),
-            frames,
-            queries,
-        ),
-        "rounded": (
-            DejaVu(
-                SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4),
-                mapper=SpectralMapper(20.0),
-                weight_bits=8,
-            ),
-            frames,
-            queries,
-        ),
-        "resampled": (
-            DejaVu(
-                velocity=GroundOdometry(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)), (48, 48), step=6.0)
-            ),
-            frames_of(ground),
-            ground[:20],
-        ),
+        "learned": (DejaVu(network, mapper=templates), frames, queries),
+        "rounded": (DejaVu(rounded, mapper=SpectralMapper(20.0), weight_bits=8), frames, queries),
+        "resampled": (DejaVu(velocity=odometry), frames_of(ground), ground[:20]),
     }
     for name, (model, reference, query) in models.items():
         model.learn(reference)

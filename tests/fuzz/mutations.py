@@ -11,7 +11,7 @@ import copy
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from random import Random
 from typing import Any
 
@@ -31,24 +31,9 @@ CLASSES = (
     *("HOG", "Whitening", "SmallCNN", "SpectralMapper", "TemplateMapper", "torch.nn.Identity", "nn.Linear"),
 )
 TEXTS = (
-    *(
-        "",
-        " ",
-        "x",
-        "none",
-        "null",
-        "true",
-        "NaN",
-        "é",
-        "日本",
-        "\n",
-        "a\nb",
-        "\r\n",
-        "\0",
-        "\x1b[31m",
-        "\u2028",
-    ),
-    *("%s", "%n", "../..", ".", "..", "~", "a" * 300, "a" * LONG, "1" * 5000, "-", "--", "\udcff", "\ufeff"),
+    *("", " ", "x", "none", "null", "true", "NaN", "é", "日本", "\n", "a\nb", "\r\n", "\0", "\x1b[31m"),
+    *("\u2028", "%s", "%n", "../..", ".", "..", "~", "a" * 300, "a" * LONG, "1" * 5000, "-", "--", "\udcff"),
+    "\ufeff",
 )
 TOKENS = (  # of text files and options, where numbers stand as text
     *map(str, NUMBERS),
@@ -72,6 +57,10 @@ PICKLES = (  # each calls the canary where it is unpickled
     b"\x80\x02" + f"c{CANARY}\nrun\n)R.".encode(),
     f"(S'{CANARY}'\ni{CANARY}\nrun\n.".encode(),
 )
+KINDS = (
+    *(torch.float64, torch.float16, torch.bfloat16, torch.float32, torch.bool),
+    *(torch.int64, torch.int32, torch.int8, torch.uint8),
+)
 ONE_EACH = 0.7  # of the cases have a single change: several hide each other
 
 
@@ -83,7 +72,23 @@ def times(random: Random) -> int:
 def mutate_bytes(random: Random, data: bytes) -> bytes:
     """Bytes flipped, cut, doubled, spliced, overwritten or inserted; mostly near an end."""
     for _ in range(times(random)):
-        data = random.choice(BYTES)(random, data)
+        start, other = _place(random, data), _place(random, data)
+        stop = min(len(data), start + random.choice((1, 2, 4, 8, 64, 1024)))
+        size = random.choice((1, 3, 8, 500))
+        flipped = bytes([data[start] ^ 1 << random.randrange(8)]) if data else b""
+        filled = random.choice((b"\0", b"\xff", b"\x7f", b"\x80", b" ", b"9")) * (stop - start)
+        changed = (
+            *[data[:start] + flipped + data[start + 1 :]] * 3,
+            data[:start] + filled + data[stop:],
+            data[:start] + random.randbytes(stop - start) + data[stop:],
+            data[:start],
+            data + data,
+            data[:other] + data[start:stop] + data[other:],
+            data[:start] + random.randbytes(size) + data[start:],
+            data[:start] + data[stop:],
+            random.choice((b"", b"\0" * 100, random.randbytes(1000), *PICKLES)),
+        )
+        data = random.choice(changed)
     return data
 
 
@@ -94,82 +99,23 @@ def _place(random: Random, data: bytes) -> int:
     return max(0, len(data) - 1 - at) if random.random() < 0.3 else min(at, max(0, len(data) - 1))
 
 
-def _piece(random: Random, data: bytes) -> tuple[int, int]:
-    at = _place(random, data)
-    return at, min(len(data), at + random.choice((1, 2, 4, 8, 64, 1024)))
-
-
-def _flip(random: Random, data: bytes) -> bytes:
-    if not data:
-        return data
-    changed, at = bytearray(data), _place(random, data)
-    changed[at] ^= 1 << random.randrange(8)
-    return bytes(changed)
-
-
-def _overwrite(random: Random, data: bytes) -> bytes:
-    start, stop = _piece(random, data)
-    filled = random.choice((b"\0", b"\xff", b"\x7f", b"\x80", b" ", b"9")) * (stop - start)
-    return data[:start] + filled + data[stop:]
-
-
-def _noise(random: Random, data: bytes) -> bytes:
-    start, stop = _piece(random, data)
-    return data[:start] + random.randbytes(stop - start) + data[stop:]
-
-
-def _truncate(random: Random, data: bytes) -> bytes:
-    return data[: _place(random, data)]
-
-
-def _double(random: Random, data: bytes) -> bytes:
-    return data + data
-
-
-def _splice(random: Random, data: bytes) -> bytes:
-    (start, stop), at = _piece(random, data), _place(random, data)
-    return data[:at] + data[start:stop] + data[at:]
-
-
-def _insert(random: Random, data: bytes) -> bytes:
-    at = _place(random, data)
-    return data[:at] + random.randbytes(random.choice((1, 3, 8, 500))) + data[at:]
-
-
-def _delete(random: Random, data: bytes) -> bytes:
-    start, stop = _piece(random, data)
-    return data[:start] + data[stop:]
-
-
-def _replace_all(random: Random, data: bytes) -> bytes:
-    return random.choice((b"", b"\0" * 100, random.randbytes(1000), *PICKLES))
-
-
-BYTES = (_flip, _flip, _flip, _overwrite, _noise, _truncate, _double, _splice, _insert, _delete, _replace_all)
-
-
 def mutate_json(random: Random, value: Any) -> Any:
     """A tree of JSON values with some replaced by another type or size, removed, renamed or added."""
     value = copy.deepcopy(value)
     for _ in range(times(random)):
-        value = _mutate_node(random, value)
-    return value
-
-
-def _mutate_node(random: Random, value: Any) -> Any:
-    places = list(_places(value))
-    if not places:
-        return odd_value(random, value)
-    holder, key = random.choice(places)
-    act = random.random()
-    if act < 0.75:
-        holder[key] = odd_value(random, holder[key])
-    elif act < 0.85:
-        del holder[key]
-    elif isinstance(holder, dict):
-        holder[random.choice((*TEXTS[:20], "class_path", "init_args", str(key) + "_"))] = holder[key]
-    else:
-        holder.insert(key, odd_value(random, holder[key]))
+        places = list(_places(value))
+        if not places:
+            value = odd_value(random, value)
+            continue
+        (holder, key), act = random.choice(places), random.random()
+        if act < 0.75:
+            holder[key] = odd_value(random, holder[key])
+        elif act < 0.85:
+            del holder[key]
+        elif isinstance(holder, dict):
+            holder[random.choice((*TEXTS[:20], "class_path", "init_args", f"{key}_"))] = holder[key]
+        else:
+            holder.insert(key, odd_value(random, holder[key]))
     return value
 
 
@@ -182,29 +128,19 @@ def _places(value: Any) -> Any:
 
 def odd_value(random: Random, value: Any) -> Any:
     """Something else in place of a JSON value."""
-    act = random.random()
-    if isinstance(value, bool) or value is None:
-        act += 0.25
-    if act < 0.25 and isinstance(value, int | float):
-        return random.choice(
-            (value + 1, value - 1, -value, value * 2, value * 1000, float(value), str(value))
-        )
-    if act < 0.25 and isinstance(value, str):
-        return random.choice((value + value, value[:-1], value + "\n", *CLASSES))
-    if act < 0.25 and isinstance(value, list):
-        return random.choice((value + value, value[:-1], value[::-1], [value], value * 1000))
-    kind = random.randrange(8)
-    if kind < 4:
-        return random.choice(NUMBERS)
-    if kind == 4:
-        return random.choice(TEXTS)
-    if kind == 5:
-        return random.choice(
-            (None, True, False, [], {}, [None], [[1, 2]], [-1, 2**62], [1e300] * 3, [0] * 10_000)
-        )
-    if kind == 6:
-        return {"class_path": random.choice(CLASSES), "init_args": random.choice(({}, {"a": 1}, None, []))}
-    return random.choice((Nested("["), Nested("{")))
+    near: tuple[Any, ...] = ()
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        near = (value + 1, value - 1, -value, value * 2, value * 1000, float(value), str(value))
+    elif isinstance(value, str):
+        near = (value + value, value[:-1], value + "\n", *CLASSES)
+    elif isinstance(value, list):
+        near = (value + value, value[:-1], value[::-1], [value], value * 1000)
+    if near and random.random() < 0.25:
+        return random.choice(near)
+    built = {"class_path": random.choice(CLASSES), "init_args": random.choice(({}, {"a": 1}, None, []))}
+    plain = (None, True, False, [], {}, [None], [[1, 2]], [-1, 2**62], [1e300] * 3, [0] * 10_000)
+    others = (random.choice(TEXTS), random.choice(plain), built, random.choice((Nested("["), Nested("{"))))
+    return random.choice((*[random.choice(NUMBERS)] * 4, *others))
 
 
 class Nested(str):
@@ -312,58 +248,41 @@ def mutate_tensors(random: Random, tensors: dict[str, Tensor]) -> dict[str, Tens
             other = random.choice(sorted(found))
             found[name], found[other] = found[other], found[name]
         else:
-            found[name] = random.choice(TENSORS)(random, found[name])
+            found[name] = odd_tensor(random, found[name])
     return found
 
 
-def _reshaped(random: Random, tensor: Tensor) -> Tensor:
-    shapes = (tensor[None], tensor.flatten(), tensor[..., None], tensor.flatten()[:0], tensor.new_zeros(()))
-    return random.choice(shapes)
-
-
-def _resized(random: Random, tensor: Tensor) -> Tensor:
-    if not tensor.ndim:
-        return tensor[None].expand(3)
-    return random.choice(
-        (tensor[:-1], torch.cat([tensor, tensor]), tensor[:1], tensor[..., :1], tensor.flip(0))
-    )
-
-
-def _retyped(random: Random, tensor: Tensor) -> Tensor:
-    kinds = (torch.float64, torch.float16, torch.int64, torch.int8, torch.uint8, torch.bool, torch.int32)
-    return tensor.to(random.choice((*kinds, torch.bfloat16, torch.float32)))
+def odd_tensor(random: Random, tensor: Tensor) -> Tensor:
+    """Another shape, size or type, a value that is odd, or other bytes."""
+    act = random.randrange(6)
+    if act == 0:
+        flat = tensor.flatten()
+        return random.choice((tensor[None], flat, tensor[..., None], flat[:0], tensor.new_zeros(())))
+    if act == 1:
+        if not tensor.ndim:
+            return tensor[None].expand(3)
+        doubled = torch.cat([tensor, tensor])
+        return random.choice((tensor[:-1], doubled, tensor[:1], tensor[..., :1], tensor.flip(0)))
+    if act == 2:
+        return tensor.to(random.choice(KINDS))
+    if act == 3 and tensor.numel():
+        data = bytearray(tensor.contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        for _ in range(random.choice((1, 10, 100))):
+            data[random.randrange(len(data))] = random.randrange(256)
+        return torch.frombuffer(data, dtype=torch.uint8).view(tensor.dtype).view(tensor.shape).clone()
+    return _filled(random, tensor)
 
 
 def _filled(random: Random, tensor: Tensor) -> Tensor:
-    value = random.choice(
-        (0, 1, -1, 127, 255, 2**31 - 1, 2**62, -(2**62), math.nan, math.inf, -math.inf, 1e30)
-    )
-    tensor = tensor.clone()
+    """One or all of the values are odd ones."""
+    odd = (0, 1, -1, 127, 255, 2**31 - 1, 2**62, -(2**62), math.nan, math.inf, -math.inf, 1e30)
+    value, tensor = random.choice(odd), tensor.clone()
     if not tensor.is_floating_point():
-        limits = (
-            (0, 1)
-            if tensor.dtype == torch.bool
-            else (torch.iinfo(tensor.dtype).min, torch.iinfo(tensor.dtype).max)
-        )
-        value = min(max(int(value) if math.isfinite(value) else -1, limits[0]), limits[1])
+        about = None if tensor.dtype == torch.bool else torch.iinfo(tensor.dtype)
+        least, most = (about.min, about.max) if about else (0, 1)
+        value = min(max(int(value) if math.isfinite(value) else -1, least), most)
     filling = torch.tensor(value).to(tensor.dtype)  # inf where halves hold no such number
     if tensor.numel() and random.random() < 0.6:
         tensor.view(-1)[random.randrange(tensor.numel())] = filling
         return tensor
     return tensor.copy_(filling)
-
-
-def _shuffled(random: Random, tensor: Tensor) -> Tensor:
-    data = (
-        bytearray(tensor.contiguous().view(-1).view(torch.uint8).numpy().tobytes()) if tensor.numel() else b""
-    )
-    if not data:
-        return tensor
-    for _ in range(random.choice((1, 10, 100))):
-        data[random.randrange(len(data))] = random.randrange(256)
-    return torch.frombuffer(data, dtype=torch.uint8).view(tensor.dtype).view(tensor.shape).clone()
-
-
-TENSORS: tuple[Callable[[Random, Tensor], Tensor], ...] = (
-    *(_reshaped, _resized, _retyped, _filled, _filled, _shuffled),
-)

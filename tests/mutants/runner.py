@@ -13,7 +13,6 @@ Exit status 1: a mutant survived, does not apply, or names tests that are not th
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib
 import os
 import shutil
@@ -21,7 +20,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -31,20 +30,11 @@ from .by_tester import MUTANTS as BY_TESTER
 from .mutant import Mutant
 
 ROOT = Path(__file__).parents[2]
-COPIED = (
-    "dejavu_torch",
-    "benchmarks",
-    "configs",
-    "tests",
-    "docs",
-    "README.md",
-    "CONTRIBUTING.md",
-    "pyproject.toml",
-)
+FOLDERS, FILES = ("dejavu_torch", "benchmarks", "configs", "tests", "docs"), ("README.md", "CONTRIBUTING.md")
 MUTANTS: list[Mutant] = [*BY_READER, *BY_TESTER]
 SLOW_IMPORTS = ("torch", "kornia", "numpy", "pytest", "hypothesis", "PIL.Image", "safetensors.torch")
 LIMIT = 120  # seconds; a mutant whose tests take longer counts as killed
-KILLED, SURVIVED, NO_TESTS, IN_VAIN = "killed", "SURVIVED", "NO TESTS", "DOES NOT APPLY"
+PYTEST = ("-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=line")
 
 
 def problem(mutant: Mutant) -> str:
@@ -53,9 +43,8 @@ def problem(mutant: Mutant) -> str:
     if not path.is_file():
         return f"{mutant.file} is not there"
     text = path.read_text()
-    found = text.count(mutant.old)
-    if found != 1:
-        return f"{mutant.old!r} occurs {found} times in {mutant.file}"
+    if text.count(mutant.old) != 1:
+        return f"{mutant.old!r} occurs {text.count(mutant.old)} times in {mutant.file}"
     if mutant.old == mutant.new:
         return "it changes nothing"
     try:
@@ -65,51 +54,45 @@ def problem(mutant: Mutant) -> str:
     return ""
 
 
-@contextlib.contextmanager
-def copies(count: int) -> Iterator[list[Path]]:
-    """So many copies of the working tree, in a temporary folder."""
-    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
-        made = [Path(folder) / str(i) for i in range(count)]
-        for copy in made:
-            copy.mkdir()
-            for name in COPIED:
-                source = ROOT / name
-                (shutil.copytree if source.is_dir() else shutil.copy2)(source, copy / name)
-        yield made
+def copied(copy: Path) -> Path:
+    """A copy of the working tree."""
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, copy / name)
+    for name in (*FILES, "pyproject.toml"):
+        shutil.copy2(ROOT / name, copy / name)
+    return copy
 
 
-@contextlib.contextmanager
-def applied(mutant: Mutant, copy: Path) -> Iterator[None]:
-    """In the block a copy has the mutant."""
-    path = copy / mutant.file
-    text = path.read_text()
-    for stale in (path.parent / "__pycache__").glob(f"{path.stem}.*"):  # also what numba compiled
+def rewrite(path: Path, text: str) -> None:
+    """Write a module, and forget what Python and numba compiled of it."""
+    for stale in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
         stale.unlink()
-    try:
-        path.write_text(text.replace(mutant.old, mutant.new))
-        yield
-    finally:
-        path.write_text(text)
-        for stale in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
-            stale.unlink()
-
-
-def words_of(tests: Sequence[str]) -> list[list[str]]:
-    """Arguments of pytest for tests: `file::name` are run together, `file::-k EXPRESSION` each alone."""
-    named = [one for one in tests if "::-k " not in one]
-    chosen = [one.partition("::-k ") for one in tests if "::-k " in one]
-    return [named] * bool(named) + [[file, "-k", expression] for file, _, expression in chosen]
+    path.write_text(text)
 
 
 def outcome(tests: Sequence[str], copy: Path, log: Path) -> int:
-    """Exit status of pytest of these tests in a copy: 0 if all pass, 1 if one fails; 124 out of time."""
-    for words in words_of(tests):
+    """Exit status of pytest of these tests in a copy: 0 if all pass, 1 if one fails; 124 out of time.
+
+    `file::name` are run together, `file::-k EXPRESSION` each alone.
+    """
+    named = [one for one in tests if "::-k " not in one]
+    chosen = [one.partition("::-k ") for one in tests if "::-k " in one]
+    for words in [named] * bool(named) + [[file, "-k", expression] for file, _, expression in chosen]:
         child = os.fork()
         if child == 0:
             _run_tests(words, copy, log)
-        status = _wait(child)
+        late = time.monotonic() + LIMIT
+        while True:
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                break
+            if time.monotonic() > late:
+                os.killpg(child, signal.SIGKILL)
+                os.waitpid(child, 0)
+                return 124
+            time.sleep(0.05)
         if status:
-            return status
+            return os.waitstatus_to_exitcode(status) & 255
     return 0
 
 
@@ -128,39 +111,27 @@ def _run_tests(words: list[str], copy: Path, log: Path) -> None:
         os.dup2(file, 2)
         import pytest
 
-        plain = ["-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=line"]
-        status = int(pytest.main([*plain, *words]))
+        status = int(pytest.main([*PYTEST, *words]))
     finally:
         sys.stdout.flush()
         os._exit(status)
 
 
-def _wait(child: int) -> int:
-    """The exit status of a child; 124 where it took too long, and was ended."""
-    began = time.monotonic()
-    while time.monotonic() < began + LIMIT:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status) & 255
-        time.sleep(0.05)
-    os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return 124
-
-
-def judged(mutant: Mutant, copy: Path, log: Path, unchanged: bool) -> str:
-    """What becomes of a mutant in a copy."""
+def judged(mutant: Mutant, copy: Path, log: Path, unchanged: bool) -> tuple[bool, str]:
+    """Whether all is well with a mutant in a copy, and what becomes of it."""
     why = problem(mutant)
     if why:
-        return f"{IN_VAIN}: {why}"
+        return False, f"DOES NOT APPLY: {why}"
+    path, text = copy / mutant.file, (ROOT / mutant.file).read_text()
+    rewrite(path, text if unchanged else text.replace(mutant.old, mutant.new))
+    try:
+        status = outcome(mutant.tests, copy, log)
+    finally:
+        rewrite(path, text)
     if unchanged:
-        status = outcome(mutant.tests, copy, log)
-        return "passes" if status == 0 else f"FAILS UNCHANGED ({status})"
-    with applied(mutant, copy):
-        status = outcome(mutant.tests, copy, log)
-    if status == 0:
-        return SURVIVED
-    return KILLED if status in (1, 124) else f"{NO_TESTS} ({status})"
+        return status == 0, f"FAILS UNCHANGED ({status})" if status else "passes"
+    told = {0: "SURVIVED", 1: "killed", 124: "killed"}
+    return status in (1, 124), told.get(status, f"NO TESTS ({status})")
 
 
 def chosen(words: Sequence[str]) -> list[int]:
@@ -169,9 +140,8 @@ def chosen(words: Sequence[str]) -> list[int]:
     for word in words:
         first, dash, last = word.partition("-")
         numbers += range(int(first), int(last if dash else first) + 1)
-    outside = [n for n in numbers if not 1 <= n <= len(MUTANTS)]
-    if outside:
-        raise SystemExit(f"there is no mutant {outside[0]}; expected 1 to {len(MUTANTS)}")
+    if numbers and not 1 <= min(numbers) <= max(numbers) <= len(MUTANTS):
+        raise SystemExit(f"mutants {' '.join(words)}; expected 1 to {len(MUTANTS)}")
     return numbers or list(range(1, len(MUTANTS) + 1))
 
 
@@ -186,34 +156,36 @@ def main() -> int:
     given = parser.parse_args()
     numbers = chosen(given.mutants)
     if given.check:
-        wrong = [(n, problem(MUTANTS[n - 1])) for n in numbers if problem(MUTANTS[n - 1])]
-        for n, why in wrong:
+        wrong = {n: problem(MUTANTS[n - 1]) for n in numbers if problem(MUTANTS[n - 1])}
+        for n, why in wrong.items():
             print(f"{n:3} {why}")
         print(f"{len(numbers)} mutants, {len(wrong)} do not apply")
         return int(bool(wrong))
     os.environ["OMP_NUM_THREADS"] = "1"
     for name in SLOW_IMPORTS:
         importlib.import_module(name)
-    began, found = time.monotonic(), {}
-    with copies(given.processes) as made, ThreadPoolExecutor(given.processes) as pool:
-        free: SimpleQueue[Path] = SimpleQueue()
-        for copy in made:
+    free: SimpleQueue[Path] = SimpleQueue()
+
+    def run(number: int) -> tuple[int, bool, str]:
+        copy, start = free.get(), time.monotonic()
+        try:
+            log = (given.log or copy / "tests.log").resolve()
+            well, told = judged(MUTANTS[number - 1], copy, log, given.unchanged)
+        finally:
             free.put(copy)
+        line = f"{number:3} {told:9} {time.monotonic() - start:5.1f} s  {MUTANTS[number - 1].sentence}"
+        return number, well, line
 
-        def run(number: int) -> tuple[int, str, float]:
-            copy, start = free.get(), time.monotonic()
-            log = given.log or copy / "tests.log"
-            try:
-                told = judged(MUTANTS[number - 1], copy, log.resolve(), given.unchanged)
-            finally:
-                free.put(copy)
-            return number, told, time.monotonic() - start
-
-        for number, told, seconds in pool.map(run, numbers):
-            found[number] = told
-            mutant = MUTANTS[number - 1]
-            print(f"{number:3} {told:9} {seconds:5.1f} s  {mutant.sentence}", flush=True)
-    wrong = [n for n, told in found.items() if told not in (KILLED, "passes")]
+    began, failed = time.monotonic(), []
+    with (
+        tempfile.TemporaryDirectory(prefix="mutants-") as folder,
+        ThreadPoolExecutor(given.processes) as pool,
+    ):
+        for i in range(given.processes):
+            free.put(copied(Path(folder) / str(i)))
+        for number, well, line in pool.map(run, numbers):
+            failed += [str(number)] * (not well)
+            print(line, flush=True)
     took = time.monotonic() - began
-    print(f"{len(found)} mutants in {took:.0f} s, {len(wrong)} not killed: {' '.join(map(str, wrong))}")
-    return int(bool(wrong))
+    print(f"{len(numbers)} mutants in {took:.0f} s, {len(failed)} not killed: {' '.join(failed)}")
+    return int(bool(failed))
