@@ -21,7 +21,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from random import Random
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,20 +166,15 @@ def localize(model: DejaVu, queries: Traverse, random: Random) -> None:
 def same_model(first: DejaVu, second: DejaVu) -> bool:
     """Whether two maps hold the same tensors and settings."""
     (tensors, header), (others, other) = contents_of(first), contents_of(second)
-    if (
-        json.dumps(header, sort_keys=True) != json.dumps(other, sort_keys=True)
-        or tensors.keys() != others.keys()
-    ):
+    headers = {json.dumps(one, sort_keys=True) for one in (header, other)}
+    if len(headers) > 1 or tensors.keys() != others.keys():
         return False
     return all(same_tensor(tensors[name], others[name]) for name in tensors)
 
 
 def same_tensor(one: Tensor, other: Tensor) -> bool:
-    return (
-        one.dtype == other.dtype
-        and one.shape == other.shape
-        and torch.equal(one.nan_to_num(), other.nan_to_num())
-    )
+    alike = one.dtype == other.dtype and one.shape == other.shape
+    return alike and torch.equal(one.nan_to_num(), other.nan_to_num())
 
 
 # maps -----------------------------------------------------------------------------------------------------
@@ -188,12 +182,6 @@ def same_tensor(one: Tensor, other: Tensor) -> bool:
 
 def pick_map(case: Case) -> Path:
     return case.random.choice(sorted(case.made(maps).glob("*.safetensors")))
-
-
-def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header of a valid map."""
-    tensors, header = map_file.read_map(path)
-    return tensors, header
 
 
 def sealed(tensors: dict[str, Tensor], header: str) -> bytes:
@@ -209,7 +197,7 @@ def sealed(tensors: dict[str, Tensor], header: str) -> bytes:
 
 def crafted(random: Random, path: Path) -> bytes:
     """A map whose content is another, sealed again."""
-    tensors, header = contents(path)
+    tensors, header = map_file.read_map(path)
     act = random.random()
     text = json_text(header)
     if act < 0.6:
@@ -285,24 +273,31 @@ def map_commands(case: Case) -> None:
 def codec(case: Case) -> None:
     random = case.random
     rows, columns = random.randint(1, 30), random.randint(1, 8)
-    levels = torch.tensor([[int(random.gauss(0, 9)) for _ in range(columns)] for _ in range(rows)]).to(
-        torch.int8
-    )
+    numbers = [int(random.gauss(0, 9)) for _ in range(rows * columns)]
+    levels = torch.tensor(numbers).view(rows, columns).to(torch.int8)
     stream = encode(levels)
     data, checksum, sizes = bytes(stream.bytes.tolist()), stream.checksum, [rows, columns]
     act = random.random()
     if act < 0.5:
         data = mutate_bytes(random, data)
     elif act < 0.9:
-        sizes[random.randrange(2)] = random.choice(
-            (0, -1, rows + 1, columns - 1, 1000, 10**6, 10**9, 2**31, 2**62)
-        )
+        odd = (0, -1, rows + 1, columns - 1, 1000, 10**6, 10**9, 2**31, 2**62)
+        sizes[random.randrange(2)] = random.choice(odd)
     else:
         checksum = random.choice((0, -1, checksum ^ 1, 2**62))
     case.begin()
     found = decode(Stream(torch.tensor(list(data), dtype=torch.uint8), checksum), *sizes)
     if sizes != [rows, columns] or not torch.equal(found, levels):
         raise Wrong("a damaged stream decodes to other levels")
+
+
+def rewritten(data: bytes, packing: int, change: Callable[[str, bytes], bytes]) -> bytes:
+    """A whole archive whose files, by name, hold something else."""
+    written = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(written, "w") as new:
+        for name in old.namelist():
+            new.writestr(zipfile.ZipInfo(name), change(name, old.read(name)), packing)
+    return written.getvalue()
 
 
 # checkpoints ----------------------------------------------------------------------------------------------
@@ -313,16 +308,14 @@ def mutated_checkpoint(random: Random, data: bytes) -> tuple[bytes, bool]:
     act = random.random()
     if act < 0.4:
         return mutate_bytes(random, data), False
-    if act < 0.6:  # in the files of the archive, which is whole
-        written = io.BytesIO()
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(written, "w") as new:
-            chosen = random.choice(old.namelist())
-            for name in old.namelist():
-                held = old.read(name)
-                if name == chosen:
-                    held = random.choice(PICKLES) if random.random() < 0.3 else mutate_bytes(random, held)
-                new.writestr(zipfile.ZipInfo(name), held)
-        return written.getvalue(), True
+    if act < 0.6:
+        names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+        chosen, pickle = random.choice(names), random.choice((*PICKLES, *[b""] * 7))
+
+        def change(name: str, held: bytes) -> bytes:
+            return held if name != chosen else pickle or mutate_bytes(random, held)
+
+        return rewritten(data, zipfile.ZIP_STORED, change), True
     held = torch.load(io.BytesIO(data), weights_only=True)
     plain = {name: value for name, value in held.items() if name not in ("state_dict", "optimizer_states")}
     if random.random() < 0.5:
@@ -370,9 +363,8 @@ def train_commands(case: Case) -> None:
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
     random, data = case.random, Path("in/last.ckpt")
     fit, resume = ["train", "fit", "--config", "in/train.yaml"], ["--ckpt_path", "in/last.ckpt"]
-    words = random.choice(
-        (fit, [*fit, *resume], *(["train", one, *fit[2:], *resume] for one in ("validate", "export")))
-    )
+    others = (["train", one, *fit[2:], *resume] for one in ("validate", "export"))
+    words = random.choice((fit, [*fit, *resume], *others))
     act = random.random()
     if act < 0.4:
         data.write_bytes(mutated_checkpoint(random, data.read_bytes())[0])
@@ -408,9 +400,8 @@ def mutated_yaml(random: Random, text: str) -> bytes:
 def config(case: Case) -> None:
     random = case.random
     text = (FOLDER / f"{random.choice(('default', 'local_maxima', 'paper'))}.yaml").read_text()
-    text = "\n".join(
-        line.partition("#")[0].rstrip() for line in text.splitlines() if line.partition("#")[0].strip()
-    )
+    lines = [line.partition("#")[0].rstrip() for line in text.splitlines()]
+    text = "\n".join(filter(str.strip, lines))
     Path("in/config.yaml").write_bytes(mutated_yaml(random, text))
     learn = ["in/frames.npy", "--map", "out/m.safetensors"]
     compare = ["in/frames.npy", "in/query.npy", "--out", "out/report"]
@@ -422,9 +413,7 @@ def config(case: Case) -> None:
     parse(name, getattr(commands, f"run_{name}"), [*words, "--config", chosen])
 
 
-LINES = [
-    line.split()
-    for line in """
+LINES = """
 learn in/frames.npy --map out/m.safetensors
 learn in/features.npy --map out/m.safetensors --threshold 0.5 --batch_size 16
 learn in/photos?width=12 --map out/m.safetensors --features.cell 4 --whitening none
@@ -459,16 +448,12 @@ reproduce aerial --out out/paper --tolerance 4
 learn --help
 learn in/frames.npy --map out/m.safetensors --print_config
 """.strip().splitlines()
-]
-SLOW_LINES = [
-    line.split()
-    for line in """
+SLOW_LINES = """
 compare in/frames.npy in/query.npy --out out/report --truth 0 --tolerance 2
 compare in/frames.npy in/query.npy --out out/r --map in/spectral.safetensors --top 2
 compare in/features.npy in/features.npy --out out/r --config local_maxima --leave_out 3
 compare in/frames.npy in/query.npy --out out/r --truth 0 --distractors in/photos --precision .9 --filter
 """.strip().splitlines()
-]
 
 
 def groups(line: Sequence[str]) -> list[list[str]]:
@@ -500,7 +485,7 @@ in/empty in/a_file in out missing utm:25 in/last.ckpt in/fifo.csv in/fifo.npy in
 --out in/query.npy --out in/spectral.safetensors --out in/truth.csv --out in
 """
 OTHERS = [
-    *(group for line in (*LINES, *SLOW_LINES, ODD_WORDS.split()) for group in groups(line)),
+    *(group for line in (*LINES, *SLOW_LINES, ODD_WORDS) for group in groups(line.split())),
     *(["x" * 300 + ".safetensors"], ["\udcff.npy"], [""], ["--out", "\udcff.csv"], ["--out", "a\nb.csv"]),
 ]
 TRAIN_WORDS = """
@@ -522,11 +507,12 @@ def copy_inputs(case: Case) -> None:
     Path("in/loop.npy").symlink_to("loop.npy")
 
 
-def run_words(case: Case, lines: Sequence[Sequence[str]]) -> None:
+def run_words(case: Case, lines: Sequence[str]) -> None:
     """A mutated command line; what takes minutes is not begun."""
     copy_inputs(case)
-    line = case.random.choice(lines)
-    own = [group for other in lines if other[0] == line[0] for group in groups(other[1:])] or OTHERS
+    split = [line.split() for line in lines]
+    line = case.random.choice(split)
+    own = [group for other in split if other[0] == line[0] for group in groups(other[1:])] or OTHERS
     words = [line[0], *mutate_words(case.random, line[1:], case.random.choice((own, OTHERS)))]
     if case.random.random() < 0.05:
         words = mutate_words(case.random, line, OTHERS)
@@ -558,9 +544,8 @@ def slow_command_lines(case: Case) -> None:
 def npy(case: Case) -> None:
     random, path = case.random, Path("in/array.npy")
     noise = np.random.default_rng(random.randrange(2**32))
-    array = random.choice(
-        (pictures(9, 8), noise.normal(size=(9, 5)).astype(np.float32), noise.random((4, 1, 8, 8)))
-    )
+    features, frames = noise.normal(size=(9, 5)).astype(np.float32), noise.random((4, 1, 8, 8))
+    array = random.choice((pictures(9, 8), features, frames))
     written = io.BytesIO()
     act = random.random()
     if act < 0.2:
@@ -586,10 +571,8 @@ def npy(case: Case) -> None:
         text = mutate_text(random, data[10 : data.index(b"\n")].decode().rstrip()) + b"\n"
         if random.random() < 0.5:
             shape = ", ".join(str(random.choice((*NUMBERS[:16], 3))) for _ in range(random.randint(0, 5)))
-            text = (
-                f"{{'descr': '{random.choice(('|u1', '<f4', 'O', '<f8'))}', 'fortran_order': False, ".encode()
-            )
-            text += f"'shape': ({shape}), }}\n".encode()
+            kind = random.choice(("|u1", "<f4", "O", "<f8"))
+            text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': ({shape}), }}\n".encode()
         version = random.choice((b"\1\0", b"\1\0", b"\2\0", b"\3\0", b"\x09\0"))
         length = struct.pack("<H" if version == b"\1\0" else "<I", len(text) % 65536)
         data = b"\x93NUMPY" + version + length + text + data[data.index(b"\n") + 1 :]
@@ -608,12 +591,8 @@ def png_of(width: int, height: int, kind: int, depth: int, data: bytes) -> bytes
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
     header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(data))
-        + chunk(b"IEND", b"")
-    )
+    parts = (b"IHDR", header), (b"IDAT", zlib.compress(data)), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(name, held) for name, held in parts)
 
 
 def mutated_image(random: Random, folder: Path) -> tuple[str, bytes]:
@@ -631,9 +610,8 @@ def mutated_image(random: Random, folder: Path) -> tuple[str, bytes]:
         Image.fromarray(values).save(written, "tiff")
         return ".tif", written.getvalue()
     if act < 0.2:
-        head = (
-            f"P{random.choice('123456789')}\n{random.choice(NUMBERS)} {random.choice((24, 9000, -1))}\n255\n"
-        )
+        side = random.choice((24, 9000, -1))
+        head = f"P{random.choice('123456789')}\n{random.choice(NUMBERS)} {side}\n255\n"
         return random.choice((".pgm", ".ppm")), head.encode() + bytes(1000)
     suffix = random.choice((path.suffix, path.suffix, path.suffix, ".png", ".tif", ".webp", ".pgm"))
     return suffix, mutate_bytes(random, path.read_bytes())
@@ -647,9 +625,8 @@ def image_folder(case: Case) -> None:
         shutil.copy(case.made(images) / "colour.png", folder / f"{i}.png")
     for _ in range(random.choice((1, 1, 3))):
         suffix, data = mutated_image(random, case.made(images))
-        name = random.choice(
-            ("5", "5", "5", "a\nb", "é", "\udcff", "\x1b[31m", "٣", "1" * 200, "9" * 249, "-", " ")
-        )
+        odd_names = ("a\nb", "é", "\udcff", "\x1b[31m", "٣", "1" * 200, "9" * 249, "-", " ")
+        name = random.choice(("5", "5", "5", *odd_names))
         (folder / f"{name}{suffix}").write_bytes(data)
     odd = random.random()
     if odd < 0.1:
@@ -786,6 +763,16 @@ def truth_table(case: Case) -> None:
     judge(case, "in/truth.csv")
 
 
+def changed_array(random: Random, held: bytes) -> bytes:
+    """A .npy of (30,12) with other bytes, with another shape, or as it is."""
+    if random.random() < 0.5:
+        return mutate_bytes(random, held)
+    if random.random() < 0.5:
+        return held
+    shape = f"({random.choice((30, 10**5, 10**6, 10**12))}, {random.choice((12, 10**6, -1))})"
+    return held.replace(b"(30, 12), }" + b" " * len(shape), shape.encode() + b", }" + b" " * 8)
+
+
 @reader("truth matrices", share=1)
 def truth_matrices(case: Case) -> None:
     random, path = case.random, Path("in/truth.npz")
@@ -804,23 +791,8 @@ def truth_matrices(case: Case) -> None:
     data = path.read_bytes()
     if act > 0.7:
         data = mutate_bytes(random, data)
-    elif act > 0.4:  # in the files of the archive, which is whole
-        written = io.BytesIO()
-        with (
-            zipfile.ZipFile(io.BytesIO(data)) as old,
-            zipfile.ZipFile(written, "w") as new,
-        ):
-            for name in old.namelist():
-                held = old.read(name)
-                if random.random() < 0.5:
-                    held = mutate_bytes(random, held)
-                elif random.random() < 0.5:
-                    shape = f"({random.choice((30, 10**5, 10**6, 10**12))}, {random.choice((12, 10**6, -1))})"
-                    held = held.replace(
-                        b"(30, 12), }" + b" " * len(shape), shape.encode() + b", }" + b" " * 8
-                    )
-                new.writestr(zipfile.ZipInfo(name), held, zipfile.ZIP_DEFLATED)
-        data = written.getvalue()
+    elif act > 0.4:
+        data = rewritten(data, zipfile.ZIP_DEFLATED, lambda _, held: changed_array(random, held))
     path.write_bytes(data)
     judge(case, str(path))
 
@@ -828,9 +800,8 @@ def truth_matrices(case: Case) -> None:
 @reader("truth text", share=1)
 def truth_text(case: Case) -> None:
     random = case.random
-    text = mutate_text(random, random.choice(("0", "-1", "12", "utm", "utm:25", "in/truth.csv"))).decode(
-        errors="surrogateescape"
-    )
+    plain = random.choice(("0", "-1", "12", "utm", "utm:25", "in/truth.csv"))
+    text = mutate_text(random, plain).decode(errors="surrogateescape")
     names = [f"@{i}@{2 * i}@.png" for i in range(12)]
     if random.random() < 0.6:
         at = random.randrange(12)
@@ -844,18 +815,9 @@ def truth_text(case: Case) -> None:
 def judge(case: Case, truth: str, traverse: Traverse | None = None) -> None:
     """Twelve matches by a truth."""
     random = case.random
-    traverses = SimpleNamespace(length=30, place=None) if traverse is None else traverse
-    resampled = random.random() < 0.2
-    interpolate = random.random() < 0.3
+    resampled, interpolate = random.random() < 0.2, random.random() < 0.3
     case.begin()
-    known = find_ground_truth(
-        truth,
-        *((None, None) if traverses is not traverse else (traverse, traverse)),
-        30,
-        12,
-        interpolate,
-        resampled,
-    )
+    known = find_ground_truth(truth, traverse, traverse, 30, 12, interpolate, resampled)
     if known is None:
         raise Wrong("a truth that is given is none")
     if len(known.positives) != 12 or int(known.positives.max()) >= 30 or int(known.positives.min()) < -1:
