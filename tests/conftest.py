@@ -37,35 +37,15 @@ settings.load_profile("repeatable")
 # whole commands, trainings, real footage and notebooks: not in a developer's inner loop
 SLOW = (
     *("training", "benchmarks", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
-    *("test_real_routes", "test_golden"),
-    *(
-        "test_periods_on_real_data",
-        "test_spectral_model",
-        "test_model_export",
-        "data/test_simulate_railway",
-        "evaluation/test_pictures",
-    ),
+    *("test_real_routes", "test_golden", "test_periods_on_real_data", "test_spectral_model"),
+    *("test_model_export", "data/test_simulate_railway", "evaluation/test_pictures"),
 )
-
-
 # modules that run whole commands again and again
 FEW_VIEWS = {
     *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_resampling", "test_several_places"),
-    *(
-        "test_cli_growth",
-        "test_faults",
-        "test_readme",
-        "test_memory_bench",
-        "test_scale",
-        "test_demo",
-        "test_cli_networks",
-        "test_pretrained",
-        "test_cli_rejection",
-        "test_onnx_export",
-        "test_reproduce",
-        "test_routes",
-        "test_spectral_training",
-    ),
+    *("test_cli_growth", "test_faults", "test_readme", "test_memory_bench", "test_scale", "test_demo"),
+    *("test_cli_networks", "test_pretrained", "test_cli_rejection", "test_onnx_export", "test_reproduce"),
+    *("test_routes", "test_spectral_training"),
 }
 PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes"}
 

@@ -52,16 +52,7 @@ RELATIVE = 2e-3  # of sizes of other methods, and of what is no share of the que
 # counts of queries; shares of them are within the same, divided by the queries
 COUNTED = {"accepted", "accepted_right", "0.9", "0.5"}
 EXACT = {
-    "queries",
-    "frames",
-    "judged",
-    "with_answer",
-    "tolerance",
-    "sequence",
-    "start",
-    "stop",
-    "k",
-    "unknown",
+    *("queries", "frames", "judged", "with_answer", "tolerance", "sequence", "start", "stop", "k", "unknown")
 }
 LOOSE = {"lines": 0.02, "noise_over_map": 0.02, "null_over_map": 0.1, "threshold_of_full_precision": 0.02}
 SCORE = 1e-4  # of scores and probabilities in matches.csv
