@@ -169,18 +169,6 @@ def test_a_mapper_that_does_not_fit_is_refused() -> None:
         TemplateMapper(nn.Linear(2, 2))  # type: ignore[arg-type]
 
 
-def test_templates_become_parameters_by_an_argument() -> None:
-    wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])
-    model = DejaVu(mapper=TemplateMapper(trainable=True)).learn(wave)
-    assert [name for name, _ in model.map.named_parameters()] == ["templates"]
-    model(wave[:3] + 0.1).logsumexp(1).sum().backward()
-    gradient = dict(model.named_parameters())["map.templates"].grad
-    assert gradient is not None
-    assert gradient.abs().max() > 0
-    plain = template_model().learn(wave)
-    assert torch.equal(model(wave), plain(wave))
-
-
 def test_a_trainable_map_is_saved_loaded_and_compared(tmp_path: Path) -> None:
     wave = torch.arange(128)[:, None] % torch.tensor([8.0, 9.0]) + 0.01 * torch.rand(128, 2)
     model = DejaVu(mapper=TemplateMapper(trainable=True)).learn(wave)
@@ -208,16 +196,6 @@ def test_a_state_that_is_refused_leaves_the_map_as_it_was(change: str) -> None:
     with refused("map"):
         model.map.load_state_dict(state)
     assert torch.equal(model(wave), expected)
-
-
-def test_the_names_of_frames_are_part_of_the_state() -> None:
-    model = DejaVu().learn(torch.rand(64, 2))
-    model.frame_names = [f"{i:04}.png" for i in range(64)]
-    again = DejaVu()
-    again.load_state_dict(model.state_dict())
-    assert (again.frame_name(7), again.map.places) == ("0007.png", 64)
-    again.load_state_dict(DejaVu().learn(torch.rand(32, 2)).state_dict())
-    assert (again.frame_name(7), again.map.places) == ("", 32)
 
 
 class Foreign(PeriodFinder):

@@ -12,7 +12,6 @@ from torch import Tensor
 from dejavu_torch import DejaVu, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
-from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.views import Views, augmented_route
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import second_traverse
@@ -206,15 +205,6 @@ def test_copies_are_the_same_however_frames_are_read() -> None:
     whole, part = ArrayTraverse(frames[10:310]), FrameRange(ArrayTraverse(frames), 10, 310)
     own, other = (augmented_route(one, 300, copies=2, most=200, strengths={})[0] for one in (whole, part))
     assert torch.equal(all_of(own.traverse), all_of(other.traverse))
-
-
-def test_networks_are_described_in_eval_mode() -> None:
-    route = ArrayTraverse(torch.rand(40, 3, 32, 32), "noise")
-    network = SmallCNN(16, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4).train()
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    DejaVu(network, whitening=Whitening(), mapper=SpectralMapper(20.0)).learn(route)
-    assert not network.training
-    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 
 @pytest.mark.parametrize("frames", [torch.zeros(20, 1, 32, 32), torch.rand(1, 1, 32, 32)])
