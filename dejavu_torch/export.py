@@ -150,8 +150,7 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
     path = Path(path)
     check_output_file(path)
     _require_packages()
-    if not model.map.places:
-        raise InputError("there is no map yet; expected learn(...) or load(...) first")
+    model.require_map()
     if model.map.routes:
         routes = ", ".join(route.name for route in model.map.routes)
         raise InputError(f"the map has the routes {routes}; expected to export the map of each")
