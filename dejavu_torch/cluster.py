@@ -298,14 +298,9 @@ def _modules_of(value: object) -> Iterator[ModuleType]:
             yield from _modules_of(one)
     for part in value.modules() if isinstance(value, nn.Module) else [value]:
         found = part if isinstance(part, ModuleType) else sys.modules.get(type(part).__module__)
-        if found is not None and _is_own(found):
+        file = getattr(found, "__file__", None)
+        if found is None or file is None or found.__name__.split(".")[0] in ("__main__", "dejavu_torch"):
+            continue
+        installed = {Path(place).resolve() for place in sysconfig.get_paths().values()}
+        if not any(Path(file).resolve().is_relative_to(place) for place in installed):
             yield found
-
-
-def _is_own(module: ModuleType) -> bool:
-    """Whether a module is a file of the user's, and not one that is installed."""
-    file = getattr(module, "__file__", None)
-    if file is None or module.__name__ == "__main__" or module.__name__.split(".")[0] == "dejavu_torch":
-        return False
-    installed = {Path(place).resolve() for place in sysconfig.get_paths().values()}
-    return not any(Path(file).resolve().is_relative_to(place) for place in installed)

@@ -105,12 +105,6 @@ def test_features_that_repeat_are_found_exactly() -> None:
     assert match.accepted.all()
 
 
-def test_frames_that_repeat_are_found() -> None:
-    model = wave_model(features=HOG(block=1)).learn(pictures())
-    assert model.localize(pictures()).index.tolist() == list(range(72))
-    assert model(pictures(5)).shape == (5, 72)
-
-
 @pytest.mark.parametrize("make", [waves, pictures])
 @pytest.mark.parametrize("batch_size", [1, 7])
 def test_tensors_traverses_and_batch_sizes_agree(make: Any, batch_size: int) -> None:
@@ -125,27 +119,6 @@ def test_tensors_traverses_and_batch_sizes_agree(make: Any, batch_size: int) -> 
         found = other.localize(source)
         assert torch.equal(found.index, expected.index)
         torch.testing.assert_close(found.score, expected.score)
-
-
-def test_byte_frames_are_frames() -> None:
-    pixels = (pictures()[:, 0] * 255).byte()
-    model = wave_model(features=HOG(block=1)).learn(pixels)
-    assert model.frame_shape == (1, *pixels.shape[1:])
-    assert model.localize(pixels).index.tolist() == list(range(72))
-
-
-def test_learn_returns_the_model_and_relearning_replaces_the_map() -> None:
-    model = wave_model()
-    assert model.learn(waves()) is model
-    assert model.learn(pictures(90)) is model
-    assert (model.map.places, model.map.dimension, model.frame_shape) == (
-        90,
-        3 * 36,
-        tuple(pictures().shape[1:]),
-    )
-    fresh = wave_model().learn(pictures(90))
-    assert model.map.plan == fresh.map.plan
-    assert torch.equal(model(pictures(3)), fresh(pictures(3)))
 
 
 def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path: Path) -> None:
@@ -321,20 +294,6 @@ def test_gradients_reach_the_weights_of_the_backbone() -> None:
             assert gradient.abs().max() > 0
 
 
-def test_a_flat_image_has_finite_gradients() -> None:
-    model = wave_model().learn(pictures())
-    frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
-    model(frames).sum().backward()
-    assert frames.grad is not None
-    assert frames.grad.isfinite().all()
-
-
-def test_localize_and_learn_leave_no_graph() -> None:
-    model = template_model(Tiny(), layers(8)).learn(pictures().requires_grad_())
-    assert not model.map.templates.requires_grad
-    assert not model.localize(pictures(3).requires_grad_()).score.requires_grad
-
-
 # a module like any other
 
 
@@ -348,13 +307,6 @@ def test_state_dict_goes_into_a_fresh_model() -> None:
     smaller = template_model(Tiny(), layers(5, features=2)).learn(pictures(80))
     smaller.load_state_dict(model.state_dict())
     assert smaller.map.plan == model.map.plan
-
-
-def test_scores_ignore_autocast() -> None:
-    model = wave_model().learn(waves() / 3)
-    with torch.autocast("cpu", torch.bfloat16):
-        scores = model(waves() / 3)
-    assert torch.equal(scores, model(waves() / 3))
 
 
 # memory
@@ -373,35 +325,12 @@ def test_few_scores_are_held_at_once(monkeypatch: pytest.MonkeyPatch, at_once: i
     assert largest.numbers <= max(at_once, 72, query.numel())
 
 
-def test_memory_does_not_grow_with_the_number_of_queries() -> None:
-    model = wave_model(batch_size=16).learn(waves())
-    largest = []
-    for queries in (100, 1000):
-        with Largest() as seen:
-            assert sum(
-                len(match.index) for match in model.matches(Stream(lambda at: waves()[at % 72], queries))
-            )
-        largest.append(seen.numbers)
-    assert largest[0] == largest[1] <= 16 * 72
-
-
 def test_nothing_of_queries_times_phases_times_features_is_built() -> None:
     features, phases, queries = 50, 8 + 9, 40
     model = template_model(periods=layers(8, 9, features=features)).learn(torch.rand(72, features))
     with Largest() as seen:
         model.localize(torch.rand(queries, features))
     assert seen.numbers < queries * phases * features / 4
-
-
-def test_queries_are_read_as_they_are_matched() -> None:
-    model = wave_model(batch_size=4).learn(waves())
-    stream = Stream(lambda at: waves()[at % 72], 400)
-    matches = model.matches(stream)
-    assert next(matches).index.tolist() == [0, 1, 2, 3]
-    before = stream.given
-    assert before <= 4
-    assert next(matches).index.tolist() == [4, 5, 6, 7]
-    assert stream.given == before + 1
 
 
 # a route in which nothing repeats, and bad input
@@ -602,3 +531,46 @@ def on_waves(query: Tensor) -> Any:
 def test_what_is_refused(use: Any, words: tuple[str, ...]) -> None:
     with refused(*words):
         use()
+
+
+def test_frames_of_floats_and_of_bytes_are_found() -> None:
+    pixels = (pictures()[:, 0] * 255).byte()
+    for frames in (pictures(), pixels):
+        model = wave_model(features=HOG(block=1)).learn(frames)
+        assert model.frame_shape == (1, *pixels.shape[1:])
+        assert model.localize(frames).index.tolist() == list(range(72))
+
+
+def test_relearning_replaces_the_map() -> None:
+    model, fresh = wave_model().learn(waves()), wave_model().learn(pictures(90))
+    assert model.learn(pictures(90)) is model
+    assert (model.map.places, model.frame_shape) == (90, tuple(pictures().shape[1:]))
+    assert torch.equal(model(pictures(3)), fresh(pictures(3)))
+
+
+def test_queries_are_read_as_they_are_matched_in_constant_memory() -> None:
+    model = wave_model(batch_size=4).learn(waves())
+    stream, numbers = Stream(lambda at: waves()[at % 72], 400), set()
+    for i, match in enumerate(model.matches(stream)):
+        assert match.index.tolist() == [(4 * i + j) % 72 for j in range(4)]
+        assert stream.given <= i + 4
+    for queries in (100, 1000):
+        with Largest() as seen:
+            assert len([*model.matches(Stream(lambda at: waves()[at % 72], queries))]) == queries // 4
+        numbers.add(seen.numbers)
+    assert len(numbers) == 1
+    assert numbers.pop() <= 4 * 72
+
+
+def test_a_flat_image_has_finite_gradients_and_no_graph_is_left() -> None:
+    model = wave_model().learn(pictures().requires_grad_())
+    frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
+    features = model.describe(frames).detach()
+    with torch.autocast("cpu", torch.bfloat16):
+        scores = model(features)
+    assert torch.equal(scores, model(features))  # which ignore it
+    model(frames).sum().backward()
+    assert frames.grad is not None
+    assert frames.grad.isfinite().all()
+    assert not model.map.templates.requires_grad
+    assert not model.localize(frames).score.requires_grad

@@ -66,15 +66,12 @@ def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Tra
     descriptors = model.whitened(model.describe(frames))
     assert torch.allclose(model.map.scores(descriptors), scores)
     assert torch.equal(model.localize_descriptors(descriptors).index, scores.argmin(1))
-    assert torch.allclose(next(model.describer.descriptors(ArrayTraverse(frames, "eight"))), descriptors)
-
-
-def test_gradients_reach_the_frames(model: DejaVu, second: Traverse) -> None:
-    frames = next(iter(second.batches(4))).requires_grad_()
+    frames = frames[:4].clone().requires_grad_()
     model(frames).amin(1).sum().backward()
     assert frames.grad is not None
     assert frames.grad.isfinite().all()
     assert frames.grad.abs().max() > 0
+    assert torch.allclose(next(model.describer.descriptors(ArrayTraverse(frames, "eight"))), descriptors)
 
 
 def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
@@ -144,7 +141,7 @@ def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_
     other.take_whitening(known)
     other.learn(open_source(f"sim:aerial?frames={FRAMES}&traverse=1"))
     states = [one.state_dict()["whitening.projection"] for one in (model, other)]
-    assert torch.equal(*states)
+    assert torch.equal(*states)  # fixed
     found = other.localize(reference).index
     assert ((found - torch.arange(FRAMES)).abs() <= 5).float().mean() > 0.9
 
@@ -156,15 +153,6 @@ def test_a_failed_relearning_keeps_map_and_whitening(reference: Traverse, second
     with refused("route_bytes_per_place is 200"):
         model.learn(open_source("sim:aerial?frames=40"))  # 10 numbers
     assert torch.equal(model(frames), before)
-
-
-def test_a_fixed_whitening_is_kept(model: DejaVu, second: Traverse) -> None:
-    assert model.whitening is not None
-    whitening = Whitening()
-    whitening.load_state_dict(model.whitening.state_dict())
-    whitening.fixed = True
-    DejaVu(whitening=whitening, mapper=SpectralMapper()).learn(second)
-    assert torch.equal(whitening.projection, model.whitening.projection)
 
 
 def test_two_features_beside_a_larger_drift_are_localized() -> None:
