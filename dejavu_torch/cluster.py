@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from dejavu_torch.data.output import SIGNALS
-from dejavu_torch.learning import ChunkCoder, in_one_thread
+from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.search import Best, empty_topk, merge_topk, search
@@ -85,11 +85,7 @@ class Cluster:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the connection, and the workers that `auto` started."""
-        self.ray.shutdown()
+        self.ray.shutdown()  # with the workers that `auto` started
 
     def run(
         self, function: Callable[..., Iterable[Any]], tasks: Sequence[Any], *shared: object
@@ -125,7 +121,7 @@ class Cluster:
         except self.ray.exceptions.RayTaskError:  # an error of ours
             raise
         except self.ray.exceptions.RayError as error:
-            seen = f"its worker died, {RETRIES + 1} times ({_brief(error)})"
+            seen = f"its worker died, {RETRIES + 1} times ({one_line(error)[:100]})"
             return [], Failure(f"{seen}; expected workers that live, and memory for them", None)
 
 
@@ -161,7 +157,8 @@ def code_on(
     with tqdm(
         total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False
     ) as bar:
-        for task, made, failure in cluster.run(_coded, tasks, coder, traverse):
+        runs = cluster.run(lambda task, coder, source: coder.chunks(source, task), tasks, coder, traverse)
+        for task, made, failure in runs:
             done |= zip(task, made, strict=False)
             bar.update(sum(chunk.places for chunk in made))
             if failure is not None:
@@ -175,12 +172,6 @@ def code_on(
                 start, stop = coder.span(rest)
                 read = "" if failure.host is None else f", read on {failure.host}"
                 raise InputError(f"frames {start} to {stop - 1}{read}: {failure.why}")
-
-
-def _coded(task: range, coder: ChunkCoder, traverse: Traverse) -> Iterator[Chunk]:
-    """Chunks, by a worker."""
-    with in_one_thread():
-        yield from coder.chunks(traverse, task)
 
 
 class ClusterSearch:
@@ -220,7 +211,7 @@ class ClusterSearch:
                 [actor.search.remote(queries.cpu().numpy(), n) for actor in self.actors]
             )
         except self.cluster.ray.exceptions.RayError as error:
-            seen = f"a worker died with its part of the map ({_brief(error)})"
+            seen = f"a worker died with its part of the map ({one_line(error)[:100]})"
             raise InputError(f"{seen}; expected workers that live, and memory for it") from error
         found = [(torch.from_numpy(score.copy()), torch.from_numpy(place.copy())) for score, place in answers]
         return reduce(merge_topk, found[1:], merge_topk(empty_topk(queries.cpu(), n), found[0]))
@@ -255,11 +246,6 @@ def check_installed() -> Any:
         raise InputError(
             f"Ray is not there ({one_line(error)}); expected it: pip install 'dejavu_torch[cluster]'"
         ) from error
-
-
-def _brief(error: Exception) -> str:
-    """What Ray says of itself at length, in few words."""
-    return one_line(error)[:100]
 
 
 def _processors() -> int:
@@ -312,14 +298,9 @@ def _modules_of(value: object) -> Iterator[ModuleType]:
             yield from _modules_of(one)
     for part in value.modules() if isinstance(value, nn.Module) else [value]:
         found = part if isinstance(part, ModuleType) else sys.modules.get(type(part).__module__)
-        if found is not None and _is_own(found):
+        file = getattr(found, "__file__", None)
+        if found is None or file is None or found.__name__.split(".")[0] in ("__main__", "dejavu_torch"):
+            continue
+        installed = {Path(place).resolve() for place in sysconfig.get_paths().values()}
+        if not any(Path(file).resolve().is_relative_to(place) for place in installed):
             yield found
-
-
-def _is_own(module: ModuleType) -> bool:
-    """Whether a module is a file of the user's, and not one that is installed."""
-    file = getattr(module, "__file__", None)
-    if file is None or module.__name__ == "__main__" or module.__name__.split(".")[0] == "dejavu_torch":
-        return False
-    installed = {Path(place).resolve() for place in sysconfig.get_paths().values()}
-    return not any(Path(file).resolve().is_relative_to(place) for place in installed)

@@ -31,7 +31,6 @@ from dejavu_torch.types import InputError, SequenceModel
 from dejavu_torch.version import __version__
 
 OPSET = 18
-PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 METADATA = "dejavu_torch"  # the key of the file's metadata whose value is a JSON mapping
 MOST_BYTES = 2**31 - 2**24  # of the constants: protobuf writes files below 2 GB
 TOLERANCE = 1e-3  # of the file's scores beside torch's, relative above 1
@@ -149,9 +148,16 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
     """
     path = Path(path)
     check_output_file(path)
-    _require_packages()
-    if not model.map.places:
-        raise InputError("there is no map yet; expected learn(...) or load(...) first")
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # onnxruntime's: it is for its user to switch on
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        try:
+            import_module(name)
+        except ImportError as error:
+            raise InputError(
+                f"an export needs {name}, which cannot be imported ({one_line(error)}); "
+                "expected it to be there: pip install 'dejavu_torch[export]'"
+            ) from error
+    model.require_map()
     if model.map.routes:
         routes = ", ".join(route.name for route in model.map.routes)
         raise InputError(f"the map has the routes {routes}; expected to export the map of each")
@@ -220,18 +226,6 @@ def run_session(session: Any, frames: Tensor) -> Tensor:
         scores, state = session.run(None, {name: frame[None], "state": state})
         found.append(torch.from_numpy(scores))
     return torch.cat(found)
-
-
-def _require_packages() -> None:
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # onnxruntime's: it is for its user to switch on
-    for name in PACKAGES:
-        try:
-            import_module(name)
-        except ImportError as error:
-            raise InputError(
-                f"an export needs {name}, which cannot be imported ({one_line(error)}); "
-                "expected it to be there: pip install 'dejavu_torch[export]'"
-            ) from error
 
 
 def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:

@@ -248,9 +248,8 @@ def one_route(model: DejaVu, verb: str) -> SpectralMap:
     Raises:
         InputError: no map, one of another kind, or one of several routes.
     """
+    model.require_map()
     route = model.map
-    if not route.places:
-        raise InputError(f"there is no map to {verb}; expected learn(...) or load(...) first")
     if route.routes:
         names = ", ".join(one.name for one in route.routes)
         seen = f"the map is merged of the routes {names}"

@@ -80,11 +80,7 @@ class Describer(NamedTuple):
         return features if self.whitening is None else self.whitening(features)
 
     def require_learning(self, name: str) -> None:
-        """Refuse a second traverse that no whitening learns from.
-
-        Raises:
-            InputError: naming it.
-        """
+        """Refuse a second traverse, by its name, that no whitening learns from."""
         if self.whitening is None or self.whitening.fixed:
             seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
             raise InputError(f"{seen} to learn from {name}; expected one that is learned")
@@ -155,11 +151,7 @@ class Describer(NamedTuple):
         return frames > SAMPLE and frames * one.nbytes > IN_MEMORY
 
     def visits(self, views: Views, dimension: int, progress: str | None = None) -> tuple[Tensor, Tensor]:
-        """Descriptors (n,K) of the frames that show a place, and these places (n,).
-
-        Raises:
-            InputError: descriptors of another dimension or number, or that are not finite.
-        """
+        """Descriptors (n,K) of the frames that show a place, and these places (n,); others are refused."""
         name = views.traverse.name
         rows = concatenate(self.descriptors(views.traverse, progress and "averaging"))
         if rows.shape != (len(views.places), dimension):
@@ -169,6 +161,10 @@ class Describer(NamedTuple):
             raise InputError(f"{name} gives NaN or infinite descriptors; expected finite numbers")
         shown = views.places.to(rows.device) >= 0
         return rows[shown], views.places[shown.to(views.places.device)]
+
+    def averaged(self, rows: Tensor, visits: Views, progress: str | None = None) -> Tensor:
+        """Descriptors (N,K) of places, averaged with those of visits to them."""
+        return with_visits(rows.float(), torch.ones(len(rows)), *self.visits(visits, rows.shape[1], progress))
 
     def seekable(self, views: Views, progress: str | None = None) -> Views:
         """Views of a traverse that seeks: as they are, or the features of all, which may lie in a file."""
@@ -229,11 +225,7 @@ class Sample(NamedTuple):
         return Views(Selection(views.traverse, shown), at[shown])
 
     def views(self, second: Views) -> Views:
-        """As `shown`.
-
-        Raises:
-            InputError: it shows nothing of the sample.
-        """
+        """As `shown`; a traverse that shows nothing of the sample is refused."""
         found = self.shown(second)
         if not len(found.places):
             seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
@@ -249,7 +241,7 @@ class ChunkCoder(NamedTuple):
     show; None averages nothing.
 
     Convention: no batch spans two chunks, so that what precedes a chunk changes nothing in it. Matrix
-        products round differently by the number of threads: work `in_one_thread`.
+        products round differently by the number of threads: the work is done `in_one_thread`.
     """
 
     describer: Describer
@@ -287,13 +279,14 @@ class ChunkCoder(NamedTuple):
         part = _ByChunks(traverse, start, stop, self.chunk)
         held: list[Tensor] = []
         done = start
-        for rows in self.describer.descriptors(part, progress):
-            held.append(rows)
-            done += len(rows)
-            if done % self.chunk == 0 or done == stop:
-                rows = torch.cat(held)
-                yield self.code(self._averaged(rows, done - len(rows)))
-                held = []
+        with in_one_thread():
+            for rows in self.describer.descriptors(part, progress):
+                held.append(rows)
+                done += len(rows)
+                if done % self.chunk == 0 or done == stop:
+                    rows = torch.cat(held)
+                    yield self.code(self._averaged(rows, done - len(rows)))
+                    held = []
         if done < stop:
             seen = f"{traverse.name} ended at frame {done}"
             raise InputError(f"{seen}; expected {self.frames} frames, as it had before")
@@ -350,8 +343,7 @@ def encode_local(
     coder: ChunkCoder, traverse: Traverse, first: int, progress: str | None = None
 ) -> Iterator[Chunk]:
     """The chunks of a traverse from number `first` on, coded in this process."""
-    with in_one_thread():
-        yield from coder.chunks(traverse, range(first, coder.total), progress)
+    return coder.chunks(traverse, range(first, coder.total), progress)
 
 
 @contextmanager
@@ -412,11 +404,7 @@ class Checkpoint:
         return True
 
     def check_unused(self) -> None:
-        """Refuse a run without checkpoints if there is the partial map of another.
-
-        Raises:
-            InputError: naming the file.
-        """
+        """Refuse a run without checkpoints if there is the partial map of another."""
         if self.path.exists():
             self._refuse()
 
@@ -478,7 +466,16 @@ def learn_map(
         long = mapper.empty().to(describer.device)
         with in_one_thread():
             if checkpoint is None or not checkpoint.open(key(), traverse, long, describer.whitening):
-                long = _fitted(describer, mapper, traverse, frames, second, visits, progress)
+                sample = Sample.of(frames, mapper.chunk)
+                own = second and sample.views(second)
+                rows = describer.reference(Selection(traverse, sample.frame), own, progress and "sampling")
+                if visits is not None and len((shown := sample.shown(visits)).places):
+                    rows = describer.averaged(rows, shown)
+                # of what the file holds once, the sample pays its share alone
+                share, once = len(rows) / frames, 2 * rows.shape[1]
+                counted = round(share * mapper.overhead - (1 - share) * once)
+                fitted = mapper.with_overhead(counted, mapper.ready).fit(rows, sample.stretch)
+                long = fitted.to(describer.device)
         coder = ChunkCoder.like(long, describer, frames, visits and describer.seekable(visits, progress))
         extend(long, coder, traverse, progress, checkpoint, code)
         _log_reached(long, mapper)
@@ -489,8 +486,7 @@ def learn_map(
         descriptors = describer.reference(traverse, second, progress, spectral)
         counts = visits and observation_counts(visits, len(descriptors))
         if visits is not None:
-            seen = describer.visits(visits, descriptors.shape[1], progress)
-            descriptors = with_visits(descriptors.float(), torch.ones(len(descriptors)), *seen)
+            descriptors = describer.averaged(descriptors, visits, progress)
         route = learn_descriptors(mapper, descriptors)
     if counts is not None:
         route.count_visits(1 + counts)
@@ -499,11 +495,7 @@ def learn_map(
 
 @torch.no_grad()
 def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
-    """The map that a mapper makes from descriptors (N,K).
-
-    Raises:
-        InputError: a map of other sizes.
-    """
+    """The map that a mapper makes from descriptors (N,K); one of other sizes is refused."""
     route: PlaceMap = mapper(descriptors)
     if (route.places, route.dimension) != tuple(descriptors.shape):
         raise InputError(
@@ -511,28 +503,6 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
             f"features from features {tuple(descriptors.shape)}; expected as many"
         )
     return route
-
-
-def _fitted(
-    describer: Describer,
-    mapper: SpectralMapper,
-    traverse: Traverse,
-    frames: int,
-    second: Views | None,
-    visits: Views | None,
-    progress: str | None,
-) -> SpectralMap:
-    """Whitening, mean and step of a long route, from a sample of it: a map without places."""
-    sample = Sample.of(frames, mapper.chunk)
-    own = second and sample.views(second)
-    descriptors = describer.reference(Selection(traverse, sample.frame), own, progress and "sampling")
-    if visits is not None and len((shown := sample.shown(visits)).places):
-        seen = describer.visits(shown, descriptors.shape[1])
-        descriptors = with_visits(descriptors.float(), torch.ones(len(descriptors)), *seen)
-    # of what the file holds once, the sample pays its share alone
-    share, once = len(descriptors) / frames, 2 * descriptors.shape[1]
-    counted = round(share * mapper.overhead - (1 - share) * once)
-    return mapper.with_overhead(counted, mapper.ready).fit(descriptors, sample.stretch).to(describer.device)
 
 
 def extend(
@@ -601,11 +571,7 @@ def with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> 
 
 
 def observation_counts(visits: Views, places: int) -> Tensor:
-    """How many frames of visits show each of so many places, (N,).
-
-    Raises:
-        InputError: they show a place beyond these.
-    """
+    """How many frames of visits show each of so many places, (N,); a place beyond these is refused."""
     shown = visits.places[visits.places >= 0].cpu()
     if len(shown) and int(shown.max()) >= places:
         seen = f"{visits.traverse.name} shows place {int(shown.max())}"

@@ -34,6 +34,7 @@ from dejavu_torch.learning import (
     learn_map,
     positions_of,
 )
+from dejavu_torch.maps.file import checked_fields
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
@@ -41,11 +42,12 @@ from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.memory import concatenate
 from dejavu_torch.model_file import (
     CLASSES,
+    STATE,
     model_state,
     read_model,
     run_key,
+    set_state,
     summary_of,
-    take_state,
     write_model,
 )
 from dejavu_torch.motion.odometry import GroundOdometry
@@ -66,7 +68,6 @@ from dejavu_torch.types import (
 
 log = logging.getLogger("dejavu_torch")
 
-ROWS = 4096  # descriptors on the device at a time
 MANY_FEATURES = 50_000  # per frame: worth a word
 
 
@@ -388,7 +389,7 @@ class DejaVu(nn.Module):
             >>> bool((match.accepted == (match.probability >= 0.99)).all())
             True
         """
-        self._require_map()
+        self.require_map()
         own = None
         if reference is not None and views is None:
             own = self.fit(as_traverse(reference), self.frame_shape or ())
@@ -406,7 +407,7 @@ class DejaVu(nn.Module):
 
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
-        self._require_map()
+        self.require_map()
         if isinstance(queries, Tensor):
             queries = resize_like(queries, self.frame_shape)
         features = features_of(queries, self.describe, "the query")
@@ -461,7 +462,7 @@ class DejaVu(nn.Module):
 
     def localizer(self, matching: Matching) -> Localizer:
         """What matches descriptors on the map, a batch of consecutive queries after the other."""
-        self._require_map()
+        self.require_map()
         check_search(matching.search)
         if matching.sequence is not None:
             matching.sequence.check(None, self.map.places)
@@ -477,7 +478,7 @@ class DejaVu(nn.Module):
         apart: int = 5,
     ) -> Iterator[Match]:
         """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory."""
-        self._require_map()
+        self.require_map()
         if k is not None:
             check_candidates(k, apart, self.map.places)
         localizer = self.localizer(self.matching(sequence, search)._replace(k=k, radius=apart))
@@ -592,7 +593,7 @@ class DejaVu(nn.Module):
                 cannot be written.
         """
         if self.trained is None:
-            self._require_map()
+            self.require_map()
         write_model(Path(path), self)
 
     @classmethod
@@ -622,15 +623,16 @@ class DejaVu(nn.Module):
         Raises:
             InputError: a state of other entries, or of other types.
         """
-        take_state(self, state)
+        set_state(self, checked_fields(state, STATE, "the model's state"))
 
-    def _require_map(self) -> None:
-        if not self.map.places and self.trained is not None:
-            raise InputError(
-                "this is a descriptor without a map; expected learn(...) of a route with it first"
-            )
+    def require_map(self) -> None:
+        """Refuse a model without a map."""
         if not self.map.places:
-            raise InputError("there is no map yet; expected learn(...) or load(...) first")
+            raise InputError(
+                "there is no map yet; expected learn(...) or load(...) first"
+                if self.trained is None
+                else "this is a descriptor without a map; expected learn(...) of a route with it first"
+            )
 
 
 def own_size(features: nn.Module) -> tuple[int, int] | None:

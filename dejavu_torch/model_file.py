@@ -139,15 +139,7 @@ def difference(stored: Recipe, given: Recipe) -> str:
 
 
 def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
-    """A module by its recipe.
-
-    Args:
-        kind: its base class. given: a module for the recipe, or for the part of it, that equals its own.
-
-    Raises:
-        InputError: a class outside the registry, or one that is no `kind`, other arguments than it has, or
-            more than `MOST_PARTS` parts.
-    """
+    """A module of base class `kind` by its recipe; `given` is taken where the recipe is its own."""
     name = recipe.class_path
     if isinstance(given, kind) and recipe_of(given) == recipe:
         return given
@@ -197,16 +189,8 @@ def _plain(value: Any) -> Any:
     return {key: _plain(one) for key, one in value._asdict().items()} if hasattr(value, "_asdict") else value
 
 
-def take_state(model: Any, state: Any) -> None:
-    """Give a model what `model_state` returned.
-
-    Raises:
-        InputError: a state of other entries, or of other types.
-    """
-    _set_state(model, checked_fields(state, STATE, "the model's state"))
-
-
-def _set_state(model: Any, state: Mapping[str, Any], frames: int | None = None) -> None:
+def set_state(model: Any, state: Mapping[str, Any], frames: int | None = None) -> None:
+    """Give a model what `model_state` returned, its types checked."""
     for name in STATE.keys() - {"names"}:
         setattr(model, name, state[name])
     names = state["names"]
@@ -236,12 +220,7 @@ def summary_of(model: Any) -> MapSummary:
 
 
 def write_model(path: Path, model: Any) -> None:
-    """Write a model that has learned a map or a descriptor.
-
-    Raises:
-        InputError: weights that were changed since they were rounded, values that no file may hold, or the
-            file cannot be written.
-    """
+    """See `DejaVu.save`."""
     _check_rounded(model)
     tensors, header = contents(model)
     checked_fields(header, HEADER, "the model")  # what is written can be read
@@ -250,14 +229,7 @@ def write_model(path: Path, model: Any) -> None:
 
 
 def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -> M:
-    """The model of a map file.
-
-    Args:
-        make: `DejaVu`. features: see `DejaVu.load`.
-
-    Raises:
-        InputError: as `DejaVu.load`.
-    """
+    """See `DejaVu.load`; `make` is `DejaVu`."""
     with opened(path) as (tensors, header):
         if features is not None and recipe_of(features) not in with_parts(header["features"]):
             raise InputError(f"it was learned with {difference(header['features'], recipe_of(features))}")
@@ -279,7 +251,7 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
             raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
         model.weight_bits = 8 if len(weights) < len(tensors) else 32
         _check_rounded(model)
-        _set_state(model, header, model.map.table.frames)
+        set_state(model, header, model.map.table.frames)
         _check(model)
         return model  # type: ignore[no-any-return]
 
@@ -300,11 +272,7 @@ def read_place_map(path: Path) -> PlaceMap:
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
-    """Tensors and header of a map file; what is refused of them within the block names the file.
-
-    Raises:
-        InputError: as `DejaVu.load`.
-    """
+    """Tensors and header of a map file; what is refused of them within the block names the file."""
     tensors, values = read_map(path)
     try:
         header = checked_fields(values, HEADER, "its header")

@@ -187,8 +187,10 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("device", [*ELSEWHERE, "tpu", "cpu:1", "cuda:x"])
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    ("command", "device"),
+    [*zip(COMMANDS, [*ELSEWHERE, "tpu", "cpu:1", "cuda:x"], strict=True)],
+)
 def test_a_device_that_is_not_there_is_one_line(
     command: str,
     device: str,

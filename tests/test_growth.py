@@ -116,26 +116,6 @@ def test_the_old_places_stay_and_the_new_ones_are_found() -> None:
     assert (model.threshold, model.summary().places) == (0.25, 500)
 
 
-def test_an_extended_map_is_an_appended_one() -> None:
-    route = walk(300)
-    one, other = learned(route[:128]), learned(route[:128])
-    coding = spectral(one).means[0], spectral(one).step
-    one.map.extend(code_chunk(part, *coding) for part in route[128:].split(64))
-    append(other, route[128:])
-    query = walk(5, seed=1)
-    assert torch.equal(one.map.scores(query), other.map.scores(query))
-
-
-def test_whitening_stays() -> None:
-    route = walk(300)
-    model = DejaVu(whitening=Whitening(numbers=4), mapper=SpectralMapper(4.0, chunk=50)).learn(route[:200])
-    assert model.whitening is not None
-    before = model.whitening.projection.clone()
-    append(model, route[200:])
-    assert torch.equal(model.whitening.projection, before)
-    assert (model.localize(route[::9]).index - torch.arange(0, 300, 9)).abs().max() <= 2
-
-
 def test_names_follow_and_parts_without_names_stay_without() -> None:
     route = walk(192)
     model = learned(Named(route[:64], "a"))
@@ -220,16 +200,6 @@ def test_no_place_is_lost_behind_more_than_float32_can_count(monkeypatch: pytest
     assert torch.equal(table.steps[50:] - 2**24, own.double() + 1)
 
 
-def test_only_a_chunk_of_descriptors_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, sizes = learned(walk(64)), []
-    code = learning.code_chunk
-    monkeypatch.setattr(
-        learning, "code_chunk", lambda part, **rest: sizes.append(len(part)) or code(part, **rest)
-    )
-    append(model, walk(1000, seed=2))
-    assert sizes == [*[64] * 15, 40]
-
-
 def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -302,6 +272,8 @@ def test_more_places_than_lines_can_be_numbered(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(growth, "LARGEST", 100)
     with refused("128 places", "at most 100"):
         append(model, walk(64))
+    with refused("230 places", "at most 100"):
+        merge(routes("a", "b"), ["a", "b"])
     assert append(model, walk(36)).map.places == 100
     monkeypatch.setattr(growth, "EXACT", 150)
     moved = DejaVu(HOG(), "none", SpectralMapper(200.0, chunk=20), velocity=camera())
@@ -468,13 +440,6 @@ def test_maps_that_cannot_be_merged() -> None:
         append(merge([one, two], ["a", "b"]), walk(64))
 
 
-def test_merged_places_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    models = routes("a", "b")
-    monkeypatch.setattr(growth, "LARGEST", 229)
-    with refused("230 places", "at most 229"):
-        merge(models, ["a", "b"])
-
-
 def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was(tmp_path: Path) -> None:
     merged = merge(routes("a", "b"), ["a", "b"])
     query = walk(1)
@@ -549,11 +514,6 @@ def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
     assert fresh.map.visit_counts.tolist() == counts
     fresh.load_state_dict(learned(route, 50).state_dict())  # of one visit
     assert fresh.map.visit_counts.tolist() == [1] * 120
-
-
-def test_places_of_one_visit_take_no_bytes(tmp_path: Path) -> None:
-    learned(walk(100)).save(tmp_path / "m")
-    assert "map.visits" not in read_map(tmp_path / "m").tensors
 
 
 @pytest.mark.parametrize("chunk", [50, 10_000])

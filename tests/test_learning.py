@@ -138,7 +138,7 @@ def test_the_budget_is_met_as_far_as_the_sample_tells(caplog: pytest.LogCaptureF
     assert [text for text in caplog.messages if f"{size(model):.3g}" in text and "400 of its 1030" in text]
 
 
-def test_names_are_beside_the_budget() -> None:
+def test_names_are_beside_the_budget_and_the_default_gives_way(caplog: pytest.LogCaptureFixture) -> None:
     class Named(ArrayTraverse):
         def frame_name(self, i: int) -> str:
             return f"{i * i % 10007}"
@@ -147,9 +147,7 @@ def test_names_are_beside_the_budget() -> None:
     assert model.summary().fixed["names"] > PLACES
     assert model.summary().route == plain.summary().route
     assert model.frame_names[3] == "9"
-
-
-def test_where_the_default_budget_gives_way_one_line_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.clear()
     mapper = SpectralMapper(chunk=3)  # whose chunks alone take over 9 bytes per place
     model = DejaVu(whitening="none", mapper=mapper).learn(route())
     assert model.summary().route_bytes > 9 * PLACES

@@ -105,12 +105,6 @@ def test_features_that_repeat_are_found_exactly() -> None:
     assert match.accepted.all()
 
 
-def test_frames_that_repeat_are_found() -> None:
-    model = wave_model(features=HOG(block=1)).learn(pictures())
-    assert model.localize(pictures()).index.tolist() == list(range(72))
-    assert model(pictures(5)).shape == (5, 72)
-
-
 @pytest.mark.parametrize("make", [waves, pictures])
 @pytest.mark.parametrize("batch_size", [1, 7])
 def test_tensors_traverses_and_batch_sizes_agree(make: Any, batch_size: int) -> None:
@@ -127,39 +121,6 @@ def test_tensors_traverses_and_batch_sizes_agree(make: Any, batch_size: int) -> 
         torch.testing.assert_close(found.score, expected.score)
 
 
-def test_byte_frames_are_frames() -> None:
-    pixels = (pictures()[:, 0] * 255).byte()
-    model = wave_model(features=HOG(block=1)).learn(pixels)
-    assert model.frame_shape == (1, *pixels.shape[1:])
-    assert model.localize(pixels).index.tolist() == list(range(72))
-
-
-def test_learn_returns_the_model_and_relearning_replaces_the_map() -> None:
-    model = wave_model()
-    assert model.learn(waves()) is model
-    assert model.learn(pictures(90)) is model
-    assert (model.map.places, model.map.dimension, model.frame_shape) == (
-        90,
-        3 * 36,
-        tuple(pictures().shape[1:]),
-    )
-    fresh = wave_model().learn(pictures(90))
-    assert model.map.plan == fresh.map.plan
-    assert torch.equal(model(pictures(3)), fresh(pictures(3)))
-
-
-@pytest.mark.parametrize("spilled", [0, 1000, 2**29])
-def test_features_that_spill_to_a_file_give_the_same_map(
-    spilled: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plain = template_model(batch_size=5).learn(pictures())
-    monkeypatch.setattr(learning, "IN_MEMORY", spilled)
-    other = template_model(batch_size=5).learn(pictures())
-    assert other.map.plan == plain.map.plan
-    assert torch.equal(other.map.templates, plain.map.templates)
-    assert other.map.templates.untyped_storage().nbytes() == plain.map.templates.untyped_storage().nbytes()
-
-
 def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path: Path) -> None:
     frames = torch.rand(40, 3, SIZE, SIZE)
     by_hand = Preprocess("R-B", "patch", patch=5)(frames)
@@ -172,20 +133,6 @@ def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path: Path) ->
     model.save(tmp_path / "map.safetensors")
     loaded = DejaVu.load(tmp_path / "map.safetensors")
     assert torch.equal(loaded(frames[:3]), model(frames[:3]))
-
-
-def test_ready_features_are_not_preprocessed() -> None:
-    model = template_model(preprocess=Preprocess("R-B")).learn(waves())
-    assert torch.equal(model.map.templates, template_model().learn(waves()).map.templates)
-
-
-def test_gradients_pass_through_the_preprocessing() -> None:
-    model = template_model(preprocess=Preprocess(contrast="patch", patch=5)).learn(pictures())
-    query = pictures()[:2].requires_grad_()
-    model(query).sum().backward()
-    assert query.grad is not None
-    assert query.grad.isfinite().all()
-    assert query.grad.abs().sum() > 0
 
 
 def test_so_many_features_are_told_of(
@@ -251,28 +198,6 @@ def test_training_and_deployed_path_give_equal_scores(training: bool) -> None:
     expected = best_match(model(query.requires_grad_()))
     assert torch.equal(match.index, expected.index)
     assert torch.equal(match.score, expected.score)
-
-
-@pytest.mark.parametrize("training", [True, False])
-def test_learning_ends_in_eval_mode_and_matching_restores_the_mode(training: bool) -> None:
-    model = template_model(Tiny(), layers(8)).train()
-    before = {name: value.clone() for name, value in model.features.state_dict().items()}
-    model.learn(pictures())
-    assert not any(module.training for module in model.modules())
-    model.train(training)
-    model.localize(pictures(5))
-    with refused("NaN"):
-        model.localize(torch.full((2, 1, SIZE, SIZE), torch.nan))
-    assert [module.training for module in model.features.modules()] == [training] * 4
-    assert all(torch.equal(before[name], value) for name, value in model.features.state_dict().items())
-
-
-def test_the_mode_of_each_part_of_the_features_is_restored() -> None:
-    model = template_model(Tiny(), layers(8)).learn(pictures()).train()
-    model.features.norm.eval()
-    model.localize(pictures(5))
-    assert model.features.training
-    assert not model.features.norm.training
 
 
 def test_a_batch_of_frames_finds_what_each_frame_finds() -> None:
@@ -369,20 +294,6 @@ def test_gradients_reach_the_weights_of_the_backbone() -> None:
             assert gradient.abs().max() > 0
 
 
-def test_a_flat_image_has_finite_gradients() -> None:
-    model = wave_model().learn(pictures())
-    frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
-    model(frames).sum().backward()
-    assert frames.grad is not None
-    assert frames.grad.isfinite().all()
-
-
-def test_localize_and_learn_leave_no_graph() -> None:
-    model = template_model(Tiny(), layers(8)).learn(pictures().requires_grad_())
-    assert not model.map.templates.requires_grad
-    assert not model.localize(pictures(3).requires_grad_()).score.requires_grad
-
-
 # a module like any other
 
 
@@ -396,28 +307,6 @@ def test_state_dict_goes_into_a_fresh_model() -> None:
     smaller = template_model(Tiny(), layers(5, features=2)).learn(pictures(80))
     smaller.load_state_dict(model.state_dict())
     assert smaller.map.plan == model.map.plan
-
-
-def test_to_float64() -> None:
-    model = template_model(Tiny(), layers(8, 9)).learn(pictures()).eval()
-    single = model(pictures(5))
-    double = model.to(torch.float64)(pictures(5).double())
-    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
-    torch.testing.assert_close(double.float(), single, atol=1e-5, rtol=1e-5)
-    assert model.map.layers.dtype == torch.int64
-
-
-def test_float64_features_stay_float64() -> None:
-    model = wave_model().learn(waves(dtype=torch.float64) / 3)
-    assert model.map.templates.dtype == torch.float64
-    assert model.localize(waves(dtype=torch.float64) / 3).score.abs().max() <= 1e-12
-
-
-def test_scores_ignore_autocast() -> None:
-    model = wave_model().learn(waves() / 3)
-    with torch.autocast("cpu", torch.bfloat16):
-        scores = model(waves() / 3)
-    assert torch.equal(scores, model(waves() / 3))
 
 
 # memory
@@ -436,35 +325,12 @@ def test_few_scores_are_held_at_once(monkeypatch: pytest.MonkeyPatch, at_once: i
     assert largest.numbers <= max(at_once, 72, query.numel())
 
 
-def test_memory_does_not_grow_with_the_number_of_queries() -> None:
-    model = wave_model(batch_size=16).learn(waves())
-    largest = []
-    for queries in (100, 1000):
-        with Largest() as seen:
-            assert sum(
-                len(match.index) for match in model.matches(Stream(lambda at: waves()[at % 72], queries))
-            )
-        largest.append(seen.numbers)
-    assert largest[0] == largest[1] <= 16 * 72
-
-
 def test_nothing_of_queries_times_phases_times_features_is_built() -> None:
     features, phases, queries = 50, 8 + 9, 40
     model = template_model(periods=layers(8, 9, features=features)).learn(torch.rand(72, features))
     with Largest() as seen:
         model.localize(torch.rand(queries, features))
     assert seen.numbers < queries * phases * features / 4
-
-
-def test_queries_are_read_as_they_are_matched() -> None:
-    model = wave_model(batch_size=4).learn(waves())
-    stream = Stream(lambda at: waves()[at % 72], 400)
-    matches = model.matches(stream)
-    assert next(matches).index.tolist() == [0, 1, 2, 3]
-    before = stream.given
-    assert before <= 4
-    assert next(matches).index.tolist() == [4, 5, 6, 7]
-    assert stream.given == before + 1
 
 
 # a route in which nothing repeats, and bad input
@@ -482,24 +348,6 @@ def test_a_constant_route_gives_a_map_without_layers() -> None:
         assert model(values[:5]).isposinf().all()
 
 
-def test_without_a_map() -> None:
-    for use in (DejaVu.localize, DejaVu.forward):
-        with refused("no map yet", "learn"):
-            use(DejaVu(), waves())
-
-
-def test_a_traverse_of_few_frames_is_refused() -> None:
-    for frames in (1, 7):
-        for make in (waves, pictures):
-            with refused(f"{frames} place", "expected at least 8"):
-                wave_model().learn(make(frames))
-
-
-def test_the_paper_refuses_a_traverse_shorter_than_its_window() -> None:
-    with refused("72 places", "1024"):
-        template_model(periods=SpectrogramAnalysis(short="refuse")).learn(waves())
-
-
 def test_a_frame_that_is_not_finite_is_named() -> None:
     for bad in (torch.nan, torch.inf):
         for make in (waves, pictures):
@@ -511,22 +359,6 @@ def test_a_frame_that_is_not_finite_is_named() -> None:
                 model = wave_model(batch_size=batch_size).learn(make())
                 with refused("frame 41", "NaN"):
                     model.localize(values)
-
-
-def test_features_of_another_dimension_are_refused() -> None:
-    for query in (torch.rand(3, 5), torch.rand(3, 1)):
-        model = wave_model().learn(waves())
-        for use in (model, model.localize):
-            with refused(str(tuple(query.shape)), "(Q, 2)"):
-                use(query)
-
-
-def test_frames_of_another_size_are_refused() -> None:
-    model = wave_model().learn(pictures())
-    with refused("32 x 32", "324 features", "expects 108"):
-        model.localize(torch.rand(3, 1, 32, 32))
-    with refused("8 x 8", "16 x 16"):
-        model.localize(torch.rand(3, 1, 8, 8))
 
 
 def test_large_frames_are_reduced_and_queries_follow(
@@ -576,56 +408,6 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
             Preprocess(size=size)  # type: ignore[arg-type]
 
 
-def test_frames_on_a_map_of_ready_features_are_refused() -> None:
-    model = wave_model().learn(waves())
-    with refused("frames", "ready features", "expected features (Q, 2)"):
-        model.localize(pictures(3))
-
-
-def test_forward_refuses_frames_on_a_map_of_ready_features() -> None:
-    model = template_model(HOG(), layers(8, features=108)).learn(torch.rand(72, 108))
-    with refused("ready features"):
-        model(pictures(3))
-
-
-def test_a_tensor_that_holds_no_traverse_is_refused() -> None:
-    for values in (
-        torch.zeros(72),
-        torch.zeros(72, 2, dtype=torch.int64),
-        torch.zeros(72, 3, 4),
-        torch.zeros(0, 2),
-    ):
-        with refused(str(tuple(values.shape)), "expected frames"):
-            wave_model().learn(values)
-
-
-def test_a_traverse_without_frames_is_refused() -> None:
-    with refused("no frames"):
-        wave_model().learn(Stream(waves, 0))
-
-
-@pytest.mark.parametrize("make", [lambda x: x, lambda x: x.sum(), lambda x: x.flatten(1)[:1]])
-def test_a_backbone_that_makes_no_features_is_refused(make: Any) -> None:
-    class Wrong(nn.Module):
-        def forward(self, frames: Tensor) -> Tensor:
-            return make(frames)
-
-    with refused("Wrong", "expected features (64, D)"):
-        template_model(Wrong(), layers(8)).learn(pictures())
-
-
-def test_bad_arguments_are_refused() -> None:
-    for arguments in (
-        {"batch_size": 0},
-        {"threshold": torch.nan},
-        {"metric": "l7"},
-        {"reduction": "median"},
-        {"temperature": 0.0},
-    ):
-        with refused("expected"):
-            template_model(**arguments)
-
-
 def test_frames_of_another_size_are_told_apart(caplog: pytest.LogCaptureFixture) -> None:
     model = wave_model(features=HOG(cell=8)).learn(torch.rand(72, 1, 32, 16))
     with refused("1 x 32 x 32", "1 x 32 x 16"):
@@ -637,13 +419,6 @@ def test_frames_of_another_size_are_told_apart(caplog: pytest.LogCaptureFixture)
     assert "1 x 16 x 32" in caplog.text
 
 
-def test_what_a_map_was_learnt_from_is_part_of_its_state() -> None:
-    model = wave_model().learn(waves())
-    again = wave_model()
-    again.load_state_dict(model.state_dict())
-    assert again.frame_shape == model.frame_shape == (waves().shape[1],)
-
-
 def test_a_temperature_makes_scores_of_how_likely_a_place_is() -> None:
     plain, model = wave_model().learn(waves()), wave_model(temperature=0.3).learn(waves())
     query = waves() + 0.3 * torch.rand(72, 2)
@@ -653,17 +428,149 @@ def test_a_temperature_makes_scores_of_how_likely_a_place_is() -> None:
     torch.testing.assert_close(match.score, model(query).amin(1))
 
 
-def test_how_a_map_was_trained_is_part_of_its_state() -> None:
+def test_features_that_spill_to_a_file_give_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = template_model(batch_size=5).learn(pictures())
+    monkeypatch.setattr(learning, "IN_MEMORY", 0)
+    other = template_model(batch_size=5).learn(pictures())
+    assert other.map.plan == plain.map.plan
+    assert torch.equal(other.map.templates, plain.map.templates)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_learning_ends_in_eval_mode_and_matching_restores_the_mode(training: bool) -> None:
+    model = template_model(Tiny(), layers(8)).train()
+    before = {name: value.clone() for name, value in model.features.state_dict().items()}
+    model.learn(pictures())
+    assert not any(module.training for module in model.modules())
+    model.train(training)
+    model.features.norm.eval()  # each part gets its own mode back
+    model.localize(pictures(5))
+    with refused("NaN"):
+        model.localize(torch.full((2, 1, SIZE, SIZE), torch.nan))
+    modes = [part.training for part in (model.features, model.features.conv, model.features.norm)]
+    assert modes == [training, training, False]
+    assert all(torch.equal(before[name], value) for name, value in model.features.state_dict().items())
+
+
+def test_double_precision() -> None:
+    model = template_model(Tiny(), layers(8, 9)).learn(pictures()).eval()
+    single = model(pictures(5))
+    double = model.to(torch.float64)(pictures(5).double())
+    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+    torch.testing.assert_close(double.float(), single, atol=1e-5, rtol=1e-5)
+    assert model.map.layers.dtype == torch.int64
+    values = waves(dtype=torch.float64) / 3
+    assert wave_model().learn(values).localize(values).score.abs().max() <= 1e-12
+
+
+def test_what_is_known_of_a_map_is_part_of_its_state() -> None:
     model, again = wave_model().learn(waves()), wave_model()
-    assert model.trained is None
+    model.trained, model.frame_names = Training(7, None), [f"{i:04}.png" for i in range(72)]
     again.load_state_dict(model.state_dict())
-    assert again.trained is None
-    model.trained = Training(7, None)
-    again.load_state_dict(model.state_dict())
-    assert again.trained == Training(7, None)
+    assert (again.frame_shape, again.trained, again.frame_name(7)) == ((2,), Training(7, None), "0007.png")
+    again.learn(waves())  # anew
+    assert (again.trained, again.frame_name(7)) == (None, "")
+    model.load_state_dict(again.state_dict())
+    assert (model.trained, model.frame_name(7)) == (None, "")
 
 
-def test_learning_anew_forgets_the_training() -> None:
-    model = wave_model().learn(waves())
-    model.trained = Training(7, None)
-    assert model.learn(waves()).trained is None
+class Wrong(nn.Module):
+    """Makes no features."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return frames.flatten(1)[:1]
+
+
+def on_waves(query: Tensor) -> Any:
+    return wave_model().learn(waves()).localize(query)
+
+
+@pytest.mark.parametrize(
+    ("use", "words"),
+    [
+        (lambda: DejaVu().localize(waves()), ("no map yet", "learn")),
+        (lambda: DejaVu()(waves()), ("no map yet", "learn")),
+        (lambda: wave_model().learn(waves(7)), ("7 place", "expected at least 8")),
+        (lambda: wave_model().learn(pictures(1)), ("1 place", "expected at least 8")),
+        (
+            lambda: template_model(periods=SpectrogramAnalysis(short="refuse")).learn(waves()),
+            ("72 places", "1024"),
+        ),
+        (lambda: on_waves(torch.rand(3, 5)), ("(3, 5)", "(Q, 2)")),
+        (lambda: wave_model().learn(waves())(torch.rand(3, 1)), ("(3, 1)", "(Q, 2)")),
+        (
+            lambda: wave_model().learn(pictures()).localize(torch.rand(3, 1, 32, 32)),
+            ("32 x 32", "324 features", "expects 108"),
+        ),
+        (
+            lambda: wave_model().learn(pictures()).localize(torch.rand(3, 1, 8, 8)),
+            ("8 x 8", "16 x 16"),
+        ),
+        (lambda: on_waves(pictures(3)), ("frames", "ready features", "expected features (Q, 2)")),
+        (
+            lambda: template_model(HOG(), layers(8, features=108)).learn(torch.rand(72, 108))(pictures(3)),
+            ("ready features",),
+        ),
+        *(
+            (lambda values=values: wave_model().learn(values), (str(tuple(values.shape)), "expected frames"))
+            for values in (torch.zeros(72), torch.zeros(72, 2, dtype=torch.int64), torch.zeros(72, 3, 4))
+        ),
+        (lambda: wave_model().learn(torch.zeros(0, 2)), ("(0, 2)", "expected frames")),
+        (lambda: wave_model().learn(Stream(waves, 0)), ("no frames",)),
+        (
+            lambda: template_model(Wrong(), layers(8)).learn(pictures()),
+            ("Wrong", "expected features (64, D)"),
+        ),
+        (lambda: DejaVu(batch_size=0), ("expected",)),
+        (lambda: DejaVu(threshold=torch.nan), ("expected",)),
+        (lambda: template_model(metric="l7"), ("expected",)),
+        (lambda: template_model(reduction="median"), ("expected",)),
+        (lambda: template_model(temperature=0.0), ("expected",)),
+    ],
+)
+def test_what_is_refused(use: Any, words: tuple[str, ...]) -> None:
+    with refused(*words):
+        use()
+
+
+def test_frames_of_floats_and_of_bytes_are_found() -> None:
+    pixels = (pictures()[:, 0] * 255).byte()
+    for frames in (pictures(), pixels):
+        model = wave_model(features=HOG(block=1)).learn(frames)
+        assert model.frame_shape == (1, *pixels.shape[1:])
+        assert model.localize(frames).index.tolist() == list(range(72))
+
+
+def test_relearning_replaces_the_map() -> None:
+    model, fresh = wave_model().learn(waves()), wave_model().learn(pictures(90))
+    assert model.learn(pictures(90)) is model
+    assert (model.map.places, model.frame_shape) == (90, tuple(pictures().shape[1:]))
+    assert torch.equal(model(pictures(3)), fresh(pictures(3)))
+
+
+def test_queries_are_read_as_they_are_matched_in_constant_memory() -> None:
+    model = wave_model(batch_size=4).learn(waves())
+    stream, numbers = Stream(lambda at: waves()[at % 72], 400), set()
+    for i, match in enumerate(model.matches(stream)):
+        assert match.index.tolist() == [(4 * i + j) % 72 for j in range(4)]
+        assert stream.given <= i + 4
+    for queries in (100, 1000):
+        with Largest() as seen:
+            assert len([*model.matches(Stream(lambda at: waves()[at % 72], queries))]) == queries // 4
+        numbers.add(seen.numbers)
+    assert len(numbers) == 1
+    assert numbers.pop() <= 4 * 72
+
+
+def test_a_flat_image_has_finite_gradients_and_no_graph_is_left() -> None:
+    model = wave_model().learn(pictures().requires_grad_())
+    frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
+    features = model.describe(frames).detach()
+    with torch.autocast("cpu", torch.bfloat16):
+        scores = model(features)
+    assert torch.equal(scores, model(features))  # which ignore it
+    model(frames).sum().backward()
+    assert frames.grad is not None
+    assert frames.grad.isfinite().all()
+    assert not model.map.templates.requires_grad
+    assert not model.localize(frames).score.requires_grad

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -79,59 +80,6 @@ def exported(model: DejaVu, queries: Tensor) -> torch.export.ExportedProgram:
     return torch.export.export(model, (queries,), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}})
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_exported_model_scores_frames_as_the_model_does(backbone: str) -> None:
-    model = learned(backbone)
-    run = exported(model, torch.rand(2, 3, 32, 24)).module()
-    for batch in BATCHES:
-        queries = torch.rand(batch, 3, 32, 24)
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("backbone", ["HOG", "Embedding"])
-def test_the_exported_model_of_a_spectral_map_scores_frames_as_the_model_does(backbone: str) -> None:
-    model = spectral(backbone)
-    program, buffer = exported(model, torch.rand(2, 3, 32, 24)), io.BytesIO()
-    torch.export.save(program, buffer)
-    buffer.seek(0)
-    runs = program.module(), torch.export.load(buffer).module()
-    for batch in BATCHES:
-        queries = torch.rand(batch, 3, 32, 24)
-        for run in runs:
-            torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("settings", SPECTRAL.values(), ids=SPECTRAL)
-def test_every_setting_of_a_spectral_map_is_exported(settings: dict[str, Any]) -> None:
-    """Of whitened features."""
-    model = DejaVu(mapper=SpectralMapper(16.0, **settings)).learn(torch.rand(60, 8)).eval()
-    run = exported(model, torch.rand(2, 8)).module()
-    for batch in BATCHES:
-        queries = torch.rand(batch, 8)
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_the_compiled_model_of_a_spectral_map_scores_frames_as_the_model_does() -> None:
-    model = spectral("HOG")
-    torch.compiler.reset()
-    run = torch.compile(model, fullgraph=True, backend="eager")
-    for batch in BATCHES:
-        queries = torch.rand(batch, 3, 32, 24)
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_compiled_model_scores_frames_as_the_model_does(backbone: str) -> None:
-    model = learned(backbone)
-    torch.compiler.reset()
-    run = torch.compile(model, fullgraph=True, backend="eager")
-    for batch in BATCHES:
-        queries = torch.rand(batch, 3, 32, 24)
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
 @pytest.mark.figures
 @pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> None:
@@ -141,31 +89,6 @@ def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> Non
     for batch in (8, 100):
         queries = torch.rand(batch, 3, 32, 24)
         torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
-def test_every_setting_of_a_map_is_exported(settings: dict[str, Any]) -> None:
-    model = of_chunks(**settings)
-    program, buffer = exported(model, torch.rand(2, 4)), io.BytesIO()
-    torch.export.save(program, buffer)
-    buffer.seek(0)
-    loaded = torch.export.load(buffer).module()
-    for batch in (1, 3, 7):
-        queries = torch.rand(batch, 4)
-        expected = model(queries)
-        assert expected[:, UNCOVERED].isposinf().all()
-        for run in (program.module(), loaded):
-            scores = run(queries)
-            assert scores.dtype == torch.float32
-            torch.testing.assert_close(scores, expected, rtol=0, atol=1e-6)
-
-
-def test_a_map_is_compiled() -> None:
-    model = of_chunks(temperature=0.1)
-    torch.compiler.reset()
-    run = torch.compile(model, fullgraph=True, backend="eager")
-    for queries in (torch.rand(1, 4), torch.rand(7, 4)):
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -180,35 +103,83 @@ def test_the_weights_of_the_features_count(training: bool) -> None:
     torch.testing.assert_close(exported(model, queries[:2]).module()(queries), expected, rtol=0, atol=1e-6)
 
 
+def assert_scores_alike(
+    run: Callable[[Tensor], Tensor], model: DejaVu, *shape: int, atol: float = 1e-5
+) -> None:
+    for batch in BATCHES:
+        queries = torch.rand(batch, *shape)
+        scores = run(queries)
+        assert scores.dtype == torch.float32
+        torch.testing.assert_close(scores, model(queries), rtol=0, atol=atol)
+
+
+def saved(program: torch.export.ExportedProgram) -> Any:
+    """The program as it is read again."""
+    buffer = io.BytesIO()
+    torch.export.save(program, buffer)
+    buffer.seek(0)
+    return torch.export.load(buffer).module()
+
+
+OF_FRAMES: dict[str, Callable[[], DejaVu]] = {
+    **{name: partial(learned, name) for name in BACKBONES},
+    "spectral": partial(spectral, "HOG"),
+    "spectral Embedding": partial(spectral, "Embedding"),
+}
+
+
+@pytest.mark.parametrize("kind", OF_FRAMES)
+def test_the_exported_model_scores_frames_as_the_model_does(kind: str) -> None:
+    model = OF_FRAMES[kind]()
+    program = exported(model, torch.rand(2, 3, 32, 24))
+    assert_scores_alike(program.module(), model, 3, 32, 24)
+    if kind.startswith("spectral"):
+        assert_scores_alike(saved(program), model, 3, 32, 24)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*BACKBONES, "spectral"])
+def test_the_compiled_model_scores_frames_as_the_model_does(kind: str) -> None:
+    model = OF_FRAMES[kind]()
+    torch.compiler.reset()
+    assert_scores_alike(torch.compile(model, fullgraph=True, backend="eager"), model, 3, 32, 24)
+
+
+@pytest.mark.parametrize("settings", SPECTRAL.values(), ids=SPECTRAL)
+def test_every_setting_of_a_spectral_map_is_exported(settings: dict[str, Any]) -> None:
+    """Of whitened features."""
+    model = DejaVu(mapper=SpectralMapper(16.0, **settings)).learn(torch.rand(60, 8)).eval()
+    assert_scores_alike(exported(model, torch.rand(2, 8)).module(), model, 8)
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_every_setting_of_a_map_is_exported(settings: dict[str, Any]) -> None:
+    model = of_chunks(**settings)
+    program = exported(model, torch.rand(2, 4))
+    assert model(torch.rand(3, 4))[:, UNCOVERED].isposinf().all()
+    for run in (program.module(), saved(program)):
+        assert_scores_alike(run, model, 4, atol=1e-6)
+
+
+@pytest.mark.parametrize("plan", [(), CHUNKS], ids=["no layers", "layers"])
+def test_a_map_is_compiled(plan: Plan) -> None:
+    mapper = TemplateMapper(Fixed(*plan), temperature=0.1)
+    model = DejaVu(mapper=mapper).learn_features(torch.rand(60, 4)).eval()
+    torch.compiler.reset()
+    run = torch.compile(model, fullgraph=True, backend="eager")
+    assert_scores_alike(run, model, 4, atol=1e-6)
+    assert_scores_alike(exported(model, torch.rand(2, 4)).module(), model, 4, atol=1e-6)
+
+
 @pytest.mark.parametrize("preprocess", [Preprocess("grey"), Preprocess("R-B", "patch")], ids=repr)
 def test_preprocessing_is_part_of_the_exported_model(preprocess: Preprocess) -> None:
     model = DejaVu(mapper=TemplateMapper(ImposedPeriods([3, 4])), preprocess=preprocess)
     model.learn(torch.rand(40, 3, 32, 24)).eval()
-    queries = torch.rand(8, 3, 32, 24)
-    run = exported(model, queries[:2]).module()
-    torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-def test_a_map_without_layers_is_exported() -> None:
-    model = DejaVu(mapper=TemplateMapper(Fixed())).learn_features(torch.rand(20, 4)).eval()
-    assert exported(model, torch.rand(2, 4)).module()(torch.rand(5, 4)).isposinf().all()
+    assert_scores_alike(exported(model, torch.rand(2, 3, 32, 24)).module(), model, 3, 32, 24)
 
 
 def test_frames_that_run_in_parts_are_exported_whole() -> None:
     """Eagerly HOG takes 42 frames of this size at a time."""
     model = DejaVu(HOG(), Whitening(views=1), SpectralMapper(16.0)).learn(torch.rand(60, 3, 64, 64)).eval()
-    run = exported(model, torch.rand(2, 3, 64, 64)).module()
-    for batch in (1, 42, 43, 100):
-        queries = torch.rand(batch, 3, 64, 64)
-        assert (queries.numel() > VALUES_AT_ONCE) == (batch > 42)
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-def test_gradients_reach_the_backbone() -> None:
-    model = learned("SmallCNN")
-    scores = model(torch.rand(3, 3, 32, 24))
-    scores.sum().backward()
-    for parameter in model.parameters():
-        assert parameter.grad is not None
-        assert parameter.grad.isfinite().all()
-        assert parameter.grad.abs().max() > 0
+    assert max(BATCHES) * 3 * 64 * 64 > VALUES_AT_ONCE
+    assert_scores_alike(exported(model, torch.rand(2, 3, 64, 64)).module(), model, 3, 64, 64)

@@ -152,24 +152,27 @@ class Counts(nn.Module):
         return frames.flatten(1) + torch.zeros(len(frames), 1)
 
 
-@pytest.mark.parametrize("features", [Solves(), Counts()], ids=["no operation", "batch"])
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ({"features": Solves()}, ("the features, Solves, cannot be exported: ",)),
+        ({"features": Counts()}, ("the features, Counts, cannot be exported: ",)),
+        (
+            {"preprocess": Preprocess("grey", "clahe", grid=(2, 2))},
+            ("the preprocess, Preprocess, cannot be exported: clahe", "expected another contrast"),
+        ),
+    ],
+    ids=["no operation", "batch", "clahe"],
+)
 def test_a_part_that_cannot_be_exported_is_named(
-    features: nn.Module, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    part: dict[str, Any], words: tuple[str, ...], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     mapper = TemplateMapper(Fixed(FrequencyLayer(4, 4, 0, 20, (0, 1))))
-    model = DejaVu(features, mapper=mapper).learn(torch.rand(20, 1, 8, 8))
-    with refused(f"the features, {type(features).__name__}, cannot be exported: "):
+    model = DejaVu(mapper=mapper, **part).learn(torch.rand(20, 3, 24, 24))
+    with refused(*words):
         export_onnx(model, tmp_path / "map.onnx")
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr() == ("", "")
-
-
-def test_clahe_is_refused(tmp_path: Path) -> None:
-    mapper = TemplateMapper(Fixed(FrequencyLayer(4, 4, 0, 20, (0, 1))))
-    model = DejaVu(mapper=mapper, preprocess=Preprocess("grey", "clahe", grid=(2, 2)))
-    model.learn(torch.rand(20, 3, 24, 24))
-    with refused("the preprocess, Preprocess, cannot be exported: clahe", "expected another contrast"):
-        export_onnx(model, tmp_path / "map.onnx")
 
 
 def test_scores_that_differ_are_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,13 +184,6 @@ def test_scores_that_differ_are_no_file(tmp_path: Path, monkeypatch: pytest.Monk
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("package", ["onnxruntime"])
-def test_a_missing_package_is_named(package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, package, None)
-    with refused(f"an export needs {package}", "pip install 'dejavu_torch[export]'"):
-        export_onnx(of_features(), tmp_path / "map.onnx")
-
-
 def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with refused("there is no map yet"):
         export_onnx(DejaVu(), tmp_path / "map.onnx")
@@ -195,6 +191,12 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
         export_onnx(of_features(), tmp_path / "none" / "map.onnx")
     with refused("what frames"):
         export_onnx(DejaVu().learn_features(torch.rand(60, 4)), tmp_path / "map.onnx")
+    with (
+        monkeypatch.context() as patch,
+        refused("an export needs onnxruntime", "pip install 'dejavu_torch[export]'"),
+    ):
+        patch.setitem(sys.modules, "onnxruntime", None)
+        export_onnx(of_features(), tmp_path / "map.onnx")
     monkeypatch.setattr(onnx_file, "MOST_BYTES", 60 * 5 * 4 - 1)
     with refused("60 places of 5 numbers", "GB"):
         export_onnx(DejaVu().learn(torch.rand(60, 4)), tmp_path / "map.onnx")

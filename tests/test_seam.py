@@ -125,26 +125,11 @@ def test_a_state_of_another_kind_or_of_other_settings_is_refused() -> None:
     with refused("power is 1.0", "2.0"):
         other.load_state_dict(state)
     assert other.map.places == 0
-
-
-@pytest.mark.parametrize("settings", [("l2", "mean"), ("l1", "sum")])
-def test_an_l1_mean_state_goes_into_no_other(settings: tuple[Any, Any]) -> None:
     layer = FrequencyLayer(4, 4, 0, 9, (0,))
-    route = TemplateMap((layer,), [torch.rand(4, 1)], 9, 2)
-    other = TemplateMap((), (), 0, 0, *settings)
-    with refused("expected"):
-        other.load_state_dict(route.state_dict())
-    assert (other.places, other.plan) == (0, ())
-
-
-def test_frames_and_places_are_one_another_where_nothing_is_resampled() -> None:
-    route = TemplateMap((), (), 5, 2)
-    some = torch.tensor([[0, 4], [-1, 2]])
-    assert torch.equal(route.frame_of(some), some)
-    assert torch.equal(route.place_of(some), some)
-    assert route.table.borders.tolist() == list(range(route.places + 1))
-    with refused("frame 5", "0 to 4"):
-        route.place_of(torch.tensor([5]))
+    state = TemplateMap((layer,), [torch.rand(4, 1)], 9, 2).state_dict()
+    for settings in (("l2", "mean"), ("l1", "sum")):
+        with refused("expected"):
+            TemplateMap((), (), 0, 0, *settings).load_state_dict(state)
 
 
 def test_the_one_table_between_frames_and_places() -> None:
@@ -158,6 +143,11 @@ def test_the_one_table_between_frames_and_places() -> None:
     route.positions = torch.tensor([0.0, 1.0])
     with refused("positions of 2 places", "expected 4"):
         route.check()
+    route, some = TemplateMap((), (), 5, 2), torch.tensor([[0, 4], [-1, 2]])  # not resampled
+    assert torch.equal(route.frame_of(some), some)
+    assert torch.equal(route.place_of(some), some)
+    with refused("frame 5", "0 to 4"):
+        route.place_of(torch.tensor([5]))
 
 
 def test_a_mapper_that_does_not_fit_is_refused() -> None:
@@ -167,18 +157,6 @@ def test_a_mapper_that_does_not_fit_is_refused() -> None:
         DejaVu(mapper=nn.Linear(2, 2))  # type: ignore[arg-type]
     with refused("Linear", "PeriodFinder"):
         TemplateMapper(nn.Linear(2, 2))  # type: ignore[arg-type]
-
-
-def test_templates_become_parameters_by_an_argument() -> None:
-    wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])
-    model = DejaVu(mapper=TemplateMapper(trainable=True)).learn(wave)
-    assert [name for name, _ in model.map.named_parameters()] == ["templates"]
-    model(wave[:3] + 0.1).logsumexp(1).sum().backward()
-    gradient = dict(model.named_parameters())["map.templates"].grad
-    assert gradient is not None
-    assert gradient.abs().max() > 0
-    plain = template_model().learn(wave)
-    assert torch.equal(model(wave), plain(wave))
 
 
 def test_a_trainable_map_is_saved_loaded_and_compared(tmp_path: Path) -> None:
@@ -208,16 +186,6 @@ def test_a_state_that_is_refused_leaves_the_map_as_it_was(change: str) -> None:
     with refused("map"):
         model.map.load_state_dict(state)
     assert torch.equal(model(wave), expected)
-
-
-def test_the_names_of_frames_are_part_of_the_state() -> None:
-    model = DejaVu().learn(torch.rand(64, 2))
-    model.frame_names = [f"{i:04}.png" for i in range(64)]
-    again = DejaVu()
-    again.load_state_dict(model.state_dict())
-    assert (again.frame_name(7), again.map.places) == ("0007.png", 64)
-    again.load_state_dict(DejaVu().learn(torch.rand(32, 2)).state_dict())
-    assert (again.frame_name(7), again.map.places) == ("", 32)
 
 
 class Foreign(PeriodFinder):
