@@ -65,11 +65,6 @@ class TestTheCompiledLoop:
         expected = (query.double()[:, None] - mu.double()).abs().sum(2)
         torch.testing.assert_close(distances(query, mu).double(), expected, rtol=1e-5, atol=0)
 
-    def test_equals_float64_over_many_features(self) -> None:
-        query, mu = torch.rand(2, 100_003), torch.rand(5, 100_003)
-        expected = (query.double()[:, None] - mu.double()).abs().sum(2)
-        torch.testing.assert_close(distances(query, mu).double(), expected, rtol=1e-5, atol=0)
-
     @SIZES
     def test_equal_templates_have_equal_distances(
         self, queries: int, phases: int, features: int, seed: int
@@ -88,33 +83,17 @@ class TestTheCompiledLoop:
         assert distances(query, mu).tolist() == alone
 
     @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-    @pytest.mark.parametrize("feature", [0, 40, 99])
-    def test_nan_and_infinity_arrive(self, value: float, feature: int) -> None:
+    def test_nan_and_infinity_arrive(self, value: float) -> None:
         query, mu = torch.rand(4, 100), torch.rand(6, 100)
-        query[1, feature] = value
-        mu[5, feature] = value
+        query[1, 40] = mu[5, 40] = value
         expected = torch.cdist(query, mu, p=1.0)
         assert expected.isfinite().sum() == 3 * 5
         torch.testing.assert_close(distances(query, mu), expected, equal_nan=True)
-
-    def test_infinity_minus_infinity_is_nan(self) -> None:
-        rows = torch.tensor([[0.0, torch.inf], [0.0, -torch.inf]])
-        assert str(distances(rows, rows).tolist()) == "[[nan, inf], [inf, nan]]"
 
     def test_rows_need_not_lie_side_by_side(self) -> None:
         query, mu = torch.rand(80, 7).T, torch.rand(20, 161)[::2, 1::2]
         assert torch.equal(distances(query, mu), distances(query.clone(), mu.clone()))
         assert torch.equal(distances(mu[3:4].expand(5, -1), mu)[4], distances(mu, mu)[3])
-
-    def test_no_queries(self) -> None:
-        assert distances(torch.rand(0, 5), torch.rand(3, 5)).shape == (0, 3)
-
-    def test_inputs_stay_as_they_were(self) -> None:
-        query, mu = torch.rand(4, 9), torch.rand(5, 9)
-        kept = query.clone(), mu.clone()
-        distances(query, mu).fill_(7)
-        assert torch.equal(query, kept[0])
-        assert torch.equal(mu, kept[1])
 
     def test_several_threads_at_once(self, forget: Callable[[], None]) -> None:
         query, mu = torch.rand(20, 33), torch.rand(21, 33)
@@ -205,16 +184,7 @@ def test_gradients_are_left_to_torch() -> None:
         (torch.rand(2, ENOUGH[1], device="meta"), torch.rand(ENOUGH, device="meta")),
         (torch.rand(2, ENOUGH[1]), torch.rand(ENOUGH).to_sparse()),
     ],
-    ids=[
-        "few",
-        "f64",
-        "mixed",
-        "f16",
-        "grad",
-        "grad of templates",
-        "meta",
-        "sparse",
-    ],
+    ids=["few", "f64", "mixed", "f16", "grad", "grad of templates", "meta", "sparse"],
 )
 def test_what_is_left_to_torch(query: Tensor, templates: Tensor) -> None:
     assert l1.compiled_l1(query, templates) is None

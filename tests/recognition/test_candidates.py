@@ -10,7 +10,6 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch import best_match
 from dejavu_torch.recognition.select import best_candidates, check_candidates
 
 INF = math.inf
@@ -28,23 +27,6 @@ def test_equals_reference(rows: list[list[float]], k: int, apart: int) -> None:
         [row[i] if i >= 0 else INF for i in places] for row, places in zip(rows, index.tolist(), strict=True)
     ]
     assert score.tolist() == at
-
-
-@given(ROWS, st.integers(0, 3))
-def test_the_first_is_the_best_match(rows: list[list[float]], apart: int) -> None:
-    scores = torch.tensor(rows)
-    match = best_match(scores, threshold=1.0)
-    first = best_candidates(scores, 1, apart).map(lambda column: column[:, 0])
-    for one, other in zip(first[:2], match[:2], strict=True):
-        assert torch.equal(one, other)
-
-
-def test_each_candidate_as_a_match() -> None:
-    scores = torch.tensor([[5.0, 1, 2, 4, 3], [INF, 2, INF, INF, INF]])
-    index, score, accepted = best_candidates(scores, 3, 1)
-    assert index.tolist() == [[1, 4, -1], [1, -1, -1]]
-    assert score.tolist() == [[1, 3, INF], [2, INF, INF]]
-    assert accepted.tolist() == [[True, True, False], [True, False, False]]
 
 
 def test_a_query_of_nan_has_no_candidates() -> None:
