@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -19,8 +18,6 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from dejavu_torch.maps.compiling import compiled
 from dejavu_torch.types import InputError
-
-log = logging.getLogger("dejavu_torch")
 
 Metric = Literal["l1", "l2", "cosine"]
 Floats = NDArray[np.float32]
@@ -126,11 +123,8 @@ def _floats(tensor: Tensor) -> Floats | None:
 @cache
 def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
     signature = "void(float32[:,::1], float32[:,::1], float32[:,:])"
-    try:  # sums in any order, but not "nnan" and "ninf": NaN and infinity have to arrive
-        return compiled(_distances, signature, fastmath={"reassoc", "nsz", "contract"})
-    except Exception as error:  # a broken compiler must not break what works without one
-        log.info("L1 distances by torch, not by numba: %s", " ".join(str(error).split()))
-        return None
+    fastmath = {"reassoc", "nsz", "contract"}  # but not "nnan" and "ninf": NaN and infinity have to arrive
+    return compiled(_distances, signature, "L1 distances by torch", fastmath=fastmath)
 
 
 def _distances(query: Floats, templates: Floats, out: Floats) -> None:

@@ -174,17 +174,6 @@ def test_one_file_of_the_size_the_map_claims(saved: Path) -> None:
     assert model.summary().bytes_per_place == model.summary().map_bytes / 64
 
 
-def test_metadata_names_version_checksums_and_header(saved: Path) -> None:
-    tensors, sealed = contents(saved)
-    assert sealed["version"] == FORMAT
-    assert sealed["checksums"].keys() == {"header", "map"}
-    assert tensors["map.layers"].tolist() == [[8, 1, 8, 0, 64], [9, 1, 9, 0, 64]]
-    config = sealed["header"]
-    assert config["features"]["class_path"] == "HOG"
-    assert config["mapper"]["init_args"]["periods"]["init_args"]["window"] == 64
-    assert (config["map"]["kind"], config["map"]["metric"], config["threshold"]) == ("templates", "l1", None)
-
-
 def test_no_pickle_is_written_or_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = template_model(Small(), WINDOW).learn(pictures())
 

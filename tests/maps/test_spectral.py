@@ -94,12 +94,6 @@ def test_gradients_reach_the_queries() -> None:
         assert torch.autograd.gradcheck(learned.scores, queries, atol=1e-6)
 
 
-def test_a_route_of_a_period_is_found() -> None:
-    wave = route(40, 6).repeat(12, 1)[:470] + torch.linspace(0, 2, 470)[:, None]
-    learned = SpectralMapper()(wave)
-    assert torch.equal(learned.scores(wave).argmin(1), torch.arange(470))
-
-
 @pytest.mark.parametrize(("budget", "chunk"), [(0.8, 500), (5.0, 10_000)])
 def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_path: Path) -> None:
     descriptors = route(2000, 24)
@@ -297,19 +291,6 @@ def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
     nothing = torch.zeros(2, 4, requires_grad=True)
     (gradient,) = torch.autograd.grad(learned.scores(nothing).sum(), nothing)
     assert gradient.isfinite().all()
-
-
-def test_chunks_are_added_without_touching_others() -> None:
-    descriptors = route(500)
-    learned = SpectralMapper(chunk=100)(descriptors[:250])
-    before, table = held(learned), learned.packed()["stream_table"]
-    grow(learned, descriptors[250:])
-    assert learned.places == 500
-    assert learned.lengths.tolist() == [100, 100, 50, 100, 100, 50]
-    assert torch.equal(held(learned)[:250], before)
-    assert torch.equal(learned.packed()["stream_table"][:3], table)
-    found = learned.scores(descriptors).argmin(1)
-    assert (found == torch.arange(500)).float().mean() > 0.95
 
 
 def test_noise_tells_what_half_of_its_variance_needs() -> None:

@@ -44,12 +44,12 @@ def test_the_scores_carry_gradients_and_are_left_as_they_are() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     scores = torch.rand(2, 4)
-    with refused("0 candidates", "at least 1"):
-        best_candidates(scores, 0, 5)
-    with refused("5 candidates", "on 4 places", "at most 4"):
-        best_candidates(scores, 5, 5)
-    with refused("more than -1 places apart", "at least 0"):
-        best_candidates(scores, 2, -1)
-    with refused("(4,)", "(Q,N)"):
-        best_candidates(scores[0], 2, 5)
+    for arguments, words in (
+        ((scores, 0, 5), ["0 candidates", "at least 1"]),
+        ((scores, 5, 5), ["5 candidates", "on 4 places", "at most 4"]),
+        ((scores, 2, -1), ["more than -1 places apart", "at least 0"]),
+        ((scores[0], 2, 5), ["(4,)", "(Q,N)"]),
+    ):
+        with refused(*words):
+            best_candidates(*arguments)
     check_candidates(10**6, 0)  # of an unknown number of places

@@ -168,14 +168,6 @@ def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
     assert torch.allclose(again.score, found.score, rtol=1e-3)
 
 
-def test_a_dark_frame_says_nothing_whatever_its_score() -> None:
-    for value in (0.1, 0.7, 3.3, 123.456):
-        filter_ = PlaceFilter()
-        for places in (300, 1003):
-            start = filter_.posterior(torch.full((1, places), value))[0].detach()
-            assert start[-1] == pytest.approx(0.001 / 0.011, abs=1e-3)
-
-
 def test_gradients_are_finite_where_something_is_impossible() -> None:
     for impossible in ("jump", "leave", "enter"):
         filter_ = PlaceFilter(**{impossible: 0.0}, sharpness=2.2)  # type: ignore[arg-type]
