@@ -128,8 +128,7 @@ def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
 
 
 def _distances(query: Floats, templates: Floats, out: Floats) -> None:
-    """Four templates at a time, so that each number of a query is loaded once for all four; the last block
-    repeats the last template, so that every pair is summed in the same order."""
+    """Four templates at a time; the last block repeats the last, so that all sums are in one order."""
     last = len(templates) - 1
     for a in range(0, len(templates), 4):
         b, c, d = min(a + 1, last), min(a + 2, last), min(a + 3, last)

@@ -172,10 +172,8 @@ def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
         return False
     if origin is Literal:
         return any(type(value) is type(one) and value == one for one in inner)
-    if origin is float:
-        return type(value) in (int, float)
-    if origin in (int, str, bool, None, type(None)):
-        return type(value) is (origin or type(None))
+    if origin in (int, float, str, bool, None, type(None)):
+        return type(value) in ((int, float) if origin is float else (origin or type(None),))
     return origin is Any or isinstance(value, dict)
 
 

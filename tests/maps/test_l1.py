@@ -200,46 +200,49 @@ def test_what_is_not_left_to_torch() -> None:
         assert l1.compiled_l1(torch.rand(2, ENOUGH[1]), mu) is not None
 
 
+@pytest.mark.parametrize(
+    ("problem", "told"),
+    [
+        ("missing", "by torch, not by numba"),
+        ("broken", "libllvm is of another time"),
+        ("switched off", "NUMBA_DISABLE_JIT"),
+    ],
+)
 @pytest.mark.usefixtures("forget")
-class TestWithoutNumba:
-    def told(self, caplog: pytest.LogCaptureFixture) -> str:
-        """The one line that is logged, once, while torch does the work."""
-        query, mu = torch.rand(3, ENOUGH[1]), torch.rand(ENOUGH)
-        with caplog.at_level(logging.INFO, "dejavu_torch"):
-            for _ in range(2):
-                assert l1.l1_backend() == "torch"
-                assert torch.equal(phase_distances(query, mu), torch.cdist(query, mu, p=1.0))
-        (record,) = caplog.records
-        assert record.levelno == logging.INFO
-        assert "\n" not in record.getMessage()
-        return record.getMessage()
+def test_without_numba_one_line_is_logged_and_torch_does_the_work(
+    problem: str, told: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def njit(*args: object, **options: object) -> None:
+        raise OSError("libllvm\nis of another time")
 
-    def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    if problem == "missing":
         monkeypatch.setitem(sys.modules, "numba", None)
-        assert "by torch, not by numba" in self.told(caplog)
-
-    def test_broken(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-        def njit(*args: object, **options: object) -> None:
-            raise OSError("libllvm\nis of another time")
-
+    elif problem == "broken":
         monkeypatch.setattr(pytest.importorskip("numba"), "njit", njit)
-        assert self.told(caplog).endswith("libllvm is of another time")
-
-    def test_switched_off(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    else:
         monkeypatch.setattr(pytest.importorskip("numba").config, "DISABLE_JIT", 1)
-        assert "NUMBA_DISABLE_JIT" in self.told(caplog)
+    query, mu = torch.rand(3, ENOUGH[1]), torch.rand(ENOUGH)
+    with caplog.at_level(logging.INFO, "dejavu_torch"):
+        for _ in range(2):
+            assert l1.l1_backend() == "torch"
+            assert torch.equal(phase_distances(query, mu), torch.cdist(query, mu, p=1.0))
+    (line,) = caplog.messages
+    assert told in line
+    assert "\n" not in line
 
-    def test_nowhere_to_keep_what_is_compiled(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        numba = pytest.importorskip("numba")
-        njit = numba.njit
 
-        def nowhere(*args: object, cache: bool, **options: object) -> object:
-            if cache:
-                raise RuntimeError("cannot cache function: no locator available")
-            return njit(*args, cache=cache, **options)
+@pytest.mark.usefixtures("forget")
+def test_there_may_be_nowhere_to_keep_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    numba = pytest.importorskip("numba")
+    njit = numba.njit
 
-        monkeypatch.setattr(numba, "njit", nowhere)
-        assert l1.l1_backend() == "numba"
+    def nowhere(*args: object, cache: bool, **options: object) -> object:
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(*args, cache=cache, **options)
+
+    monkeypatch.setattr(numba, "njit", nowhere)
+    assert l1.l1_backend() == "numba"
 
 
 def test_numba_waits_until_it_is_needed() -> None:
