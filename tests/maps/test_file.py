@@ -475,11 +475,14 @@ class Masked(nn.Module):
         return frames.flatten(1)[:, :32] + self.mask[:, 0].sum()
 
 
-def test_buffers_of_a_network_may_be_expanded_and_infinite(path: Path) -> None:
-    model = template_model(Masked(), WINDOW).learn(pictures())
+@pytest.mark.parametrize("make", [Masked, Tied])
+def test_modules_from_elsewhere_may_have_any_state(path: Path, make: Any) -> None:
+    finder = Stateful(FrequencyLayer(Fraction(8), 8, 0, 64, (0,)))
+    model, query = template_model(make(), finder).learn(pictures(size=8)), pictures(5, 8)
     model.save(path)
-    loaded = DejaVu.load(path, Masked())
-    assert torch.equal(loaded.features.mask, model.features.mask)
+    loaded, own = DejaVu.load(path, make()), model.features.state_dict()
+    assert all(torch.equal(tensor, own[name]) for name, tensor in loaded.features.state_dict().items())
+    assert torch.equal(loaded.localize(query).score, model.localize(query).score)
 
 
 # features from elsewhere
@@ -522,18 +525,6 @@ def test_other_features_are_refused(small_map: tuple[Path, DejaVu], tmp_path: Pa
     ):
         with refused(*words):
             DejaVu.load(file, given)
-
-
-def test_tied_weights_can_be_saved(path: Path) -> None:
-    model = template_model(Tied(), WINDOW).learn(pictures(size=8))
-    model.save(path)
-    query = pictures(5, 8)
-    assert torch.equal(DejaVu.load(path, Tied()).localize(query).score, model.localize(query).score)
-
-
-def test_a_map_made_with_a_period_finder_of_its_own_state_can_be_read(path: Path) -> None:
-    template_model(periods=Stateful(FrequencyLayer(Fraction(8), 8, 0, 64, (0,)))).learn(waves()).save(path)
-    DejaVu.load(path)
 
 
 # an Embedding: features of this package around a network that may be from elsewhere
