@@ -367,3 +367,21 @@ def test_places_at_inf_leave_gradients_finite() -> None:
     assert scores.grad[0, 1] == 0
     assert scores.grad[1].tolist() == [0, 0, 0]
     assert scores.grad[0, 0] != 0
+
+
+def test_gradients_reach_the_reference_features() -> None:
+    values = torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
+    queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    plan = (whole(3, 10, (0, 2)), whole(4, 10, (1,)))
+    assert torch.autograd.gradcheck(lambda q, v: scored(q, make(v, plan)), (queries, values))
+
+
+def test_gradients_reach_queries_and_templates_through_a_temperature() -> None:
+    plan = (whole(3, 8, (0, 2)), FrequencyLayer(Fraction(5, 2), 2, 4, 10, (0, 1)))
+    queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    blocks = [torch.randn(x.phases, len(x.features), dtype=torch.float64, requires_grad=True) for x in plan]
+
+    def covered(queries: Tensor, *blocks: Tensor) -> Tensor:
+        return scored(queries, TemplateMap(plan, blocks, 10, 3), temperature=0.5)
+
+    assert torch.autograd.gradcheck(covered, (queries, *blocks))

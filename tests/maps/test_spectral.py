@@ -408,3 +408,16 @@ def test_nothing_is_written_to_stderr_when_a_map_scores() -> None:
     program += "SpectralMapper()(w).scores(w[:3])"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert found.stderr == ""
+
+
+def test_chunks_are_added_without_touching_others() -> None:
+    descriptors = route(500)
+    learned = SpectralMapper(chunk=100)(descriptors[:250])
+    before, table = held(learned), learned.packed()["stream_table"]
+    grow(learned, descriptors[250:])
+    assert learned.places == 500
+    assert learned.lengths.tolist() == [100, 100, 50, 100, 100, 50]
+    assert torch.equal(held(learned)[:250], before)
+    assert torch.equal(learned.packed()["stream_table"][:3], table)
+    found = learned.scores(descriptors).argmin(1)
+    assert (found == torch.arange(500)).float().mean() > 0.95

@@ -114,3 +114,43 @@ def test_a_layer_beyond_the_traverse_is_refused() -> None:
     ):
         with pytest.raises(InputError, match=message):
             PhaseTemplates()(torch.rand(10, 2), [layer])
+
+
+@given(reference.routes())
+def test_templates_are_means_under_the_mask(route: reference.Route) -> None:
+    n = len(route.values)
+    for mu, layer in zip(PhaseTemplates()(route.values, route.plan), route.plan, strict=True):
+        mask = phase_mask(n, layer.period, layer.phases, layer.start, layer.stop, torch.float64)
+        total = mask @ route.values[:, list(layer.features)]
+        torch.testing.assert_close(mu, total / mask.sum(1, keepdim=True).clamp(min=1), rtol=0, atol=1e-12)
+
+
+@given(st.integers(2, 9), st.integers(1, 4), st.integers(-20, 20))
+def test_shifting_the_traverse_rolls_the_templates(period: int, turns: int, shift: int) -> None:
+    values = torch.randint(-16, 17, (period * turns, 3)).double() / 8
+    layer = whole(period, len(values), (0, 1, 2))
+    (mu,) = PhaseTemplates()(values, [layer])
+    (shifted,) = PhaseTemplates()(values.roll(shift, 0), [layer])
+    assert torch.equal(shifted, mu.roll(shift, 0))
+
+
+@given(reference.routes(), st.randoms(use_true_random=False))
+def test_permuting_features_changes_no_template(route: reference.Route, random: object) -> None:
+    dimension = route.values.shape[1]
+    order = list(range(dimension))
+    random.shuffle(order)  # type: ignore[attr-defined]
+    moved = [
+        FrequencyLayer(
+            layer.period,
+            layer.phases,
+            layer.start,
+            layer.stop,
+            tuple(sorted(order.index(j) for j in layer.features)),
+        )
+        for layer in route.plan
+    ]
+    before = PhaseTemplates()(route.values, route.plan)
+    after = PhaseTemplates()(route.values[:, order], moved)
+    for layer, other, a, b in zip(route.plan, moved, before, after, strict=True):
+        columns = [other.features.index(order.index(j)) for j in layer.features]
+        assert torch.equal(a, b[:, columns])

@@ -160,12 +160,18 @@ WEIGHT, SCALES = "features.linear.weight", "features.linear.weight.scale"
     [
         (SCALES, lambda scale: scale * torch.nan),
         (SCALES, lambda scale: -scale),
+        (SCALES, lambda scale: scale * 0),
+        (SCALES, lambda scale: scale + torch.inf),
         (SCALES, lambda scale: scale.float()),
         (SCALES, lambda scale: scale[:-1]),
+        (SCALES, lambda scale: scale[None]),
+        (WEIGHT, lambda whole: whole.short()),
         (WEIGHT, lambda whole: whole // 2),
         (WEIGHT, lambda whole: torch.full_like(whole, -128)),
         (WEIGHT, lambda whole: whole[:, :-1]),
+        (SCALES, lambda scale: None),
         (WEIGHT, lambda whole: None),
+        (WEIGHT, lambda whole: whole.float()),
     ],
 )
 def test_damaged_numbers_are_refused(tmp_path: Path, name: str, change: Any) -> None:

@@ -10,6 +10,7 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch import best_match
 from dejavu_torch.recognition.select import best_candidates, check_candidates
 
 INF = math.inf
@@ -53,3 +54,12 @@ def test_what_cannot_be_is_refused() -> None:
         with refused(*words):
             best_candidates(*arguments)
     check_candidates(10**6, 0)  # of an unknown number of places
+
+
+@given(ROWS, st.integers(0, 3))
+def test_the_first_is_the_best_match(rows: list[list[float]], apart: int) -> None:
+    scores = torch.tensor(rows)
+    match = best_match(scores, threshold=1.0)
+    first = best_candidates(scores, 1, apart).map(lambda column: column[:, 0])
+    for one, other in zip(first[:2], match[:2], strict=True):
+        assert torch.equal(one, other)
