@@ -9,7 +9,6 @@ the same kind, cosine or sine. All arithmetic is in integers, so that every mach
 
 from __future__ import annotations
 
-import logging
 import math
 import zlib
 from collections.abc import Callable
@@ -24,8 +23,6 @@ from torch import Tensor
 from dejavu_torch.maps.compiling import compiled
 from dejavu_torch.memory import free_memory
 from dejavu_torch.types import InputError
-
-log = logging.getLogger("dejavu_torch")
 
 Ints = NDArray[np.integer[Any]]
 
@@ -147,11 +144,7 @@ def _filled(levels: Ints) -> int:
 
 
 def _count(counts: Any, size: Ints, sign: Ints, before: Ints, near: Ints) -> None:
-    """Count the bits of levels (R,K) in their contexts, as `_code` codes them.
-
-    Args:
-        counts: (CONTEXTS,2), added to. size, sign: of each level. before: the sign two rows before.
-    """
+    """Add the bits of levels (R,K) to counts (CONTEXTS,2); before: the sign two rows before each."""
     length = np.frexp(size)[1].astype(np.int64)
     ends = np.bincount((length * NEAR + near).ravel(), minlength=32 * NEAR).reshape(32, NEAR)
     more = ends[::-1].cumsum(0)[::-1] - ends
@@ -168,11 +161,7 @@ def _count(counts: Any, size: Ints, sign: Ints, before: Ints, near: Ints) -> Non
 
 
 def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, int, Any]:
-    """Write levels to bytes, or read as many from them, a block of rows at a time.
-
-    Returns:
-        The levels, the row at which coding ended, and the state of `_code`.
-    """
+    """Write levels to bytes, or read as many; the levels, the row where coding ended, `_code`'s state."""
     rows, columns = levels.shape
     kernel, begin = _kernel(levels.size), SPAN // 8 if reads else 0
     state: Any = np.array([int.from_bytes(packed[:begin], "big"), 1 << SPAN, begin])
@@ -206,18 +195,9 @@ def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, in
 
 
 def _code(block: Any, start: int, filled: int, packed: Any, coding: Any) -> int:
-    """Code the rows of a block from row `start` on, in which the two before them come first.
-
-    Args:
-        filled: rows up to the last that is not 0, if they are known.
-        coding: whether to read; state: the lower end of the interval, or the value read less that, its
-            width, and the position in `packed`; counts of 0s and 1s in each context; sums and logarithms,
-            see `_near`.
-
-    Returns:
-        The row at which coding ended; all further ones are 0.
-    """
+    """Code the rows of a block, behind the two before row `start`; the row from which on all are 0."""
     reads, state, counts, sums, logarithms = coding
+    # the lower end of the interval, or the value read less that, its width, the position in `packed`
     low, span, at = state[0], state[1], state[2]
     for r in range(2, len(block)):
         row = start + r - 2
@@ -288,12 +268,7 @@ def _put(low: int, at: int, packed: Any) -> int:
 
 
 def _near(sums: Any, rows: Any, logarithms: Any) -> Any:
-    """The contexts of the levels of rows (R,) by the magnitudes near each: (R,K), 0 to `NEAR`.
-
-    Args:
-        sums: (over R,K+1), at the number of a row modulo the length the magnitudes over all rows before it,
-            of each column and of all.
-    """
+    """The contexts (R,K), 0 to `NEAR`, by what sums (over R,K+1) of all rows before gained lately."""
     now, columns = sums[rows % len(sums)], sums.shape[1] - 1
     far = np.minimum(np.minimum(np.maximum(rows // 2, 16), REACH), rows)
     close = np.minimum(np.minimum(np.maximum(rows // 16, 2), 8), rows)
@@ -331,12 +306,5 @@ def _compiled() -> Callable[..., int] | None:
     """`_code` compiled, or None if numba is missing or broken."""
     block, numbers = "int32[:,::1]", "int64[::1]"
     coding = f"Tuple((boolean, {numbers}, {numbers}, {block}, {numbers}))"
-    try:
-        from numba.extending import register_jitable
-
-        for function in (_bit, _put, _near):
-            register_jitable(function)
-        return compiled(_code, f"int64({block}, int64, int64, uint8[::1], {coding})")
-    except Exception as error:  # a broken compiler must not break what works without one
-        log.info("levels are coded in Python, not by numba: %s", " ".join(str(error).split()))
-        return None
+    signature = f"int64({block}, int64, int64, uint8[::1], {coding})"
+    return compiled(_code, signature, "levels are coded in Python", (_bit, _put, _near))

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any
 
-F = TypeVar("F", bound=Callable[..., Any])
+log = logging.getLogger("dejavu_torch")
 
 
-def compiled(function: F, signature: str, **options: Any) -> F:
-    """The function compiled for one signature, or loaded from numba's cache; `options` are those of `njit`.
+def compiled(
+    function: Callable[..., Any], signature: str, what: str, calls: Sequence[Any] = (), **options: Any
+) -> Callable[..., Any] | None:
+    """The function, and what it calls, compiled for one signature or loaded from numba's cache.
 
-    Raises:
-        Exception: of any kind, if numba is missing, disabled or broken; its message says why.
+    None, with a line in the log that says `what` is done without, if numba is missing, disabled or broken;
+    `options` are those of `njit`.
     """
-    import numba
-
     options |= {"nogil": True, "error_model": "numpy"}
-    kernel: Any
     try:
-        kernel = numba.njit(signature, cache=True, **options)(function)
-    except Exception:  # there may be no folder for the cache
-        kernel = numba.njit(signature, cache=False, **options)(function)
-    if kernel is function:
-        raise RuntimeError("NUMBA_DISABLE_JIT is set")
-    return kernel  # type: ignore[no-any-return]
+        import numba
+        from numba.extending import register_jitable
+
+        for one in calls:
+            register_jitable(one)
+        try:
+            kernel: Any = numba.njit(signature, cache=True, **options)(function)
+        except Exception:  # there may be no folder for the cache
+            kernel = numba.njit(signature, cache=False, **options)(function)
+        if kernel is function:
+            raise RuntimeError("NUMBA_DISABLE_JIT is set")
+        return kernel  # type: ignore[no-any-return]
+    except Exception as error:  # a broken compiler must not break what works without one
+        log.info("%s, not by numba: %s", what, " ".join(str(error).split()))
+        return None

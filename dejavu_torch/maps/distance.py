@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -19,8 +18,6 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from dejavu_torch.maps.compiling import compiled
 from dejavu_torch.types import InputError
-
-log = logging.getLogger("dejavu_torch")
 
 Metric = Literal["l1", "l2", "cosine"]
 Floats = NDArray[np.float32]
@@ -126,16 +123,12 @@ def _floats(tensor: Tensor) -> Floats | None:
 @cache
 def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
     signature = "void(float32[:,::1], float32[:,::1], float32[:,:])"
-    try:  # sums in any order, but not "nnan" and "ninf": NaN and infinity have to arrive
-        return compiled(_distances, signature, fastmath={"reassoc", "nsz", "contract"})
-    except Exception as error:  # a broken compiler must not break what works without one
-        log.info("L1 distances by torch, not by numba: %s", " ".join(str(error).split()))
-        return None
+    fastmath = {"reassoc", "nsz", "contract"}  # but not "nnan" and "ninf": NaN and infinity have to arrive
+    return compiled(_distances, signature, "L1 distances by torch", fastmath=fastmath)
 
 
 def _distances(query: Floats, templates: Floats, out: Floats) -> None:
-    """Four templates at a time, so that each number of a query is loaded once for all four; the last block
-    repeats the last template, so that every pair is summed in the same order."""
+    """Four templates at a time; the last block repeats the last, so that all sums are in one order."""
     last = len(templates) - 1
     for a in range(0, len(templates), 4):
         b, c, d = min(a + 1, last), min(a + 2, last), min(a + 3, last)

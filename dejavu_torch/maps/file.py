@@ -25,8 +25,6 @@ FORMAT = 11
 NAME = "dejavu_torch-map"
 ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
-EXPORT = "or `dejavu train export` of the checkpoint"
-CONTIGUOUS = torch.contiguous_format
 HEADER = "header"  # the digest that is of no tensor
 SHOWN = 60  # characters of a value in a message
 
@@ -60,14 +58,11 @@ def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
 
 def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
     """Write the file whole or, with an InputError, not at all; the same contents give the same bytes."""
-    try:
-        plain, metadata = _sealed(tensors, header)
-    except ValueError as error:
-        raise InputError(f"{path} was not written: {error}") from error
     with whole_file(path) as temporary:
         try:
+            plain, metadata = _sealed(tensors, header)
             safetensors.torch.save_file(plain, temporary, metadata)
-        except SafetensorError as error:
+        except (SafetensorError, ValueError) as error:
             raise InputError(f"{path} was not written: {error}") from error
 
 
@@ -75,7 +70,8 @@ def _sealed(
     tensors: Mapping[str, Tensor], header: dict[str, Any]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors with memory of their own, as safetensors needs, and one entry of metadata: it mixes several."""
-    plain = {name: one.detach().cpu().clone(memory_format=CONTIGUOUS) for name, one in tensors.items()}
+    layout = torch.contiguous_format
+    plain = {name: one.detach().cpu().clone(memory_format=layout) for name, one in tensors.items()}
     sealed = {"version": FORMAT, "checksums": checksums(plain, header), HEADER: header}
     try:
         return plain, {NAME: json.dumps(sealed, allow_nan=False)}
@@ -96,7 +92,8 @@ def read_map(path: Path) -> Contents:
     try:
         with path.open("rb") as file:
             if file.read(len(ZIP)) == ZIP:
-                raise InputError(f"{path} is a checkpoint or another archive; expected {EXPECTED}, {EXPORT}")
+                cure = "or `dejavu train export` of the checkpoint"
+                raise InputError(f"{path} is a checkpoint or another archive; expected {EXPECTED}, {cure}")
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
             if NAME not in metadata:
@@ -175,10 +172,8 @@ def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
         return False
     if origin is Literal:
         return any(type(value) is type(one) and value == one for one in inner)
-    if origin is float:
-        return type(value) in (int, float)
-    if origin in (int, str, bool, None, type(None)):
-        return type(value) is (origin or type(None))
+    if origin in (int, float, str, bool, None, type(None)):
+        return type(value) in ((int, float) if origin is float else (origin or type(None),))
     return origin is Any or isinstance(value, dict)
 
 

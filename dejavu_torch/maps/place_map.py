@@ -71,6 +71,12 @@ class PlaceMap(nn.Module, ABC):
     def forward(self, queries: Tensor) -> Tensor:
         return self.scores(queries)
 
+    def check_queries(self, queries: Tensor) -> None:
+        """Refuse, by an InputError, queries that are not (Q,D)."""
+        if queries.ndim != 2 or queries.shape[1] != self.dimension:
+            seen = f"the query features are {tuple(queries.shape)}"
+            raise InputError(f"{seen}; the map expects (Q, {self.dimension})")
+
     def score_blocks(
         self, queries: Tensor, start: int = 0, stop: int | None = None
     ) -> Iterator[tuple[int, Tensor]]:

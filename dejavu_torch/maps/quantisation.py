@@ -107,8 +107,7 @@ class RouteLines:
 
     def step_of(self, room: float) -> float:
         """The smallest step in which the lines take so many bytes, or fewer; of a long route, about it."""
-        close = CLOSE if self.lines.numel() > BLOCK else 1.0
-        return self._smallest_step(self.coded_bytes, room, close)
+        return self._smallest_step(self.coded_bytes, room, CLOSE if self.lines.numel() > BLOCK else 1.0)
 
     def step_that_holds(self, share: float) -> float:
         """The smallest step in which the lines hold less than a share of the variance."""
@@ -137,8 +136,7 @@ class RouteLines:
             yield self.lines[rows], None if self.width is None else self.width[rows]
 
     def _smallest_step(self, value: Callable[[float], float], most: float, close: float = 1.0) -> float:
-        """The smallest step whose value, which falls as the step grows, is at most `most`: by bisection of
-        its logarithm, until the value is also at least `close` times that."""
+        """The smallest step whose falling value is at most `most`, by bisection of its logarithm."""
         finest = self.scale / FINEST
         low, high = math.log(finest), math.log(self.coarsest)
         for _ in range(HALVINGS):

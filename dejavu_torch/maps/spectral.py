@@ -109,14 +109,12 @@ class SpectralMapper(Mapper):
         return self._fitted(sample, stretch)[0]
 
     def empty(self) -> SpectralMap:
-        """See `Mapper`."""
         return self._map()
 
     def _map(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
         return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
 
     def with_overhead(self, overhead: int, ready: bool = False) -> SpectralMapper:
-        """See `Mapper`."""
         other = copy.copy(self)
         other.overhead, other.ready = overhead, ready
         return other

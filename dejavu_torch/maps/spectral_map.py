@@ -358,10 +358,7 @@ class SpectralMap(PlaceMap):
     ) -> Iterator[tuple[int, Tensor]]:
         """See `PlaceMap`: of consecutive chunks, as many as the processor's cache has room for."""
         stop = self.places if stop is None else stop
-        if queries.ndim != 2 or queries.shape[1] != self.dimension:
-            raise InputError(
-                f"the query descriptors are {tuple(queries.shape)}; the map expects (Q, {self.dimension})"
-            )
+        self.check_queries(queries)
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
@@ -387,7 +384,6 @@ class SpectralMap(PlaceMap):
 
     @property
     def block_places(self) -> int:
-        """See `PlaceMap`."""
         longest = max((stop - start for start, stop in self.chunks), default=1)
         return max(COPIES * longest, BLOCK // max(1, self.dimension))
 
@@ -396,45 +392,45 @@ class SpectralMap(PlaceMap):
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """See `PlaceMap`."""
         return {**super().get_extra_state(), "routes": [one._asdict() for one in self.routes]}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See `PlaceMap`."""
         super().set_extra_state(state)
         self.routes = checked(state.get("routes", ()), tuple[Route, ...], "the map's routes")
 
     def disagreement(self) -> str:
-        """See `PlaceMap`."""
+        return next((told for wrong, told in self._disagreements() if wrong), "")
+
+    def _disagreements(self) -> Iterator[tuple[bool, str]]:
+        """Whether a rule is broken, and what to say then; each relies on those before it."""
         for name, (dtype, ndim) in FILE.items():
-            tensor = getattr(self, name)
-            if tensor.dtype != dtype or tensor.ndim != ndim:
-                return f"{name} {tuple(tensor.shape)} {tensor.dtype}; expected {dtype} of {ndim} dimensions"
-        lengths, routes = self.lengths.tolist(), self.routes
-        if min(lengths, default=1) < 1 or sum(lengths) != self.places:
-            return f"chunks of {lengths!s:.100} places; expected {self.places} in all"
-        if len(self.steps) != len(lengths) or not bool(((self.steps > 0) & self.steps.isfinite()).all()):
-            return f"steps {self.steps.tolist()!s:.100}; expected {len(lengths)} finite numbers above 0"
-        if self.stream_table.shape != (len(lengths), 2):
-            shape = tuple(self.stream_table.shape)
-            return f"a stream table {shape} for {len(lengths)} chunks; expected a row each"
+            seen = getattr(self, name)
+            fits = seen.dtype == dtype and seen.ndim == ndim
+            yield not fits, f"{name} {tuple(seen.shape)} {seen.dtype}; expected {dtype} of {ndim} dimensions"
+        lengths, steps, routes = self.lengths.tolist(), self.steps, self.routes
+        fits = min(lengths, default=1) >= 1 and sum(lengths) == self.places
+        yield not fits, f"chunks of {lengths!s:.100} places; expected {self.places} in all"
+        fits = len(steps) == len(lengths) and bool(((steps > 0) & steps.isfinite()).all())
+        yield not fits, f"steps {steps.tolist()!s:.100}; expected {len(lengths)} finite numbers above 0"
+        shape = tuple(self.stream_table.shape)
+        told = f"a stream table {shape} for {len(lengths)} chunks; expected a row each"
+        yield shape != (len(lengths), 2), told
         sizes = self.stream_table[:, 0].tolist()
-        if min(sizes, default=0) < 0 or sum(sizes) != len(self.streams):
-            return f"the coded lines are {len(self.streams)} bytes; the table claims {sizes!s:.100}"
+        told = f"the coded lines are {len(self.streams)} bytes; the table claims {sizes!s:.100}"
+        yield min(sizes, default=0) < 0 or sum(sizes) != len(self.streams), told
         shape = (max(1, len(routes)), self.dimension)
-        if self.places and (self.means.shape != shape or not self.means.isfinite().all()):
-            return f"means {tuple(self.means.shape)}; expected {shape} finite numbers"
-        names, places, frames = zip(*routes, strict=True) if routes else ((), (), ())
-        if len({*names}) != len(names) or not all(names):
-            return f"names {', '.join(names)}; expected another one for each of {len(names)} routes"
-        ends = {*accumulate(lengths)}
-        if routes and (
-            sum(places) != self.places or min(places) < 1 or not ends.issuperset(accumulate(places))
-        ):
-            return f"routes of {[*places]!s:.100} places; expected whole chunks, {self.places} places in all"
-        if routes and sum(frames) != self.table.frames:
-            return f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all"
-        return ""
+        fits = not self.places or (self.means.shape == shape and bool(self.means.isfinite().all()))
+        yield not fits, f"means {tuple(self.means.shape)}; expected {shape} finite numbers"
+        if not routes:
+            return
+        names, places, frames = zip(*routes, strict=True)
+        told = f"names {', '.join(names)}; expected another one for each of {len(names)} routes"
+        yield len({*names}) != len(names) or not all(names), told
+        whole = {*accumulate(lengths)}.issuperset(accumulate(places)) and sum(places) == self.places
+        told = f"routes of {[*places]!s:.100} places; expected whole chunks, {self.places} places in all"
+        yield not whole or min(places) < 1, told
+        told = f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all"
+        yield sum(frames) != self.table.frames, told
 
     def loaded(self) -> None:
         """Decode the chunks of a file."""

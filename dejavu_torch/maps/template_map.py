@@ -180,11 +180,9 @@ class TemplateMap(PlaceMap):
         return {"metric": self.metric, "reduction": self.reduction}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """See `PlaceMap`."""
         return super().get_extra_state() | {"temperature": self.temperature}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See `PlaceMap`."""
         super().set_extra_state(state)
         self.temperature = state.get("temperature")
 
@@ -204,9 +202,7 @@ class TemplateMap(PlaceMap):
 
     def distances(self, queries: Tensor, layers: Sequence[int] | None = None) -> list[Tensor]:
         """Eq. 3 for every layer, or for some by their positions in the plan: (Q,D) -> L tensors (Q,P)."""
-        if queries.ndim != 2 or queries.shape[1] != self.dimension:
-            seen = f"the query features are {tuple(queries.shape)}"
-            raise InputError(f"{seen}; the map expects (Q, {self.dimension})")
+        self.check_queries(queries)
         queries, features, blocks = self.weighted(queries), self.layer_features(), self.blocks()
         return [
             phase_distances(queries.index_select(1, features[j]), blocks[j], self.metric)
@@ -235,27 +231,25 @@ class TemplateMap(PlaceMap):
 
     def scores(self, queries: Tensor) -> Tensor:
         """S(i) of all places (eq. 3, eq. 4): (Q,D) -> (Q,N)."""
-        return self._scores_between(queries, 0, self.places)
+        scores = self._sums(queries, 0, self.places)
+        return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
     def score_blocks(
         self, queries: Tensor, start: int = 0, stop: int | None = None
     ) -> Iterator[tuple[int, Tensor]]:
         """See `PlaceMap`: one block, from the layers that cover these places."""
         stop = self.places if stop is None else stop
-        if self.temperature is None:
-            yield start, self._scores_between(queries, start, stop)
-        else:  # a softmax is over all places
-            yield start, self.scores(queries)[:, start:stop]
+        whole = self.temperature is not None  # a softmax is over all places
+        yield start, self.scores(queries)[:, start:stop] if whole else self._sums(queries, start, stop)
 
-    def _scores_between(self, queries: Tensor, start: int, stop: int) -> Tensor:
+    def _sums(self, queries: Tensor, start: int, stop: int) -> Tensor:
         members = [j for j, layer in enumerate(self.plan) if layer.start < stop and layer.stop > start]
         found = dict(zip(members, self.distances(queries, members), strict=True))
         if not found:
             dtype = torch.promote_types(queries.dtype, torch.float32)
             return queries.new_full((queries.shape[0], stop - start), math.inf, dtype=dtype)
         distances = [found.get(j, found[members[0]]) for j in range(len(self.plan))]  # no other row is read
-        scores = self.combine(distances, start, stop)
-        return scores if self.temperature is None else log_posterior(scores, self.temperature)
+        return self.combine(distances, start, stop)
 
     @property
     def block_places(self) -> int:

@@ -93,7 +93,7 @@ class PlaceFilter(SequenceModel):
         if not all(0 <= rate <= 1 for rate in (jump, leave, enter)) or jump + leave > 1:
             seen = f"jump {jump}, leave {leave}, enter {enter}"
             raise InputError(f"{seen}; expected probabilities, jump and leave at most 1 together")
-        if not moves or not all(move >= 0 for move in moves) or not abs(sum(moves) - 1) < 1e-6:
+        if not all(move >= 0 for move in moves) or not abs(sum(moves) - 1) < 1e-6:
             raise InputError(f"the moves are {[*moves]}; expected probabilities that add up to 1")
         if not 0 < sharpness < math.inf or not math.isfinite(off_map):
             seen = f"sharpness {sharpness}, off_map {off_map}"

@@ -65,11 +65,6 @@ class TestTheCompiledLoop:
         expected = (query.double()[:, None] - mu.double()).abs().sum(2)
         torch.testing.assert_close(distances(query, mu).double(), expected, rtol=1e-5, atol=0)
 
-    def test_equals_float64_over_many_features(self) -> None:
-        query, mu = torch.rand(2, 100_003), torch.rand(5, 100_003)
-        expected = (query.double()[:, None] - mu.double()).abs().sum(2)
-        torch.testing.assert_close(distances(query, mu).double(), expected, rtol=1e-5, atol=0)
-
     @SIZES
     def test_equal_templates_have_equal_distances(
         self, queries: int, phases: int, features: int, seed: int
@@ -88,33 +83,17 @@ class TestTheCompiledLoop:
         assert distances(query, mu).tolist() == alone
 
     @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-    @pytest.mark.parametrize("feature", [0, 40, 99])
-    def test_nan_and_infinity_arrive(self, value: float, feature: int) -> None:
+    def test_nan_and_infinity_arrive(self, value: float) -> None:
         query, mu = torch.rand(4, 100), torch.rand(6, 100)
-        query[1, feature] = value
-        mu[5, feature] = value
+        query[1, 40] = mu[5, 40] = value
         expected = torch.cdist(query, mu, p=1.0)
         assert expected.isfinite().sum() == 3 * 5
         torch.testing.assert_close(distances(query, mu), expected, equal_nan=True)
-
-    def test_infinity_minus_infinity_is_nan(self) -> None:
-        rows = torch.tensor([[0.0, torch.inf], [0.0, -torch.inf]])
-        assert str(distances(rows, rows).tolist()) == "[[nan, inf], [inf, nan]]"
 
     def test_rows_need_not_lie_side_by_side(self) -> None:
         query, mu = torch.rand(80, 7).T, torch.rand(20, 161)[::2, 1::2]
         assert torch.equal(distances(query, mu), distances(query.clone(), mu.clone()))
         assert torch.equal(distances(mu[3:4].expand(5, -1), mu)[4], distances(mu, mu)[3])
-
-    def test_no_queries(self) -> None:
-        assert distances(torch.rand(0, 5), torch.rand(3, 5)).shape == (0, 3)
-
-    def test_inputs_stay_as_they_were(self) -> None:
-        query, mu = torch.rand(4, 9), torch.rand(5, 9)
-        kept = query.clone(), mu.clone()
-        distances(query, mu).fill_(7)
-        assert torch.equal(query, kept[0])
-        assert torch.equal(mu, kept[1])
 
     def test_several_threads_at_once(self, forget: Callable[[], None]) -> None:
         query, mu = torch.rand(20, 33), torch.rand(21, 33)
@@ -205,16 +184,7 @@ def test_gradients_are_left_to_torch() -> None:
         (torch.rand(2, ENOUGH[1], device="meta"), torch.rand(ENOUGH, device="meta")),
         (torch.rand(2, ENOUGH[1]), torch.rand(ENOUGH).to_sparse()),
     ],
-    ids=[
-        "few",
-        "f64",
-        "mixed",
-        "f16",
-        "grad",
-        "grad of templates",
-        "meta",
-        "sparse",
-    ],
+    ids=["few", "f64", "mixed", "f16", "grad", "grad of templates", "meta", "sparse"],
 )
 def test_what_is_left_to_torch(query: Tensor, templates: Tensor) -> None:
     assert l1.compiled_l1(query, templates) is None
@@ -230,46 +200,49 @@ def test_what_is_not_left_to_torch() -> None:
         assert l1.compiled_l1(torch.rand(2, ENOUGH[1]), mu) is not None
 
 
+@pytest.mark.parametrize(
+    ("problem", "told"),
+    [
+        ("missing", "by torch, not by numba"),
+        ("broken", "libllvm is of another time"),
+        ("switched off", "NUMBA_DISABLE_JIT"),
+    ],
+)
 @pytest.mark.usefixtures("forget")
-class TestWithoutNumba:
-    def told(self, caplog: pytest.LogCaptureFixture) -> str:
-        """The one line that is logged, once, while torch does the work."""
-        query, mu = torch.rand(3, ENOUGH[1]), torch.rand(ENOUGH)
-        with caplog.at_level(logging.INFO, "dejavu_torch"):
-            for _ in range(2):
-                assert l1.l1_backend() == "torch"
-                assert torch.equal(phase_distances(query, mu), torch.cdist(query, mu, p=1.0))
-        (record,) = caplog.records
-        assert record.levelno == logging.INFO
-        assert "\n" not in record.getMessage()
-        return record.getMessage()
+def test_without_numba_one_line_is_logged_and_torch_does_the_work(
+    problem: str, told: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def njit(*args: object, **options: object) -> None:
+        raise OSError("libllvm\nis of another time")
 
-    def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    if problem == "missing":
         monkeypatch.setitem(sys.modules, "numba", None)
-        assert "by torch, not by numba" in self.told(caplog)
-
-    def test_broken(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-        def njit(*args: object, **options: object) -> None:
-            raise OSError("libllvm\nis of another time")
-
+    elif problem == "broken":
         monkeypatch.setattr(pytest.importorskip("numba"), "njit", njit)
-        assert self.told(caplog).endswith("libllvm is of another time")
-
-    def test_switched_off(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    else:
         monkeypatch.setattr(pytest.importorskip("numba").config, "DISABLE_JIT", 1)
-        assert "NUMBA_DISABLE_JIT" in self.told(caplog)
+    query, mu = torch.rand(3, ENOUGH[1]), torch.rand(ENOUGH)
+    with caplog.at_level(logging.INFO, "dejavu_torch"):
+        for _ in range(2):
+            assert l1.l1_backend() == "torch"
+            assert torch.equal(phase_distances(query, mu), torch.cdist(query, mu, p=1.0))
+    (line,) = caplog.messages
+    assert told in line
+    assert "\n" not in line
 
-    def test_nowhere_to_keep_what_is_compiled(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        numba = pytest.importorskip("numba")
-        njit = numba.njit
 
-        def nowhere(*args: object, cache: bool, **options: object) -> object:
-            if cache:
-                raise RuntimeError("cannot cache function: no locator available")
-            return njit(*args, cache=cache, **options)
+@pytest.mark.usefixtures("forget")
+def test_there_may_be_nowhere_to_keep_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    numba = pytest.importorskip("numba")
+    njit = numba.njit
 
-        monkeypatch.setattr(numba, "njit", nowhere)
-        assert l1.l1_backend() == "numba"
+    def nowhere(*args: object, cache: bool, **options: object) -> object:
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(*args, cache=cache, **options)
+
+    monkeypatch.setattr(numba, "njit", nowhere)
+    assert l1.l1_backend() == "numba"
 
 
 def test_numba_waits_until_it_is_needed() -> None:

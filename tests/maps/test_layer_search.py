@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
 from dejavu_torch.maps import layer_search, template_map
-from dejavu_torch.maps.layer_search import _circles, lowest, sliding_minimum
+from dejavu_torch.maps.layer_search import _circles, lowest
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
@@ -70,16 +70,6 @@ def test_equals_the_scan_in_random_cases() -> None:
             route = random_map(draw, generator)
             with patch.object(layer_search, "AHEAD", draw.choice([1, 7, 4096])):
                 check(route, random_values(draw, generator, draw.randint(1, 5), 3))
-
-
-@pytest.mark.usefixtures("always")
-def test_equals_the_scan_below_and_above_the_common_period() -> None:
-    for periods in ((210, 286), (200, 200), (64, 256), (199, 201), (1, 300)):
-        for places in (5000, 60_000):
-            plan = tuple(FrequencyLayer(Fraction(p), p, 17, places, (j,)) for j, p in enumerate(periods))
-            generator = torch.Generator().manual_seed(places)
-            blocks = [torch.rand(p, 1, generator=generator) for p in periods]
-            check(TemplateMap(plan, blocks, places, 2), torch.rand(8, 2, generator=generator))
 
 
 def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan() -> None:
@@ -152,11 +142,3 @@ def test_two_rows_are_searched_beyond_their_common_period() -> None:
             score, place = lowest(one, other, places, 3)
             assert torch.equal(score, sums.amin(1))
             assert torch.equal(place, sums.min(1).indices)
-
-
-def test_sliding_minimum_is_that_of_every_window() -> None:
-    for size in (1, 2, 7, 12):
-        values = torch.randint(0, 9, (2, 3, size), generator=torch.Generator().manual_seed(size))
-        for width in range(1, size + 1):
-            windows = torch.stack([values.roll(-k, -1) for k in range(width)])
-            assert torch.equal(sliding_minimum(values, width), windows.amin(0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 import tempfile
 from pathlib import Path
@@ -18,7 +17,6 @@ from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.maps import quantisation
-from dejavu_torch.maps.quantisation import RouteLines
 from dejavu_torch.maps.spectral import SpectralMapper
 
 SETTINGS: list[dict[str, Any]] = [
@@ -77,22 +75,6 @@ def test_in_blocks_too_it_is_told_what_would_hold_half_of_the_route() -> None:
     assert learned.needed is not None
     enough = SpectralMapper(learned.needed * 1.05)(noise)
     assert 0.45 < 1 - float((held(enough) - noise).square().sum() / noise.square().sum()) < 0.6
-
-
-@pytest.mark.usefixtures("in_blocks")
-def test_in_blocks_what_is_alike_is_refused() -> None:
-    with refused("900", "alike"):
-        SpectralMapper()(torch.ones(900, 24))
-
-
-def test_lines_and_their_scale_are_those_of_each_chunk() -> None:
-    descriptors = route(300, 5)
-    lines = RouteLines(descriptors, [200, 100], "dft")
-    centred = descriptors - lines.mean.float()
-    assert torch.allclose(lines.lines[200:].square().sum(), centred[200:].square().sum())
-    assert math.isclose(lines.scale, float(centred.square().mean().sqrt()), rel_tol=1e-5)
-    assert lines.error(lines.scale / 64) < 0.001 * lines.energy
-    assert not any(levels.any() for levels in lines.levels(lines.coarsest))
 
 
 class TestRoomInAFile:

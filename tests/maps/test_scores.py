@@ -22,7 +22,6 @@ from dejavu_torch import (
     TemplateMap,
     TemplateMapper,
     best_match,
-    phase_distances,
 )
 from dejavu_torch.maps.template_map import log_posterior, segments
 from dejavu_torch.periods.finder import PeriodFinder
@@ -80,20 +79,6 @@ def test_the_place_found_is_the_references(route: reference.Route) -> None:
     assert match.accepted.tolist() == [reference.accepted(row, 4.0) for row in rows]
 
 
-def test_a_score_is_the_sum_of_the_distances_of_its_phases() -> None:
-    for metric in METRICS:
-        values = torch.randn(50, 4, dtype=torch.float64)
-        route, queries = make(values, MIXED), torch.randn(3, 4, dtype=torch.float64)
-        scores = scored(queries, route, metric, "sum")
-        parts = [
-            phase_distances(queries[:, list(layer.features)], mu, metric)
-            for layer, mu in zip(MIXED, route.blocks(), strict=True)
-        ]
-        torch.testing.assert_close(scores[:, 2], parts[0][:, 2])
-        torch.testing.assert_close(scores[:, 13], parts[0][:, 1] + parts[1][:, reference.phase(13, MIXED[1])])
-        torch.testing.assert_close(scores[:, 40], parts[2][:, 40 % 7])
-
-
 # ----------------------------------------------------------------- closed form
 
 
@@ -118,15 +103,6 @@ def test_score_is_0_exactly_at_the_common_period(periods: tuple[Fraction, ...], 
     assert torch.equal(scores <= 1e-12, (i - q) % common == 0)
 
 
-def test_shifting_the_route_shifts_the_scores() -> None:
-    for shift in (1, 5, -13):
-        values = torch.randint(-16, 17, (48, 3)).double() / 8  # 48: whole turns of both layers
-        plan = (whole(12, 48, (0, 1)), whole(16, 48, (1, 2)))
-        queries = torch.randn(5, 3, dtype=torch.float64)
-        scores, shifted = (scored(queries, make(v, plan)) for v in (values, values.roll(shift, 0)))
-        torch.testing.assert_close(shifted, scores.roll(shift, 1), rtol=0, atol=1e-12)
-
-
 @given(route=reference.routes(), random=st.randoms(use_true_random=False))
 def test_permuting_features_changes_nothing(route: reference.Route, random: object) -> None:
     values, plan = route
@@ -138,12 +114,6 @@ def test_permuting_features_changes_nothing(route: reference.Route, random: obje
     )
     before = scored(values, make(values, plan))
     after = scored(values[:, order], make(values[:, order], moved))
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
-
-
-def test_the_order_of_the_layers_changes_nothing() -> None:
-    values = torch.randn(50, 4, dtype=torch.float64)
-    before, after = (scored(values, make(values, plan)) for plan in (MIXED, MIXED[::-1]))
     torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
 
 
@@ -221,16 +191,6 @@ def test_segments_cut_the_route_where_coverage_changes(route: reference.Route) -
             assert members == tuple(j for j, layer in enumerate(plan) if layer.start <= i < layer.stop)
 
 
-def test_combine_the_layers_of_a_plan_by_hand() -> None:
-    distances = [torch.tensor([[1.0, 2.0]]), torch.tensor([[10.0, 20.0, 30.0]])]
-    plan = (whole(2, 4), whole(3, 6, (0, 1), start=2))
-    blocks = [torch.zeros(layer.phases, len(layer.features)) for layer in plan]
-    total = TemplateMap(plan, blocks, 7, 2, reduction="sum").combine(distances)
-    assert total.tolist() == [[1, 2, 31, 12, 20, 30, math.inf]]
-    mean = TemplateMap(plan, blocks, 7, 2).combine(distances)
-    torch.testing.assert_close(mean, torch.tensor([[1, 2, 31 / 3, 4, 10, 15, math.inf]]))
-
-
 # ------------------------------------------------- gradients, batches, precision
 
 
@@ -244,34 +204,6 @@ def test_gradients_are_right_towards_queries_and_templates(metric: str, reductio
         return TemplateMap(plan, blocks, 10, 3, metric, reduction).scores(queries)  # type: ignore[arg-type]
 
     assert torch.autograd.gradcheck(covered, (queries, *blocks))
-
-
-def test_gradients_reach_the_reference_features() -> None:
-    values = torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
-    queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
-    plan = (whole(3, 10, (0, 2)), whole(4, 10, (1,)))
-    assert torch.autograd.gradcheck(lambda q, v: scored(q, make(v, plan)), (queries, values))
-
-
-def test_uncovered_places_leave_gradients_finite() -> None:
-    values = torch.rand(60, 4)
-    queries = torch.rand(3, 4, requires_grad=True)
-    scores = scored(queries, make(values, MIXED))
-    torch.logsumexp(-scores, 1).sum().backward()
-    assert queries.grad is not None
-    assert queries.grad.isfinite().all()
-    assert queries.grad.count_nonzero() > 0
-
-
-def test_a_batch_is_its_queries_one_by_one() -> None:
-    for metric in METRICS:
-        values = torch.rand(60, 4)
-        route, queries = TemplateMap(MIXED, make(values, MIXED).blocks(), 60, 4, metric), torch.rand(9, 4)
-        together = route(queries)
-        assert together.shape == (9, 60)
-        torch.testing.assert_close(torch.cat([route(row[None]) for row in queries]), together)
-        order = torch.randperm(9)
-        torch.testing.assert_close(route(queries[order]), together[order])
 
 
 def test_convention_10_scores_are_float32_whatever_the_autocast() -> None:
@@ -327,11 +259,6 @@ def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: typ
     assert largest(900) == largest(64) == 16 * 500
 
 
-def test_double_maps_give_double_scores() -> None:
-    values = torch.rand(50, 4)
-    assert scored(values, make(values, MIXED).double()).dtype == torch.float64
-
-
 def test_half_maps_are_matched_in_single_precision() -> None:
     values = torch.rand(50, 4)
     route = make(values, MIXED)
@@ -341,10 +268,10 @@ def test_half_maps_are_matched_in_single_precision() -> None:
     torch.testing.assert_close(half, exact, rtol=0, atol=1e-3)
 
 
-def test_queries_of_another_dimension_are_refused() -> None:
-    for shape in ((3, 5), (3, 3), (4,), (2, 3, 4)):
-        with pytest.raises(InputError, match=r"query features are .*; the map expects \(Q, 4\)"):
-            scored(torch.rand(shape), make(torch.rand(50, 4), MIXED))
+@pytest.mark.parametrize("shape", [(3, 5), (4,)])
+def test_queries_of_another_dimension_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match=r"query features are .*; the map expects \(Q, 4\)"):
+        scored(torch.rand(shape), make(torch.rand(50, 4), MIXED))
 
 
 @pytest.mark.parametrize(
@@ -353,8 +280,6 @@ def test_queries_of_another_dimension_are_refused() -> None:
         ({"metric": "manhattan"}, r"metric 'manhattan' is unknown; expected l1, l2, cosine"),
         ({"reduction": "max"}, r"reduction 'max' is unknown; expected 'mean' or 'sum'"),
         ({"temperature": 0.0}, r"temperature is 0.0; expected a number above 0"),
-        ({"temperature": -1.0}, r"temperature is -1.0; expected a number above 0"),
-        ({"temperature": math.inf}, r"temperature is inf; expected a number above 0"),
         ({"temperature": math.nan}, r"temperature is nan; expected a number above 0"),
     ],
 )
@@ -387,23 +312,12 @@ def test_log_posterior_equals_the_loops(rows: list[list[float]], temperature: fl
 def test_log_posterior_in_closed_form() -> None:
     """Two places D apart: log(1 + exp(-D / T)) and that of -D; n equal ones: log n."""
     low, high = log_posterior(torch.tensor([[1.0, 1.5]], dtype=torch.float64), 0.25)[0].tolist()
-    assert low == pytest.approx(math.log1p(math.exp(-2)))
-    assert high == pytest.approx(math.log1p(math.exp(2)))
+    assert (low, high) == (pytest.approx(math.log1p(math.exp(-2))), pytest.approx(math.log1p(math.exp(2))))
     equal = log_posterior(torch.full((2, 7), 3.0), 0.1)
     torch.testing.assert_close(equal, torch.full((2, 7), math.log(7)))
     assert log_posterior(torch.tensor([[math.inf, 5.0]]), 0.1).tolist() == [[math.inf, 0.0]]
-
-
-def test_log_posterior_survives_scores_far_beyond_the_temperature() -> None:
-    found = log_posterior(torch.tensor([[3000.0, 3001.0, math.inf]]), 1e-3)
-    assert found.tolist() == [[0.0, pytest.approx(1000.0), math.inf]]
-
-
-def test_log_posterior_does_not_see_what_fits_no_place() -> None:
-    """What raises S at all places alike changes nothing: that is what makes queries comparable."""
-    scores = torch.rand(3, 8, dtype=torch.float64)
-    shifted = scores + torch.tensor([[0.0], [5.0], [50.0]])
-    torch.testing.assert_close(log_posterior(shifted, 0.3), log_posterior(scores, 0.3), rtol=0, atol=1e-10)
+    far = log_posterior(torch.tensor([[3000.0, 3001.0, math.inf]]), 1e-3)
+    assert far.tolist() == [[0.0, pytest.approx(1000.0), math.inf]]
 
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
@@ -455,6 +369,13 @@ def test_places_at_inf_leave_gradients_finite() -> None:
     assert scores.grad[0, 0] != 0
 
 
+def test_gradients_reach_the_reference_features() -> None:
+    values = torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
+    queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    plan = (whole(3, 10, (0, 2)), whole(4, 10, (1,)))
+    assert torch.autograd.gradcheck(lambda q, v: scored(q, make(v, plan)), (queries, values))
+
+
 def test_gradients_reach_queries_and_templates_through_a_temperature() -> None:
     plan = (whole(3, 8, (0, 2)), FrequencyLayer(Fraction(5, 2), 2, 4, 10, (0, 1)))
     queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
@@ -464,16 +385,3 @@ def test_gradients_reach_queries_and_templates_through_a_temperature() -> None:
         return scored(queries, TemplateMap(plan, blocks, 10, 3), temperature=0.5)
 
     assert torch.autograd.gradcheck(covered, (queries, *blocks))
-
-
-def test_distances_are_those_of_each_layer_and_combine_to_the_scores() -> None:
-    values, queries = torch.rand(60, 4), torch.rand(3, 4)
-    route = make(values, MIXED)
-    distances = route.distances(queries)
-    assert [tuple(part.shape) for part in distances] == [(3, 4), (3, 3), (3, 7)]
-    for part, layer, block in zip(distances, MIXED, route.blocks(), strict=True):
-        torch.testing.assert_close(part, (queries[:, None, list(layer.features)] - block).abs().sum(2))
-    assert torch.equal(route.combine(distances), route.scores(queries))
-    assert TemplateMap((), (), 20, 4).distances(queries) == []
-    with pytest.raises(InputError, match=r"query features are \(3, 5\); the map expects \(Q, 4\)"):
-        route.distances(torch.rand(3, 5))

@@ -40,14 +40,6 @@ def test_chunks_of_a_plan_made_by_hand() -> None:
     assert (third.start, third.stop, third.common_period) == (1900, 2100, 60)
 
 
-def test_the_order_of_the_layers_does_not_matter_to_the_totals() -> None:
-    a, b = summarise(PLAN, 2500, {}), summarise(PLAN[::-1], 2500, {})
-    assert (a.covered, a.templates, a.template_numbers) == (b.covered, b.templates, b.template_numbers)
-    assert [(x.start, x.stop, x.common_period) for x in a.chunks] == [
-        (x.start, x.stop, x.common_period) for x in b.chunks
-    ]
-
-
 def test_a_plan_without_layers() -> None:
     summary = summarise((), places=50, route={"layers": 200})
     assert (summary.places, summary.covered, summary.templates, summary.chunks) == (50, 0, 0, ())
@@ -77,9 +69,3 @@ def test_description_of_many_layers_stays_short() -> None:
     first, *_ = str(summarise(plan, 1024, {})).splitlines()
     assert "100 layers" in first
     assert len(first) < 300
-
-
-def test_a_summary_prints_as_lines_for_a_person() -> None:
-    summary = summarise(PLAN, 2500, {"templates": 1})
-    assert str(summary) == repr(summary)
-    assert "Fraction" not in str(summary)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from fractions import Fraction
 
 import pytest
@@ -33,24 +32,6 @@ def test_mask_equals_reference(route: reference.Route) -> None:
     assert mask.tolist() == [[reference.mask(i, k, layer) for i in range(n)] for k in range(layer.phases)]
 
 
-@pytest.mark.parametrize(
-    ("period", "phases"), [(93, 93), (Fraction(195, 2), 98), (115, 23), (7, 12), (Fraction(22, 7), 3)]
-)
-def test_each_frame_of_the_chunk_has_exactly_one_phase(period: Fraction, phases: int) -> None:
-    mask = phase_mask(500, period, phases, 40, 410)
-    assert mask.shape == (phases, 500)
-    assert mask.sum(0).tolist() == [0.0] * 40 + [1.0] * 370 + [0.0] * 90
-
-
-def test_97_and_a_half_frames_in_98_phases() -> None:
-    layer = FrequencyLayer(Fraction(195, 2), 98, 0, 390, (0,))
-    phase = layer.place_phases.tolist()
-    assert phase == [reference.phase(i, layer) for i in range(390)]
-    assert phase[:195] == phase[195:]  # two periods are 195 frames
-    assert phase[:98] == list(range(98))
-    assert set(phase) == set(range(98))
-
-
 def test_115_frames_in_23_phases_are_bins_of_5_frames() -> None:
     phase = FrequencyLayer(Fraction(115), 23, 0, 230, (0,)).place_phases
     assert phase.tolist() == [i % 115 // 5 for i in range(230)]
@@ -76,26 +57,12 @@ def test_convention_1_the_mask_is_zero_outside_the_half_open_chunk() -> None:
     assert mu.tolist() == [[1.0], [2.0]]
 
 
-def test_mask_dtype() -> None:
-    for dtype in (None, torch.float64, torch.bool):
-        assert phase_mask(5, 2, dtype=dtype).dtype == (dtype or torch.float32)
-
-
 @given(reference.routes())
 def test_templates_equal_reference(route: reference.Route) -> None:
     found = PhaseTemplates()(route.values, route.plan)
     for mu, layer in zip(found, route.plan, strict=True):
         expected = torch.tensor(reference.templates(route.values.tolist(), layer), dtype=torch.float64)
         torch.testing.assert_close(mu, expected, rtol=0, atol=1e-12)
-
-
-@given(reference.routes())
-def test_templates_are_means_under_the_mask(route: reference.Route) -> None:
-    n = len(route.values)
-    for mu, layer in zip(PhaseTemplates()(route.values, route.plan), route.plan, strict=True):
-        mask = phase_mask(n, layer.period, layer.phases, layer.start, layer.stop, torch.float64)
-        total = mask @ route.values[:, list(layer.features)]
-        torch.testing.assert_close(mu, total / mask.sum(1, keepdim=True).clamp(min=1), rtol=0, atol=1e-12)
 
 
 def test_a_perfectly_periodic_traverse_is_reproduced() -> None:
@@ -107,12 +74,55 @@ def test_a_perfectly_periodic_traverse_is_reproduced() -> None:
         assert torch.equal(mu[torch.arange(len(values)) % period], values)
 
 
-def test_a_rational_period_is_reproduced_too() -> None:
-    layer = FrequencyLayer(Fraction(5, 2), 5, 0, 20, (0, 1))
-    cycle = torch.randint(-8, 9, (5, 2)).double() / 8  # 2.5 frames in 5 phases: every second one is seen,
-    values = cycle[layer.place_phases]  # on the second turn the others
-    (mu,) = PhaseTemplates()(values, [layer])
-    assert torch.equal(mu, cycle)
+def test_a_phase_without_frames_is_finite() -> None:
+    values = torch.ones(3, 1, requires_grad=True)
+    (mu,) = PhaseTemplates()(values, [whole(5, stop=3)])
+    assert mu[:, 0].tolist() == [1, 1, 1, 0, 0]
+    mu.sum().backward()
+    assert values.grad is not None
+    assert values.grad.isfinite().all()
+
+
+def test_gradients_are_right() -> None:
+    values = torch.randn(14, 3, dtype=torch.float64, requires_grad=True)
+    plan = [
+        whole(4, 14, (0, 2)),
+        FrequencyLayer(Fraction(5, 2), 3, 2, 11, (0, 1)),
+        FrequencyLayer(Fraction(6), 2, 5, 9, (1,)),
+    ]
+    assert torch.autograd.gradcheck(lambda x: PhaseTemplates()(x, plan), values)
+
+
+def test_masks_that_make_no_sense_are_refused() -> None:
+    for arguments, message in (
+        ({"period": Fraction(5, 2)}, r"period 5/2 and no phases; expected phases"),
+        ({"period": 3, "stop": 11}, r"chunk \[0, 11\); expected it inside 10 frames"),
+        ({"period": 3, "start": 5, "stop": 5}, r"covers \[5, 5\); expected 0 <= start < stop"),
+        ({"period": 3, "start": -1}, r"covers \[-1, 0\); expected 0 <= start < stop"),
+        ({"period": 0}, r"period 0 .*expected period > 0"),
+        ({"period": -3, "phases": 3}, r"period -3 .*expected period > 0"),
+        ({"period": 3, "phases": 0}, r"0 phases; expected .*phases >= 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            phase_mask(10, **arguments)
+
+
+def test_a_layer_beyond_the_traverse_is_refused() -> None:
+    for layer, message in (
+        (whole(3, stop=11), r"covers \[0, 11\) and feature 0; expected it inside 10 places of 2 features"),
+        (whole(3, 10, (0, 2)), r"feature 2; expected it inside 10 places of 2 features"),
+    ):
+        with pytest.raises(InputError, match=message):
+            PhaseTemplates()(torch.rand(10, 2), [layer])
+
+
+@given(reference.routes())
+def test_templates_are_means_under_the_mask(route: reference.Route) -> None:
+    n = len(route.values)
+    for mu, layer in zip(PhaseTemplates()(route.values, route.plan), route.plan, strict=True):
+        mask = phase_mask(n, layer.period, layer.phases, layer.start, layer.stop, torch.float64)
+        total = mask @ route.values[:, list(layer.features)]
+        torch.testing.assert_close(mu, total / mask.sum(1, keepdim=True).clamp(min=1), rtol=0, atol=1e-12)
 
 
 @given(st.integers(2, 9), st.integers(1, 4), st.integers(-20, 20))
@@ -122,13 +132,6 @@ def test_shifting_the_traverse_rolls_the_templates(period: int, turns: int, shif
     (mu,) = PhaseTemplates()(values, [layer])
     (shifted,) = PhaseTemplates()(values.roll(shift, 0), [layer])
     assert torch.equal(shifted, mu.roll(shift, 0))
-
-
-def test_a_later_chunk_has_the_templates_of_its_own_frames() -> None:
-    values = torch.randn(30, 2)
-    (late,) = PhaseTemplates()(values, [whole(5, start=10, stop=30, features=(0, 1))])
-    (alone,) = PhaseTemplates()(values[10:], [whole(5, stop=20, features=(0, 1))])
-    torch.testing.assert_close(late, alone)
 
 
 @given(reference.routes(), st.randoms(use_true_random=False))
@@ -151,72 +154,3 @@ def test_permuting_features_changes_no_template(route: reference.Route, random: 
     for layer, other, a, b in zip(route.plan, moved, before, after, strict=True):
         columns = [other.features.index(order.index(j)) for j in layer.features]
         assert torch.equal(a, b[:, columns])
-
-
-def test_a_phase_without_frames_is_finite() -> None:
-    values = torch.ones(3, 1, requires_grad=True)
-    (mu,) = PhaseTemplates()(values, [whole(5, stop=3)])
-    assert mu[:, 0].tolist() == [1, 1, 1, 0, 0]
-    mu.sum().backward()
-    assert values.grad is not None
-    assert values.grad.isfinite().all()
-
-
-def test_gradients_are_right() -> None:
-    values = torch.randn(14, 3, dtype=torch.float64, requires_grad=True)
-    plan = [
-        whole(4, 14, (0, 2)),
-        FrequencyLayer(Fraction(5, 2), 3, 2, 11, (0, 1)),
-        FrequencyLayer(Fraction(6), 2, 5, 9, (1,)),
-    ]
-    assert torch.autograd.gradcheck(lambda x: PhaseTemplates()(x, plan), values)
-
-
-def test_dtype_follows_the_features() -> None:
-    for dtype in (torch.float32, torch.float64):
-        (mu,) = PhaseTemplates()(torch.ones(4, 1, dtype=dtype), [whole(2, 4)])
-        assert mu.dtype == dtype
-
-
-def test_state_dict_round_trip() -> None:
-    PhaseTemplates().load_state_dict(PhaseTemplates().state_dict())
-
-
-def test_a_plan_without_layers_has_no_templates() -> None:
-    assert PhaseTemplates()(torch.rand(5, 2), ()) == ()
-
-
-def test_masks_that_make_no_sense_are_refused() -> None:
-    for arguments, message in (
-        ({"period": Fraction(5, 2)}, r"period 5/2 and no phases; expected phases"),
-        ({"period": 3, "stop": 11}, r"chunk \[0, 11\); expected it inside 10 frames"),
-        ({"period": 3, "start": 5, "stop": 5}, r"covers \[5, 5\); expected 0 <= start < stop"),
-        ({"period": 3, "start": -1}, r"covers \[-1, 0\); expected 0 <= start < stop"),
-        ({"period": 0}, r"period 0 .*expected period > 0"),
-        ({"period": -3, "phases": 3}, r"period -3 .*expected period > 0"),
-        ({"period": 3, "phases": 0}, r"0 phases; expected .*phases >= 1"),
-    ):
-        with pytest.raises(InputError, match=message):
-            phase_mask(10, **arguments)
-
-
-def test_layers_name_each_feature_once_in_order() -> None:
-    for features in ((), (1, 0), (0, 0), (-1, 2)):
-        with pytest.raises(InputError, match=r"feature indices must be .*increasing"):
-            whole(3, 10, features)
-
-
-def test_a_layer_beyond_the_traverse_is_refused() -> None:
-    for layer, message in (
-        (whole(3, stop=11), r"covers \[0, 11\) and feature 0; expected it inside 10 places of 2 features"),
-        (whole(3, 10, (0, 2)), r"feature 2; expected it inside 10 places of 2 features"),
-    ):
-        with pytest.raises(InputError, match=message):
-            PhaseTemplates()(torch.rand(10, 2), [layer])
-
-
-def test_phases_of_a_turn_may_have_unequal_lengths() -> None:
-    """7 frames in 3 phases: 3, 2 and 2 frames, in every turn the same."""
-    phase = FrequencyLayer(Fraction(7), 3, 0, 21, (0,)).place_phases.tolist()
-    assert Counter(phase) == {0: 9, 1: 6, 2: 6}
-    assert phase[:7] == phase[7:14] == [0, 0, 0, 1, 1, 2, 2]

@@ -124,15 +124,6 @@ def test_a_file_gives_back_the_network_bit_for_bit(tmp_path: Path, make: Any) ->
     assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
 
 
-def test_the_bytes_are_a_quarter() -> None:
-    wide = DejaVu(small()).learn(frames())
-    assert wide.weight_bits == 32
-    narrow = DejaVu(small(), weight_bits=8).learn(frames())
-    sizes = [model.summary().fixed["backbone"] for model in (wide, narrow)]
-    assert sizes[0] == sum(tensor.nbytes for tensor in wide.features.state_dict().values())
-    assert 0.25 < sizes[1] / sizes[0] < 0.32
-
-
 @pytest.mark.parametrize("take", [DejaVu.take_whitening, DejaVu.take_descriptor])
 def test_what_another_map_brings_stays_in_8_bits(tmp_path: Path, take: Any) -> None:
     DejaVu(small(), weight_bits=8).learn(frames()).save(path := tmp_path / "map.safetensors")

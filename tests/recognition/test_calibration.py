@@ -27,7 +27,6 @@ from dejavu_torch.recognition.calibration import (
     confidence_of,
     fit,
 )
-from dejavu_torch.types import Match
 
 INF = math.inf
 ROUTE, AGAIN = "sim:aerial?frames=160", "sim:aerial?frames=160&traverse=1"
@@ -230,16 +229,10 @@ def test_changed_frames_show_their_places_whatever_the_batch() -> None:
         torch.cat(list(augmented_segments(unread, 300, plain).batches(9))), frames[same.places]
     )
     with refused("ready features"):
-        augmented_segments(open_source_of(torch.rand(30, 4)), 30, plain)
+        augmented_segments(as_traverse(torch.rand(30, 4)), 30, plain)
     for strengths in ({"noise": {}}, {"noise": float("nan")}, {"nose": 0.1}):  # of a file
         with refused("nois" if "noise" in strengths else "nose"):
             augmented_segments(open_source("sim:aerial?frames=30"), 30, strengths)
-
-
-def open_source_of(features: Tensor):  # type: ignore[no-untyped-def]
-    from dejavu_torch.data.arrays import as_traverse
-
-    return as_traverse(features)
 
 
 # models
@@ -322,31 +315,37 @@ def test_a_map_without_calibration_tells_no_probability() -> None:
     features = torch.rand(64, 8)
     model = DejaVu(whitening="none").learn(features)
     assert model.localize(features).probability is None
-    with refused("ready features"):
-        model.calibrate(features)
-    with refused("no map"):
-        DejaVu().calibrate(features)
-    with refused("neither a reference nor views"):
-        model.calibrate(None)
-    with refused("60 frames and 64 places"):
-        model.calibrate(None, Views(open_source_of(features[:60]), torch.arange(64)))
-    with refused("shows place 64", "one of 64"):
-        model.calibrate(None, Views(open_source_of(features), torch.arange(64) + 1))
-    with refused("calibrating by", "none of"):
-        model.calibrate(None, Views(open_source_of(features.flip(0)[:20]), torch.arange(20)))
-    model.calibrate(None, Views(open_source_of(features + 0.01), torch.arange(64)))
+    views, numbers = as_traverse(features), torch.arange(64)
+    for one, arguments, words in (
+        (model, (features,), ["ready features"]),
+        (DejaVu(), (features,), ["no map"]),
+        (model, (None,), ["neither a reference nor views"]),
+        (model, (None, Views(as_traverse(features[:60]), numbers)), ["60 frames and 64 places"]),
+        (model, (None, Views(views, numbers + 1)), ["shows place 64", "one of 64"]),
+        (
+            model,
+            (None, Views(as_traverse(features.flip(0)[:20]), numbers[:20])),
+            ["calibrating by", "none of"],
+        ),
+    ):
+        with refused(*words):
+            one.calibrate(*arguments)
+    model.calibrate(None, Views(as_traverse(features + 0.01), numbers))
     assert model.localize(features).probability is not None
 
 
-@pytest.mark.parametrize("precision", [0.0, 1.0, -1.0, math.nan])
-def test_a_precision_is_a_share(precision: float) -> None:
-    with refused("precision", "above 0 and below 1"):
-        DejaVu(precision=precision)
-
-
-def test_a_threshold_or_a_precision() -> None:
-    with refused("threshold", "precision", "one of them"):
-        DejaVu(threshold=1.0, precision=0.9)
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"precision": 0.0}, ["precision", "above 0 and below 1"]),
+        ({"precision": 1.0}, ["precision", "above 0 and below 1"]),
+        ({"precision": math.nan}, ["precision", "above 0 and below 1"]),
+        ({"threshold": 1.0, "precision": 0.9}, ["threshold", "precision", "one of them"]),
+    ],
+)
+def test_a_precision_is_a_share(settings: dict[str, float], words: list[str]) -> None:
+    with refused(*words):
+        DejaVu(**settings)  # type: ignore[arg-type]
 
 
 def test_an_export_tells_how_to_get_probabilities(model: DejaVu, tmp_path: Path) -> None:
@@ -361,21 +360,3 @@ def test_an_export_tells_how_to_get_probabilities(model: DejaVu, tmp_path: Path)
     margin = scores.masked_fill(~beyond, INF).amin(1) - best
     told = torch.sigmoid(facts["slope"] * (facts["margin"] * margin - best) + facts["offset"]).double()
     torch.testing.assert_close(told, model.localize(queries).probability, atol=1e-3, rtol=0)
-
-
-def test_matches_join_and_change_with_and_without_probability() -> None:
-    one = Match(torch.tensor([1]), torch.tensor([0.5]), torch.tensor([True]))
-    assert Match.joined([one, one]).probability is None
-    sure = one._replace(probability=torch.tensor([0.9]))
-    assert sure._replace(index=torch.tensor([2])).probability is sure.probability
-    both = Match.joined([sure, sure]).map(lambda column: column[1:])
-    assert (both.probability, len(both)) == (torch.tensor([0.9]), 3)
-
-
-def test_a_calibration_is_of_its_way_of_matching() -> None:
-    single, followed = Platt(1.0, 0.0), Platt(2.0, 0.0)
-    both = Calibration(single, followed)
-    assert both.of(None) is single
-    assert both.of(PlaceFilter()) is followed
-    assert both.of(PlaceFilter(search_every=3)) is None
-    assert both.of(SequenceMatcher(3)) is None

@@ -84,11 +84,6 @@ def test_batches_do_not_matter(rows: list[list[float]], filter_: PlaceFilter, si
     assert torch.allclose(torch.cat(list(streamed(filter_, scores.split(size)))), filter_(scores), rtol=1e-4)
 
 
-def test_later_queries_change_nothing() -> None:
-    scores = torch.rand(20, 30)
-    assert torch.equal(PlaceFilter()(scores)[:12], PlaceFilter()(scores[:12]))
-
-
 def test_neither_unit_nor_origin_of_the_scores_matters() -> None:
     scores = torch.rand(20, 30, dtype=torch.float64)
     assert torch.allclose(PlaceFilter().posterior(scores), PlaceFilter().posterior(7 * scores + 3))
@@ -159,15 +154,6 @@ def test_a_query_that_scores_all_places_alike_says_nothing() -> None:
         assert torch.allclose(filter_.posterior(alike, before)[0], filter_.moved(before, 7))
 
 
-def test_what_a_filter_learned_is_kept_by_its_state() -> None:
-    learned, scores = PlaceFilter(sharpness=2, moves=(0.5, 0.3, 0.2)), torch.rand(5, 9)
-    with torch.no_grad():
-        learned.off_map += 0.7
-    fresh = PlaceFilter()
-    fresh.load_state_dict(learned.state_dict())
-    assert torch.equal(fresh(scores), learned(scores))
-
-
 def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
     route = torch.randn(80, 32, generator=torch.Generator().manual_seed(3))
     model = DejaVu(whitening="none", threshold=1e-9).learn(route)
@@ -180,14 +166,6 @@ def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
     model.batch_size = 7
     again = model.localize(route[10:50], sequence=PlaceFilter())
     assert torch.allclose(again.score, found.score, rtol=1e-3)
-
-
-def test_a_dark_frame_says_nothing_whatever_its_score() -> None:
-    for value in (0.1, 0.7, 3.3, 123.456):
-        filter_ = PlaceFilter()
-        for places in (300, 1003):
-            start = filter_.posterior(torch.full((1, places), value))[0].detach()
-            assert start[-1] == pytest.approx(0.001 / 0.011, abs=1e-3)
 
 
 def test_gradients_are_finite_where_something_is_impossible() -> None:
@@ -216,21 +194,16 @@ def test_no_graph_grows_from_batch_to_batch() -> None:
     [
         (lambda: PlaceFilter(moves=()), ["moves are []", "add up to 1"]),
         (lambda: PlaceFilter(moves=(0.5, 0.6)), ["moves are [0.5, 0.6]", "add up to 1"]),
-        (lambda: PlaceFilter(moves=(1.5, -0.5)), ["moves are [1.5, -0.5]"]),
         (lambda: PlaceFilter(moves=(math.nan, 1)), ["moves are [nan, 1.0]"]),
         (lambda: PlaceFilter(jump=0.7, leave=0.5), ["jump 0.7, leave 0.5", "at most 1"]),
-        (lambda: PlaceFilter(enter=-0.1), ["enter -0.1"]),
         (lambda: PlaceFilter(jump=math.nan), ["jump nan"]),
         (lambda: PlaceFilter(sharpness=0), ["sharpness 0", "above 0"]),
         (lambda: PlaceFilter(off_map=math.inf), ["off_map inf"]),
         (lambda: PlaceFilter(within=-1), ["within is -1", "at least 0"]),
-        (lambda: PlaceFilter(search_every=0), ["search_every is 0", "at least 1"]),
         (lambda: PlaceFilter()(torch.rand(4)), ["(4,)", "(Q,N)"]),
         (lambda: PlaceFilter()(torch.zeros(3, 4, dtype=torch.int64)), ["torch.int64", "floats"]),
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.rand(6)), ["posterior (6,)", "(5,)"]),
-        (lambda: PlaceFilter()(torch.rand(2, 4), -torch.ones(5)), ["adds up to -5", "to 1"]),
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.ones(5)), ["adds up to 5", "to 1"]),
-        (lambda: PlaceFilter()(torch.rand(2, 4), torch.full((5,), math.nan)), ["adds up to nan"]),
         (lambda: PlaceFilter(within=2.5), ["within is 2.5", "whole"]),  # type: ignore[arg-type]
         (lambda: PlaceFilter(search_every=2.5), ["search_every is 2.5"]),  # type: ignore[arg-type]
         (lambda: PlaceFilter(threshold=math.nan), ["threshold is NaN"]),
@@ -282,18 +255,6 @@ def test_where_the_camera_is_known_only_its_neighbourhood_is_scored() -> None:
     assert torch.equal(found.argmin(1)[after], everything.argmin(1)[after])
     difference = ((-found).exp() - (-everything).exp()).abs()
     assert difference[:200].max() < 0.02
-
-
-def test_a_filter_that_searches_for_every_query_scores_all_places() -> None:
-    scores, route = standing_out(50, [*range(10, 40)]), Watched(50)
-    assert torch.equal(followed(PlaceFilter(), scores, route), PlaceFilter()(scores))
-    assert route.scored == scores.numel()
-
-
-def test_who_is_lost_is_searched_for_everywhere() -> None:
-    route = Watched(200)
-    followed(PlaceFilter(search_every=50), standing_out(200, [-1] * 30), route)
-    assert route.scored > 0.9 * 30 * 200
 
 
 def test_a_search_that_says_nothing_is_made_again() -> None:
@@ -373,17 +334,3 @@ def test_steps_are_the_batch_and_are_exported(model: SequenceModel) -> None:
             found, state = run(row, state)
             torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(state, last, rtol=1e-5, atol=1e-5)
-
-
-def test_gradients_reach_scores_and_settings_through_the_state() -> None:
-    scores, model = with_gaps().requires_grad_(), PlaceFilter()
-    state, found = model.start(25), []
-    for row in scores.split(1):
-        together, state = model.step(row, state)
-        found.append(together.amin())
-    torch.stack(found[:4] + found[5:]).sum().backward()
-    assert scores.grad is not None
-    assert scores.grad.isfinite().all()
-    assert scores.grad[0].abs().sum() > 0
-    assert model.log_sharpness.grad is not None
-    assert model.log_sharpness.grad.isfinite()

@@ -98,12 +98,6 @@ def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_
     assert alone.probability is None
 
 
-def test_nothing_found_needs_a_gradient() -> None:
-    scores = SCORES.clone().requires_grad_()
-    for sequence in (None, SequenceMatcher(3), PlaceFilter()):
-        assert not matched(Matching(sequence), scores).score.requires_grad
-
-
 def test_places_are_renumbered_everywhere() -> None:
     match = Match(torch.tensor([3, -1]), torch.tensor([0.0, math.inf]), torch.tensor([True, False]))
     several = Match(torch.tensor([[1, 2], [3, -1]]), torch.zeros(2, 2), torch.ones(2, 2) > 0)

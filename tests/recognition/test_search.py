@@ -147,13 +147,6 @@ def test_many_of_the_best_are_taken_from_all_scores(monkeypatch: pytest.MonkeyPa
     assert route.batches[3:] == [4, 4, 4, 4, 4, 1]
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_queries_of_half_precision_are_searched_for_as_floats(dtype: torch.dtype) -> None:
-    route = SpectralMapper(None, 0.5, 32)(walk(300))
-    for queries in (walk(300)[:1].to(dtype), walk(300)[::5].to(dtype)):  # scored in different ways
-        assert_equal(search(route, queries, 3), search(route, queries.float(), 3))
-
-
 @pytest.mark.parametrize("metric", ["cosine", "l2"])
 def test_convention_10_scores_are_float32_whatever_the_autocast(metric: Any) -> None:
     route = SpectralMapper(None, 0.5, 32, metric=metric)(walk(300))

@@ -64,17 +64,6 @@ def test_nan_reports_nothing(threshold: float | None) -> None:
     assert match.accepted.tolist() == [False]
 
 
-def test_shapes_and_types() -> None:
-    match = best_match(torch.rand(4, 7, dtype=torch.float64), 0.5)
-    assert (match.index.shape, match.score.shape, match.accepted.shape) == ((4,), (4,), (4,))
-    assert (match.index.dtype, match.score.dtype, match.accepted.dtype) == (
-        torch.int64,
-        torch.float64,
-        torch.bool,
-    )
-    assert len(best_match(torch.rand(0, 7)).index) == 0
-
-
 def test_the_score_carries_gradients() -> None:
     scores = torch.tensor([[3.0, 1.0, 2.0]], requires_grad=True)
     best_match(scores).score.sum().backward()
