@@ -31,8 +31,8 @@ from dejavu_torch.model_file import check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.checkpoint import (
+    EXPECTED,
     CheckpointFiles,
-    check_resumable,
     read_checkpoint,
     taking_over,
 )
@@ -182,7 +182,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.places: Tensor | None = None  # its descriptors of the reference
         self.metric: PlaceRecognition | None = None  # `setup` makes it
         self.steps = 0  # of the training that a checkpoint comes from
-        self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
+        self.resumed = False  # whether a checkpoint is being taken over
         self.held_before: list[int] | None = None  # stretches, of the training that a checkpoint comes from
         self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
         self._callbacks: list[pl.Callback] = []
@@ -382,9 +382,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.index, self.began = self.index + 1, step
 
     def on_fit_start(self) -> None:
-        """Refuse what cannot be resumed; callbacks that watch a figure wait for the last stage."""
-        if self.resumed is not None:
-            check_resumable(self.resumed, self.trainer)
+        """Callbacks that watch a figure wait for the last stage."""
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
             self.trainer.callbacks = [  # type: ignore[attr-defined]
@@ -392,8 +390,11 @@ class PlaceRecognitionTask(pl.LightningModule):
             ]
 
     def on_train_start(self) -> None:
-        """What a checkpoint held is taken over."""
-        self.resumed = None
+        """Refuse a checkpoint whose loops are at another step than its weights."""
+        if self.resumed and self.global_step != self.steps:
+            raise InputError(
+                f"the checkpoint is of step {self.steps}, its loops are at {self.global_step}; {EXPECTED}"
+            )
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Drop a map of the features before; begin the next stage if the steps of this one are over."""
@@ -434,6 +435,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_train_batch_end(self, *_: Any) -> None:
         """Give up a training that learns nothing, as soon as that can be told."""
+        self.resumed = False  # its optimizer's state has made a step
         if not self.last.learned:
             self.last.check(self.stage.chance(self))
 
@@ -461,7 +463,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """A map of the present features, where there is none yet."""
-        self.resumed = None
+        self.resumed = False
         if self.trainer.state.fn != "fit":
             self.require_map()
         if self.in_last_stage and not self.map.places:
@@ -537,7 +539,7 @@ class PlaceRecognitionTask(pl.LightningModule):
             raise InputError(f"the checkpoint is of {seen}; expected one of the stages {stages}")
         self._check_finite(checkpoint["state_dict"])
         if self._trainer is not None:
-            self.resumed = checkpoint
+            self.resumed = True
             if self.trainer.state.fn != "fit":
                 checkpoint.pop("loops", None)  # nothing goes on
         self.routes = checkpoint.get("routes", [])
@@ -624,7 +626,7 @@ def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
     with taking_over(path):
         task.on_load_checkpoint(checkpoint)
         task.load_state_dict(checkpoint["state_dict"])
-    task.resumed = None
+    task.resumed = False
 
 
 def _layers(plan: Plan) -> str:
