@@ -167,14 +167,8 @@ class Objective:
         temperature: Tensor,
         tolerance: int,
     ) -> Losses:
-        """The losses of a batch.
-
-        Args:
-            distances: eq. 3 of each layer. scores: `log_posterior` of eq. 4.
-            places: the right ones, -1 as padding.
-
-        Shape: L tensors (B,P), (B,N), (B,R).
-        """
+        """The losses of a batch: of eq. 3 of each layer (B,P), `log_posterior` of eq. 4 (B,N) and the right
+        places (B,R), -1 as padding."""
         found = place_cross_entropy(scores, places, tolerance, 1.0)  # the scores have their temperature
         parts, total = {"place": found.loss}, self.place * found.loss
         if self.phase:
