@@ -143,11 +143,7 @@ def leaves(value: Any) -> Iterator[Any]:
 
 @contextmanager
 def taking_over(path: object, still: Callable[[], bool] = lambda: True) -> Iterator[None]:
-    """Whatever goes wrong in the block is the checkpoint's fault, and told in one line.
-
-    Args:
-        still: whether the checkpoint is still being taken over when something goes wrong.
-    """
+    """Whatever goes wrong in the block while it is `still` true is the checkpoint's fault, in one line."""
     try:
         yield
     except (InputError, OSError):
@@ -155,11 +151,11 @@ def taking_over(path: object, still: Callable[[], bool] = lambda: True) -> Itera
     except Exception as error:
         if not still():
             raise
-        if "loading state_dict" in str(error):
-            problem = f"it is of another model than the config's: {cause_of(error)}"
-        else:
-            problem = f"it does not fit this training ({cause_of(error)}); {EXPECTED}"
-        raise InputError(f"the checkpoint {path} cannot be taken over: {problem}") from error
+        other = "loading state_dict" in str(error)
+        problem = (
+            "is of another model than the config's" if other else f"does not fit this training; {EXPECTED}"
+        )
+        raise InputError(f"the checkpoint {path} {problem} ({cause_of(error)})") from error
 
 
 def cause_of(error: Exception) -> str:

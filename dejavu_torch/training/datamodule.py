@@ -41,12 +41,8 @@ class Batch(NamedTuple):
 
 
 class StoredFrames(Dataset[Batch]):
-    """Frames as bytes, which may lie in temporary files (see `concatenate`), with their right places.
-
-    Args:
-        parts: frames (n,C,H,W) uint8, or features (n,D) float, of one or several traverses.
-        truth: of all of them, one behind the other.
-    """
+    """Frames (n,C,H,W) uint8, which may lie in temporary files (see `concatenate`), or features (n,D) float,
+    of one or several traverses, with the right places of all of them."""
 
     def __init__(self, parts: list[Tensor], truth: GroundTruth) -> None:
         self.parts = parts
@@ -71,11 +67,7 @@ class StoredFrames(Dataset[Batch]):
 
 
 class InOrder(DistributedSampler[list[int]]):
-    """All frames once, in batches; of several processes each takes a stretch, and none is repeated.
-
-    Args:
-        count: frames. process: this one's number, of so many `processes`.
-    """
+    """All frames once, in batches; of several processes each takes a stretch, and none is repeated."""
 
     def __init__(self, count: int, batch_size: int, process: int = 0, processes: int = 1) -> None:
         super().__init__(cast(Any, range(count)), processes, process, shuffle=False)
@@ -90,13 +82,8 @@ class InOrder(DistributedSampler[list[int]]):
 
 
 class Clips(DistributedSampler[list[int]]):
-    """Each frame about once an epoch, in clips of consecutive frames from all over the route.
-
-    Args:
-        runs: of frames, as one for each traverse; no clip crosses from one to the next.
-        batch_size: frames of a batch. clip: frames of a clip; a last clip that is shorter is left out.
-        process: this one's number, of so many `processes`, each of which takes its part of a batch.
-    """
+    """Each frame about once an epoch, in clips of consecutive frames from all over the route. No clip crosses
+    from one run to the next; each process takes its part of a batch."""
 
     def __init__(
         self, runs: list[range], batch_size: int, clip: int, process: int = 0, processes: int = 1
@@ -236,8 +223,9 @@ class RouteData(LightningDataModule):
     def _one_each(self, name: str, given: Any) -> list[Any]:
         """What is given for each of the routes."""
         count = len(self.listed["source"])
-        each = list(given) if isinstance(given, (list, tuple)) else [given]
-        each = [None] * count if given is None else each
+        each = (
+            list(given) if isinstance(given, (list, tuple)) else [given] * (1 if given is not None else count)
+        )
         if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
             raise InputError(
                 f"{name} is given, and there are {count} routes, which make no map; expected none, and "

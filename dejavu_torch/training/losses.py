@@ -304,14 +304,7 @@ class LastLosses:
         self.last.append(dict(parts))
 
     def check(self, chance: Mapping[str, float]) -> None:
-        """Refuse losses none of which is below chance or still falling. Nothing is known before `LAST` steps.
-
-        Args:
-            chance: of each loss that tells places apart, by name.
-
-        Raises:
-            NothingLearned: naming both.
-        """
+        """Refuse losses that tell places apart if none is below chance or still falls; not before `LAST`."""
         if len(self.last) < LAST or not chance:
             return
         losses = {name: torch.stack([parts[name] for parts in self.last]) for name in chance}

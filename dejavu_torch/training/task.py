@@ -30,12 +30,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.training.checkpoint import (
-    EXPECTED,
-    CheckpointFiles,
-    read_checkpoint,
-    taking_over,
-)
+from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, read_checkpoint, taking_over
 from dejavu_torch.training.datamodule import FEW, Batch, RouteData, as_frames
 from dejavu_torch.training.losses import LastLosses, Objective
 from dejavu_torch.training.metrics import PlaceRecognition
@@ -495,11 +490,8 @@ class PlaceRecognitionTask(pl.LightningModule):
     def load_from_checkpoint(  # type: ignore[override]
         cls, checkpoint_path: str | Path, *, weights_only: bool = True, **settings: Any
     ) -> PlaceRecognitionTask:
-        """A task with the weights of a checkpoint; Lightning's own would import what the file names.
-
-        Args:
-            weights_only: ignored; no code of a checkpoint is ever run.
-            settings: of the constructor, as in the training.
+        """A task with the weights of a checkpoint and the constructor's `settings`, as in the training.
+        Nothing is imported that the file names, as by Lightning's own, and `weights_only` is always true.
 
         Raises:
             InputError: a damaged checkpoint, or one of other settings.

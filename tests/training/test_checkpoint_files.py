@@ -16,13 +16,13 @@ import pytest
 import torch
 from helpers import refused
 from pytorch_lightning.plugins import AsyncCheckpointIO, TorchCheckpointIO
-from small_training import backbone, data_of, mapper, new_task, train, trainer, warned
+from small_training import data_of, new_task, train, trainer, warned
 from torch import Tensor
 
 from dejavu_torch import DejaVu
 from dejavu_torch.training.checkpoint import CheckpointFiles, read_checkpoint
 from dejavu_torch.training.export import LastCheckpoint
-from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
+from dejavu_torch.training.task import load_weights
 
 HUGE = 10**12
 EVIL = """
@@ -84,17 +84,6 @@ def test_settings_in_a_checkpoint_import_nothing(
     assert not (tmp_path / "executed").exists()
 
 
-def test_loading_a_task_imports_nothing(last: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = {"_instantiator": "another_evil.Net"}
-    bad = changed(last, tmp_path / "bad.ckpt", ("hyper_parameters",), settings)
-    (tmp_path / "another_evil.py").write_text(EVIL)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    task = PlaceRecognitionTask.load_from_checkpoint(bad, backbone=backbone(), mapper=mapper())
-    assert torch.equal(task.log_temperature, read_checkpoint(last)["state_dict"]["log_temperature"])
-    assert not (tmp_path / "executed").exists()
-
-
 class Touch:
     """Runs code where it is unpickled."""
 
@@ -143,26 +132,13 @@ def test_what_is_no_checkpoint(
 
 @pytest.mark.parametrize(
     ("command", "word"),
-    [
-        *(("fit", word) for word in ("best", "hpc", "registry:model", "http://127.0.0.1/last.ckpt")),
-        ("validate", "best"),
-    ],
+    [("fit", "registry:model"), ("fit", "http://127.0.0.1/last.ckpt"), ("validate", "best")],
 )
 def test_a_word_is_a_file_name(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str, word: str
 ) -> None:
     line = refusal(capfd, command, "--ckpt_path", word, "--trainer.default_root_dir", tmp_path / "run")
     assert "is not there" in line
-
-
-@pytest.mark.parametrize("command", ["fit", "validate", "export"])
-def test_last_is_the_last_of_the_folder(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str
-) -> None:
-    """And never untrained weights."""
-    name = "last"
-    line = refusal(capfd, command, "--ckpt_path", name, "--trainer.default_root_dir", tmp_path / "run")
-    assert "there is no checkpoint in" in line
 
 
 # damage --------------------------------------------------------------------------------------------------
