@@ -316,7 +316,7 @@ class TrainCLI(LightningCLI):
         root = Path(self.trainer.default_root_dir)
         new = [folder for folder in (root, *root.parents) if not folder.exists()]
         try:
-            with taking_over(arguments.get("ckpt_path"), lambda: self.model.resumed is not None):
+            with taking_over(arguments.get("ckpt_path"), lambda: self.model.resumed):
                 yield
         except Exception:
             files = [path for path in root.rglob("*") if path.is_file()] if new else []

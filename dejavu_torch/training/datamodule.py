@@ -41,12 +41,8 @@ class Batch(NamedTuple):
 
 
 class StoredFrames(Dataset[Batch]):
-    """Frames as bytes, which may lie in temporary files (see `concatenate`), with their right places.
-
-    Args:
-        parts: frames (n,C,H,W) uint8, or features (n,D) float, of one or several traverses.
-        truth: of all of them, one behind the other.
-    """
+    """Frames (n,C,H,W) uint8, which may lie in temporary files (see `concatenate`), or features (n,D) float,
+    of one or several traverses, with the right places of all of them."""
 
     def __init__(self, parts: list[Tensor], truth: GroundTruth) -> None:
         self.parts = parts
@@ -71,11 +67,7 @@ class StoredFrames(Dataset[Batch]):
 
 
 class InOrder(DistributedSampler[list[int]]):
-    """All frames once, in batches; of several processes each takes a stretch, and none is repeated.
-
-    Args:
-        count: frames. process: this one's number, of so many `processes`.
-    """
+    """All frames once, in batches; of several processes each takes a stretch, and none is repeated."""
 
     def __init__(self, count: int, batch_size: int, process: int = 0, processes: int = 1) -> None:
         super().__init__(cast(Any, range(count)), processes, process, shuffle=False)
@@ -90,13 +82,8 @@ class InOrder(DistributedSampler[list[int]]):
 
 
 class Clips(DistributedSampler[list[int]]):
-    """Each frame about once an epoch, in clips of consecutive frames from all over the route.
-
-    Args:
-        runs: of frames, as one for each traverse; no clip crosses from one to the next.
-        batch_size: frames of a batch. clip: frames of a clip; a last clip that is shorter is left out.
-        process: this one's number, of so many `processes`, each of which takes its part of a batch.
-    """
+    """Each frame about once an epoch, in clips of consecutive frames from all over the route. No clip crosses
+    from one run to the next; each process takes its part of a batch."""
 
     def __init__(
         self, runs: list[range], batch_size: int, clip: int, process: int = 0, processes: int = 1
@@ -205,7 +192,21 @@ class RouteData(LightningDataModule):
         for name, (given, known) in others.items():
             self.listed[name] = self._one_each(name, given)
             self.truths[name] = self._one_each(f"{name}_truth" if name != "query" else "truth", known)
-        self._check_sources()
+        if not self.listed["source"]:
+            raise InputError("source is an empty list; expected at least one traverse")
+        for name, every in self.listed.items():
+            for one in every:
+                if not isinstance(one, (str, Path, Traverse, Tensor)) and (
+                    one is not None or name == "source"
+                ):
+                    raise InputError(
+                        f"{name} is of type {type(one).__name__}; expected a path or `sim:` address, a "
+                        "Traverse, or a tensor of frames or features"
+                    )
+        paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
+        for one in paths:
+            if paths.count(one) > 1:
+                raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
         # as it was given where there is one route
         self.sources = {
             name: given if len(given) > 1 and any(one is not None for one in given) else given[0]
@@ -222,8 +223,9 @@ class RouteData(LightningDataModule):
     def _one_each(self, name: str, given: Any) -> list[Any]:
         """What is given for each of the routes."""
         count = len(self.listed["source"])
-        each = list(given) if isinstance(given, (list, tuple)) else [given]
-        each = [None] * count if given is None else each
+        each = (
+            list(given) if isinstance(given, (list, tuple)) else [given] * (1 if given is not None else count)
+        )
         if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
             raise InputError(
                 f"{name} is given, and there are {count} routes, which make no map; expected none, and "
@@ -235,23 +237,6 @@ class RouteData(LightningDataModule):
                 "those without"
             )
         return each
-
-    def _check_sources(self) -> None:
-        routes = self.listed["source"]
-        if not routes:
-            raise InputError("source is an empty list; expected at least one traverse")
-        for name, given in self.listed.items():
-            for one in given:
-                missing = one is None and name == "source"
-                if missing or (one is not None and not isinstance(one, (str, Path, Traverse, Tensor))):
-                    raise InputError(
-                        f"{name} is of type {type(one).__name__}; expected a path or `sim:` address, a "
-                        "Traverse, or a tensor of frames or features"
-                    )
-        paths = [str(one) for one in routes if isinstance(one, (str, Path))]
-        twice = next((one for one in paths if paths.count(one) > 1), None)
-        if twice is not None:
-            raise InputError(f"{twice} is given twice; expected each route once, other traverses as second")
 
     @property
     def reference(self) -> Traverse:
@@ -289,12 +274,8 @@ class RouteData(LightningDataModule):
     def held_frames(
         self, starts: list[int], strengths: Mapping[str, Any], shape: tuple[int, ...] | None = None
     ) -> AugmentedTraverse | None:
-        """Those of these stretches that begin at `starts`, as they may look on another visit; None without
-        any.
-
-        Args:
-            strengths: see `augmented_segments`. shape: (C,H,W) of the frames; None is that of the reference.
-        """
+        """Those of these stretches that begin at `starts`, in frames of `shape`, as they may look on another
+        visit (see `augmented_segments`); None without any."""
         if not starts:
             return None
         reference = self.reference if shape is None else fitted(self.reference, shape)
@@ -366,14 +347,14 @@ class RouteData(LightningDataModule):
         return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
 
     def _read(self, name: str) -> StoredFrames:
-        if len(self.routes) == 1:
-            values, known = self._read_one(name, 0)
-            return StoredFrames([values], known)
+        """Another traverse of each route, as if of one behind the other."""
         given = [i for i, source in enumerate(self.listed[name]) if source is not None]
         parts, truths = zip(*(self._read_one(name, i) for i in given), strict=True)
-        known_places = [truth.positives.masked_fill(~truth.judged[:, None], -1) for truth in truths]
+        if len(self.routes) == 1:
+            return StoredFrames([*parts], truths[0])
+        known = [truth.positives.masked_fill(~truth.judged[:, None], -1) for truth in truths]
         starts = [sum(self.lengths[:i]) for i in given]
-        moved = [torch.where(p >= 0, p + start, -1) for p, start in zip(known_places, starts, strict=True)]
+        moved = [torch.where(p >= 0, p + start, -1) for p, start in zip(known, starts, strict=True)]
         return StoredFrames([*parts], _joined(moved))
 
     def _read_one(self, name: str, i: int) -> tuple[Tensor, GroundTruth]:

@@ -118,22 +118,14 @@ class MapExport(Callback):
 def held_frames(
     model: DejaVu, data: RouteData, starts: list[int], shape: tuple[int, ...] | None = None
 ) -> tuple[Traverse, GroundTruth] | None:
-    """The stretches that training never saw, changed, and their places; None where there are none.
-
-    Args:
-        starts: their first places. shape: (C,H,W) of the frames; None is that of the reference.
-    """
+    """The stretches that training never saw, changed, in frames of `shape`, and their places, if any."""
     strengths = STRENGTHS if model.whitening is None else model.whitening.strengths
     found = data.held_frames(starts, strengths, shape)
     return None if found is None else (found, as_ground_truth(found.places[:, None]))
 
 
 def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
-    """By the traverse to validate on, else by stretches that training never saw; else not at all.
-
-    Args:
-        starts: the first places of these stretches.
-    """
+    """By the traverse to validate on, else by stretches that training never saw; else not at all."""
     validated = data.sources["validation"] is not None
     unseen = data.unseen() if validated else held_frames(model, data, starts, model.frame_shape)
     if unseen is None:
@@ -144,8 +136,8 @@ def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
             log.warning("the map is not calibrated: of templates nothing is held out; data.validation would")
         return
     frames, truth = unseen
-    if validated and len(frames.frame_shape) == 3:
-        frames = fitted(frames, model.frame_shape or ())
+    if validated:
+        frames = _of_shape(frames, model.frame_shape)
     try:
         calibrate_if_possible(model, data.reference, Views(frames, truth.positives[:, 0]))
     except InputError as error:
@@ -210,10 +202,8 @@ def beside_untrained(
     Returns:
         By name, the trained map first; nothing where no query has a known place.
     """
-    if len(query.frame_shape) == 3:
-        query = fitted(query, reference.frame_shape)
-    trained = fitted(query, model.frame_shape or ()) if len(query.frame_shape) == 3 else query
-    found = {TRAINED: _match(model, trained)}
+    query = _of_shape(query, reference.frame_shape)
+    found = {TRAINED: _match(model, query)}
     hog = hog_baselines(reference, query, model.batch_size, tolerance)
     found |= {HOG: hog["hog"].found} if hog else {}
     mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
@@ -222,9 +212,7 @@ def beside_untrained(
         untrained = DejaVu(mapper=mapper, batch_size=model.batch_size, preprocess=preprocess)
         reference = untrained.fit(reference)
         untrained.learn(reference)
-        if len(query.frame_shape) == 3:
-            query = fitted(query, reference.frame_shape)
-        found[UNTRAINED] = _match(untrained, query)
+        found[UNTRAINED] = _match(untrained, _of_shape(query, reference.frame_shape))
     except InputError as error:
         log.warning("no untrained map to compare with: %s", error)
     scores = {name: contend(name, match, truth, tolerance).scores for name, match in found.items()}
@@ -243,8 +231,13 @@ def better(scores: Mapping[str, Scores]) -> list[str]:
     return [name for name, one in others if one.auc > first.auc]
 
 
+def _of_shape(query: Traverse, shape: tuple[int, ...] | None) -> Traverse:
+    return fitted(query, shape or ()) if len(query.frame_shape) == 3 else query
+
+
 def _match(model: DejaVu, query: Traverse) -> Match:
-    return model.localize_descriptors(model.extract_all(query), SINGLE).renumbered(model.map.table.scored)
+    descriptors = model.extract_all(_of_shape(query, model.frame_shape))
+    return model.localize_descriptors(descriptors, SINGLE).renumbered(model.map.table.scored)
 
 
 class StepBar(ProgressBar):

@@ -167,14 +167,8 @@ class Objective:
         temperature: Tensor,
         tolerance: int,
     ) -> Losses:
-        """The losses of a batch.
-
-        Args:
-            distances: eq. 3 of each layer. scores: `log_posterior` of eq. 4.
-            places: the right ones, -1 as padding.
-
-        Shape: L tensors (B,P), (B,N), (B,R).
-        """
+        """The losses of a batch: of eq. 3 of each layer (B,P), `log_posterior` of eq. 4 (B,N) and the right
+        places (B,R), -1 as padding."""
         found = place_cross_entropy(scores, places, tolerance, 1.0)  # the scores have their temperature
         parts, total = {"place": found.loss}, self.place * found.loss
         if self.phase:
@@ -310,14 +304,7 @@ class LastLosses:
         self.last.append(dict(parts))
 
     def check(self, chance: Mapping[str, float]) -> None:
-        """Refuse losses none of which is below chance or still falling. Nothing is known before `LAST` steps.
-
-        Args:
-            chance: of each loss that tells places apart, by name.
-
-        Raises:
-            NothingLearned: naming both.
-        """
+        """Refuse losses that tell places apart if none is below chance or still falls; not before `LAST`."""
         if len(self.last) < LAST or not chance:
             return
         losses = {name: torch.stack([parts[name] for parts in self.last]) for name in chance}

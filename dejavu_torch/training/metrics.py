@@ -62,7 +62,15 @@ class PlaceRecognition(Metric):
 
     def update(self, match: Match, truth: Tensor | GroundTruth) -> None:
         """Add the queries of a batch."""
-        _check_match(match)
+        if (
+            match.index.ndim != 1
+            or match.index.dtype != torch.int64
+            or match.score.shape != match.index.shape
+        ):
+            shapes = f"{tuple(match.index.shape)} {match.index.dtype} and {tuple(match.score.shape)}"
+            raise InputError(f"index and score are {shapes}; expected (Q,) int64 and (Q,)")
+        if match.score.isnan().any():
+            raise InputError("a score is NaN; expected numbers or +inf")
         check_truth(match, truth, self.tolerance)
         index, score = match.index.cpu(), match.score.detach().cpu()
         truth = as_ground_truth(
@@ -87,13 +95,3 @@ class PlaceRecognition(Metric):
             figures = evaluate(match, right.long()[:, None], tolerance=0)
         values = torch.tensor(figures, dtype=torch.float64, device=self.device)
         return dict(zip(Scores._fields, values, strict=True))
-
-
-def _check_match(match: Match) -> None:
-    """Refuse matches that are no place and score a query."""
-    index, score = match.index, match.score
-    if index.ndim != 1 or index.dtype != torch.int64 or score.shape != index.shape:
-        shapes = f"{tuple(index.shape)} {index.dtype} and {tuple(score.shape)}"
-        raise InputError(f"index and score are {shapes}; expected (Q,) int64 and (Q,)")
-    if score.isnan().any():
-        raise InputError("a score is NaN; expected numbers or +inf")

@@ -60,16 +60,15 @@ def average_gradients(optimizers: Iterable[Optimizer], module: nn.Module) -> Non
         return
     groups = [group for optimizer in optimizers for group in optimizer.param_groups]
     trained = [parameter for group in groups for parameter in group["params"]]
-    running = [buffer for buffer in module.buffers() if buffer.is_floating_point()]
-    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in trained] + running
-    has = parts[0].new_tensor([p.grad is not None for p in trained], dtype=torch.float32)
-    mean = averaged(torch.cat([has, *(part.float().flatten() for part in parts)]))
-    has, *means = mean.split([len(trained), *(part.numel() for part in parts)])
-    for parameter, found, part in zip(trained, has.tolist(), means[: len(trained)], strict=True):
-        if found:
-            parameter.grad = part.view_as(parameter).to(parameter.dtype)
-    for buffer, part in zip(running, means[len(trained) :], strict=True):
-        buffer.copy_(part.view_as(buffer))
+    without = averaged(torch.tensor([float(parameter.grad is None) for parameter in trained]).to(trained[0]))
+    for parameter, share in zip(trained, without.tolist(), strict=True):
+        if share < 1:
+            parameter.grad = averaged(
+                torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+            )
+    for buffer in module.buffers():
+        if buffer.is_floating_point():
+            buffer.copy_(averaged(buffer))
 
 
 def own_part(values: Tensor) -> Tensor:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol, cast
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.embedding import Coder, Embedding, to_length
+from dejavu_torch.features.embedding import Embedding, to_length
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.maps.spectral import SpectralMapper
-from dejavu_torch.maps.spectrum import Transform
-from dejavu_torch.maps.template_map import TemplateMap
-from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.training.datamodule import Batch, RouteData, StoredFrames, as_frames
+from dejavu_torch.training.datamodule import Batch, as_frames
 from dejavu_torch.training.losses import (
     STEP,
     Losses,
@@ -40,6 +37,7 @@ WIDE = 1e6  # step of a map without lines, beside descriptors of about 1
 NOISE = 0.5  # on descriptors in training, beside components of about 1
 
 log = logging.getLogger("dejavu_torch")
+Task = Any  # a `PlaceRecognitionTask`, whose file imports this one
 
 
 class Views(NamedTuple):
@@ -47,38 +45,6 @@ class Views(NamedTuple):
 
     descriptors: Tensor
     positives: Tensor
-
-
-class Task(Protocol):
-    """What stages use of a `PlaceRecognitionTask`; see there."""
-
-    dejavu: DejaVu
-    made: bool
-    gives_way: bool
-    frozen: set[str]
-    log_temperature: nn.Parameter
-    losses: Objective
-    views: Views | None
-    places: Tensor | None
-
-    @property
-    def data(self) -> RouteData: ...
-
-    @property
-    def route(self) -> TemplateMap: ...
-
-    @property
-    def device(self) -> torch.device: ...
-
-    @property
-    def global_step(self) -> int: ...
-
-    @property
-    def progress(self) -> float: ...
-
-    def relearn(self) -> None: ...
-
-    def scores(self, distances: Sequence[Tensor]) -> Tensor: ...
 
 
 class Stage(nn.Module):
@@ -138,11 +104,9 @@ class DescriptorStage(Stage):
             )
         reference = task.data.sets["reference"]
         every = int(self.every) if len(self.proxies) else max(1, task.data.tolerance)
-        counts = [-(-length // every) for length in task.data.lengths]
-        count = sum(counts)
-        ahead = [sum(counts[:i]) for i in range(len(counts))]
-        routes = zip(ahead, task.data.lengths, strict=True)
-        stretches = torch.cat([first + torch.arange(length) // every for first, length in routes])
+        begins = [place % every == 0 for length in task.data.lengths for place in range(length)]
+        stretches = torch.tensor(begins).cumsum(0) - 1
+        count = sum(begins)
         numbers = task.data.apart(torch.arange(len(reference)))
         between = torch.full((int(numbers[-1]) + 1,), count)
         self.stretch = between.scatter(0, numbers, stretches).to(task.device)
@@ -213,12 +177,14 @@ class RateStage(DescriptorStage):
         self.log_widths = nn.Parameter(torch.zeros(0))  # of one dimension, which weight decay leaves alone
 
     def make(self, stretches: int, dimension: int, task: Task) -> None:
-        bands = int(bands_of(stretches, _transform(task)).max()) + 1
+        bands = int(bands_of(stretches, getattr(task.dejavu.mapper, "transform", "dft")).max()) + 1
         self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
         self.log_widths = nn.Parameter(torch.zeros(bands * dimension, device=task.device))
 
     def losses(self, task: Task, batch: Batch) -> Losses:
-        coded = coded_proxies(self.proxies, self.log_step, self.log_widths, _transform(task))
+        coded = coded_proxies(
+            self.proxies, self.log_step, self.log_widths, getattr(task.dejavu.mapper, "transform", "dft")
+        )
         place = self.losses_to(coded.proxies, task, batch)
         per_place = coded.bits / len(task.data.sets["reference"])
         total = place.total + self.rate * task.progress * per_place
@@ -236,17 +202,19 @@ class CodeStage(Stage):
     def begin(self, task: Task) -> None:
         if has_descriptor(task.dejavu.features):
             task.frozen.add("network")
-            embedding_of(task).network.eval()
-            task.views = describe_views(task)
+            task.dejavu.features.network.eval()
+            room = NUMBERS // len(task.dejavu.features.coder.mean)
+            views = zip(*views_of(task, ROUNDS, room), strict=True)
+            task.views = Views(*(torch.cat(part) for part in views))
             if whitens(task.dejavu.features):
                 shown = place_descriptors(task)[task.views.positives[:, 0]]
-                _coder(embedding_of(task)).whiten(task.views.descriptors, shown)
+                task.dejavu.features.coder.whiten(task.views.descriptors, shown)
         if not task.dejavu.map.places:
             task.relearn()
 
     def trained(self, task: Task) -> list[nn.Parameter]:
         features = task.dejavu.features
-        learns = _coder(embedding_of(task)) if has_descriptor(features) else features
+        learns = task.dejavu.features.coder if has_descriptor(features) else features
         return [task.log_temperature, *_trainable(learns), *task.route.parameters()]
 
     def losses(self, task: Task, batch: Batch) -> Losses:
@@ -259,11 +227,12 @@ class CodeStage(Stage):
             n, device = len(task.views.descriptors), task.views.descriptors.device
             drawn = own_part(torch.randint(n, (BATCH,))).to(device)
             with own_random(task.global_step):
-                features = embedding_of(task).code(task.views.descriptors[drawn])
+                features = task.dejavu.features.code(task.views.descriptors[drawn])
             positives = task.views.positives[drawn]
         distances = task.route.distances(features)
         temperature, tolerance = task.log_temperature.exp(), task.data.tolerance
-        return task.losses(distances, task.scores(distances), positives, task.route, temperature, tolerance)
+        scores, objective = task.scores(distances), cast(Objective, task.losses)
+        return objective(distances, scores, positives, task.route, temperature, tolerance)
 
     def chance(self, task: Task) -> dict[str, float]:
         place = {"place": place_chance(task.route.places, task.data.tolerance)}
@@ -271,16 +240,9 @@ class CodeStage(Stage):
 
 
 def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: float = 0.0) -> list[Stage]:
-    """The stages that a backbone needs.
-
-    Where the map is made of the descriptor, that is all that is learned. For a map that is trained an
-    `Embedding` with a hidden layer learns its descriptor, then its code. A network without parameters to
-    train, such as HOG, a whitened one, as another map brings, and other backbones have the last stage only.
-
-    Args:
-        descriptor: share of the steps in which a descriptor is learned.
-        made: whether the map is made of the descriptor in closed form, and not trained.
-        rate: of the descriptor, for a map that is made of it.
+    """The stages that a backbone needs: where the map is made of the descriptor, that is all that is learned;
+    for one that is trained an `Embedding` with a hidden layer learns its descriptor, for a share of the
+    steps, then its code. What is whitened or has nothing to train, and other backbones, have the last only.
     """
     if made:
         return [RateStage(rate)] if rate else [DescriptorStage()]
@@ -289,63 +251,39 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: 
     return [CodeStage()]
 
 
-def has_descriptor(backbone: nn.Module) -> bool:
+def has_descriptor(backbone: Any) -> bool:
     """Whether a backbone is an `Embedding` whose code is learned from a whitened descriptor."""
     return isinstance(backbone, Embedding) and backbone.coder is not None
 
 
-def whitens(backbone: nn.Module) -> bool:
+def whitens(backbone: Any) -> bool:
     """Whether the descriptor of a backbone is still to be whitened."""
-    return has_descriptor(backbone) and not bool(_coder(cast(Embedding, backbone)).whitened)
+    return has_descriptor(backbone) and not bool(backbone.coder.whitened)
 
 
-def embedding_of(task: Task) -> Embedding:
-    """The task's backbone, where its stages are of an `Embedding`."""
-    return cast(Embedding, task.dejavu.features)
-
-
-def network_of(backbone: nn.Module) -> nn.Module:
+def network_of(backbone: Any) -> Any:
     """What makes the descriptor: the backbone, or its network where a code comes behind it."""
-    return cast(Embedding, backbone).network if has_descriptor(backbone) else backbone
+    return backbone.network if has_descriptor(backbone) else backbone
 
 
-def descriptor_of(task: Task) -> Callable[[Tensor], Tensor]:
+def descriptor_of(task: Task) -> Any:
     """Describes frames: (B,C,H,W) -> (B,K)."""
     if not has_descriptor(task.dejavu.features):
         return task.dejavu.describe
-    return lambda frames: embedding_of(task).describe(task.dejavu.preprocess(frames))
-
-
-def _coder(embedding: Embedding) -> Coder:
-    return cast(Coder, embedding.coder)
-
-
-def _transform(task: Task) -> Transform:
-    transform: Transform = getattr(task.dejavu.mapper, "transform", "dft")
-    return transform
+    return lambda frames: task.dejavu.features.describe(task.dejavu.preprocess(frames))
 
 
 def _trainable(module: nn.Module) -> list[nn.Parameter]:
     return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 
-def describe_views(task: Task) -> Views:
-    """Descriptors of all training frames of known places, under several augmentations of each."""
-    room = NUMBERS // len(_coder(embedding_of(task)).mean)
-    descriptors, positives = zip(*views_of(task, ROUNDS, room), strict=True)
-    return Views(torch.cat(descriptors), torch.cat(positives))
-
-
 @torch.no_grad()
 def views_of(task: Task, rounds: int, most: int) -> Iterator[Views]:
-    """Batches of descriptors of augmented training frames of known places.
-
-    Args:
-        rounds: times that each frame is shown. most: views in all, but for one of each frame.
-    """
+    """Batches of descriptors of augmented training frames of known places, each shown in so many rounds, but
+    no more than `most` in all beside the first round."""
     data, describe = task.data, descriptor_of(task)
     loader = data.training_batches()
-    rounds = min(rounds, most // len(cast(StoredFrames, loader.dataset))) if data.augmentation.acts else 1
+    rounds = min(rounds, most // len(loader.dataset)) if data.augmentation.acts else 1
     with in_mode(task.dejavu.features, False):
         for _ in range(max(1, rounds)):
             for batch in loader:
@@ -372,7 +310,7 @@ def check_map(task: Task, places: int, dimension: int) -> None:
     except InputError:
         if not gives_way or wanted is None:
             raise
-    empty = SpectralMapper(None, step=WIDE, chunk=cast(Any, mapper.chunk))(descriptors)
+    empty = SpectralMapper(None, step=WIDE, chunk=mapper.chunk)(descriptors)
     more = min(wanted + empty.summary().route_bytes / places, 4 * numbers)
     mapper.route_bytes_per_place = math.ceil(100 * more) / 100
     mapper(descriptors)
@@ -385,17 +323,14 @@ def check_map(task: Task, places: int, dimension: int) -> None:
 def place_descriptors(task: Task) -> Tensor:
     """Descriptors of the stored reference frames, (N,K), of a network that is trained no more: made once."""
     if task.places is None:
-        with in_mode(embedding_of(task), False):
+        with in_mode(task.dejavu.features, False):
             task.places = stored_features(task, descriptor_of(task))
-    return task.places
+    return cast(Tensor, task.places)
 
 
 def make_map(task: Task) -> None:
-    """Learn the whitening and the map of the present descriptors, in closed form.
-
-    Whitening sees the training's own views. None of training's random numbers are taken, and the same
-    descriptors always give the same map.
-    """
+    """Learn the whitening, from the training's own views, and the map of the present descriptors. None of
+    training's random numbers are taken, and the same descriptors always give the same map."""
     model, whitening = task.dejavu, task.dejavu.whitening
     with torch.random.fork_rng(), torch.no_grad(), in_mode(model, False):
         features = stored_features(task, model.describe)
@@ -411,14 +346,7 @@ def make_map(task: Task) -> None:
 
 
 def stored_features(task: Task, describe: Callable[[Tensor], Tensor], shuffled: bool = False) -> Tensor:
-    """Features of the stored reference frames, as of `in_batches`.
-
-    Args:
-        describe: makes features of frames.
-
-    Raises:
-        InputError: a backbone that does not take the frames, or makes NaN.
-    """
+    """Features of the stored reference frames, (N,D), see `in_batches`."""
     frames = task.data.sets["reference"]
 
     def make(index: Tensor) -> Tensor:
@@ -429,33 +357,19 @@ def stored_features(task: Task, describe: Callable[[Tensor], Tensor], shuffled: 
 
 def coded_places(task: Task, shuffled: bool) -> Tensor:
     """The same of the descriptors that are kept: the code alone is run."""
-    code, places = embedding_of(task).code, place_descriptors(task)
+    code, places = task.dejavu.features.code, place_descriptors(task)
     with torch.autocast(task.device.type, enabled=False):
         return in_batches(task, len(places), lambda index: code(places[index.to(places.device)]), shuffled)
 
 
 @torch.no_grad()
 def in_batches(task: Task, count: int, make: Callable[[Tensor], Tensor], shuffled: bool) -> Tensor:
-    """What is made of so many places, batch by batch, in 32 bits and in their order.
-
-    Args:
-        make: of some of the places, (B,) int64 -> (B,D).
-        shuffled: whether batches hold places from all over the route, as those of training do, so that
-            running statistics can be gathered from them.
-
-    Shape: -> (count,D).
-
-    Raises:
-        InputError: NaN.
-    """
+    """What is made of so many places, batch by batch, in their order; NaN is refused. Batches are drawn from
+    all over the route where running statistics are gathered from them."""
     order = torch.randperm(count) if shuffled else torch.arange(count)
     batches = min(-(-count // task.dejavu.batch_size), count // 2)  # none of a single frame
-    features = torch.zeros(0, device=task.device)
-    for batch in order.tensor_split(batches):
-        part = make(batch)
-        if not len(features):
-            features = part.new_empty(count, part.shape[1])
-        features[batch.to(task.device)] = part
+    features = torch.cat([make(batch) for batch in order.tensor_split(batches)])
+    features = features[order.argsort().to(features.device)]
     if not features.isfinite().all():
         name, maker = task.data.route_name, type(task.dejavu.features).__name__
         raise InputError(f"{maker} makes NaN or infinite features of {name}; expected finite numbers")
@@ -463,11 +377,7 @@ def in_batches(task: Task, count: int, make: Callable[[Tensor], Tensor], shuffle
 
 
 def described(task: Task, values: Tensor, describe: Callable[[Tensor], Tensor]) -> Tensor:
-    """Features of stored frames, in 32 bits.
-
-    Raises:
-        InputError: a backbone that does not take the frames.
-    """
+    """Features of stored frames, in 32 bits; a backbone that does not take them is refused."""
     try:
         with torch.autocast(task.device.type, enabled=False):
             return features_of(as_frames(values).to(task.device), describe, "the batch")

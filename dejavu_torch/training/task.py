@@ -30,12 +30,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.training.checkpoint import (
-    CheckpointFiles,
-    check_resumable,
-    read_checkpoint,
-    taking_over,
-)
+from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, read_checkpoint, taking_over
 from dejavu_torch.training.datamodule import FEW, Batch, RouteData, as_frames
 from dejavu_torch.training.losses import LastLosses, Objective
 from dejavu_torch.training.metrics import PlaceRecognition
@@ -52,7 +47,7 @@ from dejavu_torch.training.stages import (
     stored_features,
     whitens,
 )
-from dejavu_torch.types import InputError, Plan, Training
+from dejavu_torch.types import InputError, Training
 
 log = logging.getLogger("dejavu_torch")
 
@@ -130,27 +125,26 @@ class PlaceRecognitionTask(pl.LightningModule):
         weight_bits: Literal[8, 32] = 8,
     ) -> None:
         super().__init__()
-        if not lr > 0 or not weight_decay >= 0 or refresh < 0:
-            raise InputError(
-                f"lr is {lr}, weight_decay {weight_decay}, refresh {refresh}; expected an lr above 0, the "
-                "others 0 or more"
-            )
-        if not 0 <= rate < math.inf:
-            raise InputError(f"rate is {rate}; expected 0 or more, such as 1")
-        if not 0 <= descriptor < 1:
-            raise InputError(f"descriptor is {descriptor}; expected a share of the steps, from 0 to below 1")
-        if weight_bits not in BITS:
-            raise InputError(f"weight_bits is {weight_bits!r}; expected one of {', '.join(map(str, BITS))}")
+        given = {
+            "lr": (lr, lr > 0, "a number above 0"),
+            "weight_decay": (weight_decay, weight_decay >= 0, "0 or more"),
+            "refresh": (refresh, refresh >= 0, "0 or more"),
+            "rate": (rate, 0 <= rate < math.inf, "0 or more, such as 1"),
+            "descriptor": (descriptor, 0 <= descriptor < 1, "a share of the steps, from 0 to below 1"),
+            "weight_bits": (weight_bits, weight_bits in BITS, f"one of {', '.join(map(str, BITS))}"),
+        }
+        for name, (value, fits, expected) in given.items():
+            if not fits:
+                raise InputError(f"{name} is {value!r}; expected {expected}")
         backbone = SmallCNN() if backbone is None else backbone
         mapper = TemplateMapper(ImposedPeriods()) if mapper is None else mapper
         if not isinstance(mapper, Mapper):
             raise InputError(f"the mapper is {type(mapper).__name__}; expected a Mapper")
         self.made = not isinstance(mapper, TemplateMapper)
-        changed = {"feature_weights": feature_weights, "descriptor": descriptor != DESCRIPTOR}
-        changed |= {"refresh": refresh > 0, "losses": losses is not None}
-        lost = [name for name, is_changed in changed.items() if is_changed] if self.made else []
+        of_templates = {"feature_weights": feature_weights, "descriptor": descriptor != DESCRIPTOR}
+        of_templates |= {"refresh": refresh > 0, "losses": losses is not None}
         of_made = {"whitening": isinstance(whitening, Whitening), "rate": rate > 0}
-        lost += [] if self.made else [name for name, is_given in of_made.items() if is_given]
+        lost = [name for name, is_given in (of_templates if self.made else of_made).items() if is_given]
         if lost:
             raise InputError(
                 f"{lost[0]} is given, which does nothing for the map of a {type(mapper).__name__}; expected "
@@ -182,7 +176,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.places: Tensor | None = None  # its descriptors of the reference
         self.metric: PlaceRecognition | None = None  # `setup` makes it
         self.steps = 0  # of the training that a checkpoint comes from
-        self.resumed: dict[str, Any] | None = None  # a checkpoint that is being taken over
+        self.resumed = False  # whether a checkpoint is being taken over
         self.held_before: list[int] | None = None  # stretches, of the training that a checkpoint comes from
         self.routes: list[Any] | None = None  # of a checkpoint that is not compared with the data's yet
         self._callbacks: list[pl.Callback] = []
@@ -293,25 +287,20 @@ class PlaceRecognitionTask(pl.LightningModule):
             with in_bits(self.dejavu.features, self.weight_bits):
                 make_map(self)
         else:
-            self._start_templates()
+            first, weights = not self.route.places, self.route.weights
+            with in_mode(self, first):  # the first are made in training mode: running statistics are gathered
+                if has_descriptor(self.dejavu.features):
+                    features = coded_places(self, shuffled=first)
+                else:
+                    features = stored_features(self, self.dejavu.describe, shuffled=first)
+                self.dejavu.learn_features(features, self.data.reference)
+            if not self.route.plan:
+                name = self.data.reference.name
+                raise InputError(f"nothing repeats in the features of {name}; expected imposed periods")
+            self.route.trainable(True, self.feature_weights, weights)
         self.dejavu.map.train(self.training)
         if self.data.resize is not None and len(self.data.routes) == 1:
             self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
-
-    def _start_templates(self) -> None:
-        """The first features are made in training mode, so that running statistics are gathered."""
-        first, weights = not self.route.places, self.route.weights
-        with in_mode(self, first):
-            if has_descriptor(self.dejavu.features):
-                features = coded_places(self, shuffled=first)
-            else:
-                features = stored_features(self, self.dejavu.describe, shuffled=first)
-            self.dejavu.learn_features(features, self.data.reference)
-        if not self.route.plan:
-            raise InputError(
-                f"nothing repeats in the features of {self.data.reference.name}; expected imposed periods"
-            )
-        self.route.trainable(True, self.feature_weights, weights)
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scores of all places, the very ones that the exported map gives. (B,C,H,W) or (B,D) -> (B,N)."""
@@ -382,9 +371,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self.index, self.began = self.index + 1, step
 
     def on_fit_start(self) -> None:
-        """Refuse what cannot be resumed; callbacks that watch a figure wait for the last stage."""
-        if self.resumed is not None:
-            check_resumable(self.resumed, self.trainer)
+        """Callbacks that watch a figure wait for the last stage."""
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
             self.trainer.callbacks = [  # type: ignore[attr-defined]
@@ -392,8 +379,11 @@ class PlaceRecognitionTask(pl.LightningModule):
             ]
 
     def on_train_start(self) -> None:
-        """What a checkpoint held is taken over."""
-        self.resumed = None
+        """Refuse a checkpoint whose loops are at another step than its weights."""
+        if self.resumed and self.global_step != self.steps:
+            raise InputError(
+                f"the checkpoint is of step {self.steps}, its loops are at {self.global_step}; {EXPECTED}"
+            )
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Drop a map of the features before; begin the next stage if the steps of this one are over."""
@@ -434,6 +424,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_train_batch_end(self, *_: Any) -> None:
         """Give up a training that learns nothing, as soon as that can be told."""
+        self.resumed = False  # its optimizer's state has made a step
         if not self.last.learned:
             self.last.check(self.stage.chance(self))
 
@@ -461,7 +452,7 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """A map of the present features, where there is none yet."""
-        self.resumed = None
+        self.resumed = False
         if self.trainer.state.fn != "fit":
             self.require_map()
         if self.in_last_stage and not self.map.places:
@@ -499,11 +490,8 @@ class PlaceRecognitionTask(pl.LightningModule):
     def load_from_checkpoint(  # type: ignore[override]
         cls, checkpoint_path: str | Path, *, weights_only: bool = True, **settings: Any
     ) -> PlaceRecognitionTask:
-        """A task with the weights of a checkpoint; Lightning's own would import what the file names.
-
-        Args:
-            weights_only: ignored; no code of a checkpoint is ever run.
-            settings: of the constructor, as in the training.
+        """A task with the weights of a checkpoint and the constructor's `settings`, as in the training.
+        Nothing is imported that the file names, as by Lightning's own, and `weights_only` is always true.
 
         Raises:
             InputError: a damaged checkpoint, or one of other settings.
@@ -535,20 +523,25 @@ class PlaceRecognitionTask(pl.LightningModule):
         if checkpoint.get("stages") != stages:
             seen = checkpoint.get("stages", "no training")
             raise InputError(f"the checkpoint is of {seen}; expected one of the stages {stages}")
-        self._check_finite(checkpoint["state_dict"])
+        own = {name for name, _ in self.named_parameters()}  # buffers of a backbone may hold what they like
+        for name, value in checkpoint["state_dict"].items():
+            checked = name in own or name.startswith((MAP, WHITENING))
+            if checked and isinstance(value, Tensor) and not value.isfinite().all():
+                raise InputError(
+                    f"{name} of the checkpoint has NaN or infinite numbers; expected finite ones"
+                )
         if self._trainer is not None:
-            self.resumed = checkpoint
+            self.resumed = True
             if self.trainer.state.fn != "fit":
                 checkpoint.pop("loops", None)  # nothing goes on
-        self.routes = checkpoint.get("routes", [])
-        if not isinstance(self.routes, list) or not all(isinstance(one, list) for one in self.routes):
-            raise InputError(
-                f"routes of the checkpoint are {str(self.routes)[:40]}; expected a list of names and lengths"
-            )
+        for key, kind in (("routes", list), ("held", int)):
+            value = checkpoint.get(key, [])
+            if not isinstance(value, list) or not all(isinstance(one, kind) for one in value):
+                raise InputError(
+                    f"{key} of the checkpoint is {str(value)[:40]}; expected a list, as `fit` writes"
+                )
+        self.routes, self.held_before = checkpoint.get("routes", []), checkpoint.get("held", [])
         self._check_routes()
-        self.held_before = held = checkpoint.get("held", [])
-        if not isinstance(held, list) or not all(isinstance(one, int) for one in held):
-            raise InputError(f"held of the checkpoint is {str(held)[:40]}; expected a list of places")
         if not self.made:
             self._take_templates(checkpoint["state_dict"])
         self.index, self.began = checkpoint["stage"], checkpoint["began"]
@@ -560,16 +553,6 @@ class PlaceRecognitionTask(pl.LightningModule):
                 "checkpoint of the same settings"
             )
 
-    def _check_finite(self, state: dict[str, Any]) -> None:
-        """Refuse NaN and infinity, but for buffers of the backbone, such as a mask."""
-        own = {name for name, _ in self.named_parameters()}
-        for name, value in state.items():
-            checked = name in own or name.startswith((MAP, WHITENING))
-            if checked and isinstance(value, Tensor) and not bool(value.isfinite().all()):
-                raise InputError(
-                    f"{name} of the checkpoint has NaN or infinite numbers; expected finite ones"
-                )
-
     def _take_templates(self, state: dict[str, Any]) -> None:
         mapper = cast(TemplateMapper, self.dejavu.mapper)
         route, periods = mapper.empty(), mapper.periods
@@ -578,9 +561,13 @@ class PlaceRecognitionTask(pl.LightningModule):
         if route.places and isinstance(periods, ImposedPeriods):
             imposed = periods.plan(torch.zeros(1, 1).expand(route.places, route.dimension))
             if imposed != route.plan:
+                held, wanted = (
+                    ", ".join(f"{layer.phases} in {layer.period}" for layer in plan) or "no"
+                    for plan in (route.plan, imposed)
+                )
                 raise InputError(
-                    f"the checkpoint holds layers of {_layers(route.plan)} frames, this run imposes "
-                    f"{_layers(imposed)}; expected a checkpoint of the same periods"
+                    f"the checkpoint holds layers of {held} frames, this run imposes {wanted}; expected a "
+                    "checkpoint of the same periods"
                 )
         route.trainable(True, self.feature_weights)
         self.dejavu.map = route.to(self.device)
@@ -604,40 +591,26 @@ class PlaceRecognitionTask(pl.LightningModule):
 
     def _check_route(self, places: int) -> None:
         """Refuse a map of another route than the data's."""
-        if self._trainer is None or not places:
-            return
-        reference = self.data.sets["reference"]
-        if places != len(reference):
+        count = 0 if self._trainer is None else len(self.data.sets["reference"])
+        if places and count and places != count:
             raise InputError(
-                f"the map is of {places} places, {self.data.reference.name} has {len(reference)}; expected "
-                "the route that it was made of"
+                f"the map is of {places} places, {self.data.reference.name} has {count}; expected the route "
+                "that it was made of"
             )
 
 
 def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
-    """Give a task what a checkpoint of it holds.
-
-    Raises:
-        InputError: a damaged checkpoint, or one of other settings.
-    """
+    """Give a task what a checkpoint of it holds."""
     checkpoint = read_checkpoint(path)
     with taking_over(path):
         task.on_load_checkpoint(checkpoint)
         task.load_state_dict(checkpoint["state_dict"])
-    task.resumed = None
-
-
-def _layers(plan: Plan) -> str:
-    return ", ".join(f"{layer.phases} in {layer.period}" for layer in plan) or "no"
+    task.resumed = False
 
 
 def start_from(backbone: nn.Module, path: str | Path) -> None:
     """Give a backbone the weights of a map file, without the code of a whitened descriptor, which is of its
-    route; only the network if an `Embedding` gives the descriptor itself, here or there.
-
-    Raises:
-        InputError: no map file, or one of another backbone.
-    """
+    route; only the network if an `Embedding` gives the descriptor itself, here or there."""
     prefix = "features."
     with opened(Path(path)) as (tensors, header):
         stored = unpacked(tensors, prefix)
@@ -662,15 +635,8 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
 def freeze_parts(
     backbone: nn.Module, prefixes: Sequence[str], batch_norm: Literal["train", "frozen"]
 ) -> set[str]:
-    """Take the gradient from parameters; return the names of modules whose running statistics have to stay.
-
-    Args:
-        prefixes: parameters whose names begin with one of these are frozen; "" is all of them.
-        batch_norm: "frozen" keeps the running statistics of all BatchNorm, "train" of those in frozen parts.
-
-    Raises:
-        InputError: a prefix that no parameter begins with.
-    """
+    """Take the gradient from parameters; return the names of modules whose running statistics have to stay,
+    those in frozen parts at least. The arguments are the task's."""
     for prefix in prefixes:
         chosen = [p for name, p in backbone.named_parameters() if name.startswith(prefix)]
         if not chosen:
@@ -695,12 +661,8 @@ def warm_up(steps: int) -> int:
 
 
 def adamw_of(parameters: Iterable[nn.Parameter], lr: float, weight_decay: float, steps: int) -> Any:
-    """AdamW, and a schedule: the learning rate rises over the first tenth of the steps, then falls along a
-    cosine to 0. Only what is multiplied with something decays: matrices and kernels.
-
-    Returns:
-        What Lightning's `configure_optimizers` gives.
-    """
+    """AdamW and its schedule, for Lightning: the learning rate rises over the first tenth of the steps, then
+    falls along a cosine to 0. Only what is multiplied with something decays: matrices and kernels."""
     trained = list(parameters)
     groups = [
         {"params": [p for p in trained if p.ndim > 1], "weight_decay": weight_decay},

@@ -13,7 +13,6 @@ from small_training import FRAMES, backbone, data_of, fit, footage, new_task, re
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu
-from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
@@ -58,14 +57,6 @@ def test_frozen_batch_norm_keeps_its_statistics_and_learns_its_weights(tmp_path:
     task.train()
     assert {type(part) for part in module.modules() if not part.training} == {nn.BatchNorm1d, nn.BatchNorm2d}
     assert module.training
-
-
-@pytest.mark.parametrize("norm", [nn.BatchNorm2d, nn.InstanceNorm2d], ids=lambda kind: kind.__name__)
-def test_all_running_statistics_can_be_frozen(norm: type[nn.Module]) -> None:
-    net = nn.Sequential(nn.Conv2d(1, 2, 3), norm(2, affine=True, track_running_stats=True))
-    assert freeze_parts(net, [], "train") == set()
-    assert freeze_parts(net, [], "frozen") == freeze_parts(net, ["1"], "train") == {"1"}
-    assert freeze_parts(net, ["0"], "train") == set()
 
 
 def test_statistics_of_instances_stay_in_a_frozen_part(tmp_path: Path) -> None:
@@ -143,16 +134,6 @@ def test_hog_has_nothing_to_train_but_the_map_is(tmp_path: Path) -> None:
     assert len(model.map.weights) == model.map.dimension
     assert not (model.map.weights == 1).all()
     assert recall(model, footage(0.02)) > 0.5
-
-
-def test_ready_features_need_no_backbone(tmp_path: Path) -> None:
-    features = torch.randn(FRAMES, 6)
-    task = new_task(backbone=nn.Identity())
-    trainer(tmp_path).fit(task, data_of(features))
-    model = DejaVu.load(tmp_path / "map.safetensors", nn.Identity())
-    assert model.frame_shape == (6,)
-    torch.testing.assert_close(model(features[:3]), task(features[:3]))
-    assert model.localize(ArrayTraverse(features)).index.shape == (FRAMES,)
 
 
 def test_ready_features_leave_a_backbone_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

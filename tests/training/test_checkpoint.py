@@ -84,18 +84,6 @@ def test_a_checkpoint_of_other_settings_is_refused(
         getattr(trainer(tmp_path), stage)(new_task(**settings), data_of(), ckpt_path=last)
 
 
-@pytest.mark.parametrize("given", [{}, {"mapper": mapper(Later())}], ids=["imposed", "found"])
-def test_a_checkpoint_of_another_route_is_refused(tmp_path: Path, given: dict[str, Any]) -> None:
-    first, shorter = train(tmp_path, **given), data_of(footage()[:30])
-    with refused("the map is of 40 places", "has 30", "expected the route that it was made of"):
-        trainer(tmp_path).fit(new_task(**given), shorter, ckpt_path=first)
-
-
-def test_a_checkpoint_of_another_task_is_refused() -> None:
-    with refused("the checkpoint is of no training", "['CodeStage']"):
-        new_task().on_load_checkpoint({"state_dict": {"weight": torch.zeros(3)}})
-
-
 def test_a_task_is_not_fitted_to_a_second_route(tmp_path: Path) -> None:
     task = new_task()
     model = fit(tmp_path, task, data_of())

@@ -63,13 +63,6 @@ def test_a_run_that_is_over_already_warns(tmp_path: Path, caplog: pytest.LogCapt
     assert torch.equal(maps[0].templates, maps[1].templates)
 
 
-def test_a_figure_that_was_never_measured_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    best, task = ModelCheckpoint(tmp_path, monitor="val/auc_augmented", mode="max"), new_task()
-    trainer(tmp_path, best, check_val_every_n_epoch=9).fit(task, data_of())
-    assert warned(caplog) == ["val/auc_augmented was never measured: the map is of the last step"]
-    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)
-
-
 class Tidy(Callback):
     """Deletes the best checkpoint."""
 
@@ -82,14 +75,6 @@ def test_a_best_checkpoint_that_is_gone_warns(tmp_path: Path, caplog: pytest.Log
     trainer(tmp_path, best, Tidy()).fit(task, data_of())
     assert warned(caplog) == [f"{best.best_model_path} is gone: the map is of the last step"]
     assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)
-
-
-def test_the_callback_knows_what_it_wrote(tmp_path: Path) -> None:
-    running = trainer(tmp_path)
-    running.fit(new_task(), data_of())
-    path, model = running.callbacks[0].written  # type: ignore[attr-defined]
-    assert path == tmp_path / "map.safetensors"
-    assert model.summary() == DejaVu.load(path).summary()
 
 
 def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.curves import Scores, evaluate
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.types import Match
@@ -88,15 +88,6 @@ def test_close_scores_in_double_precision_stay_apart() -> None:
     assert metric.compute()["recall_at_100_precision"] == 0.5
 
 
-def test_reset_forgets() -> None:
-    first, second = some(), some()
-    metric = fed(first)
-    metric.reset()
-    assert all(value.isnan() for value in metric.compute().values())
-    metric.update(*second)
-    assert same(metric.compute(), evaluate(*second, tolerance=1))
-
-
 def fed_scores(*batches: tuple[Match, Tensor]) -> Scores:
     """`evaluate` of the batches joined by hand."""
     matches, truths = zip(*batches, strict=True)
@@ -134,23 +125,20 @@ def test_a_process_that_saw_nothing_sends_what_the_others_send() -> None:
     assert sent == [(1, torch.float64)] * 3
 
 
-def test_errors() -> None:
-    match, truth = some(queries=3)
+MATCH, TRUTH = some(queries=3)
+
+
+@pytest.mark.parametrize(
+    ("match", "truth", "words"),
+    [
+        (MATCH._replace(index=MATCH.index[:, None]), TRUTH, ("(3, 1) torch.int64", "expected (Q,) int64")),
+        (MATCH._replace(score=MATCH.score[:2]), TRUTH, ("(3,) torch.int64 and (2,)",)),
+        (MATCH._replace(score=MATCH.score * float("nan")), TRUTH, ("a score is NaN",)),
+        (MATCH, TRUTH[:2], ("the truth is (2, 2)", "(3, R)")),
+    ],
+)
+def test_what_does_not_fit_is_refused(match: Match, truth: Tensor, words: tuple[str, ...]) -> None:
     metric = PlaceRecognition(tolerance=1)
-    with refused("tolerance is -1", "at least 0"):
-        PlaceRecognition(-1)
-    with refused("(3, 1) torch.int64", "(3,)", "expected (Q,) int64"):
-        metric.update(match._replace(index=match.index[:, None]), truth)
-    with refused("torch.float32", "expected (Q,) int64"):
-        metric.update(match._replace(index=match.index.float()), truth)
-    with refused("(3,) torch.int64 and (2,)"):
-        metric.update(match._replace(score=match.score[:2]), truth)
-    with refused("a score is NaN"):
-        metric.update(match._replace(score=match.score * float("nan")), truth)
-    with refused("the truth is (2, 2)", "(3, R)"):
-        metric.update(match, truth[:2])
-    with refused("the truth is (3,)"):
-        metric.update(match, truth[:, 0])
-    with refused("(2,) and (3, 0)", "expected (3,)"):
-        metric.update(match, as_ground_truth(truth)._replace(judged=torch.ones(2, dtype=torch.bool)))
+    with refused(*words):
+        metric.update(match, truth)
     assert not metric.score  # nothing of a refused batch is kept

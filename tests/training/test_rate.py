@@ -12,16 +12,15 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from small_training import FRAMES, Stop, data_of, fit, footage, mapper, new_task, recall, trainer
+from small_training import FRAMES, Stop, data_of, fit, footage, new_task, recall, trainer
 from test_stages import coded
 from torch import Tensor
 
-from dejavu_torch import RouteData, SpectralMapper, Whitening
+from dejavu_torch import RouteData, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.training.losses import bands_of, coded_proxies, laplace_bits
-from dejavu_torch.training.stages import DescriptorStage
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 
@@ -146,11 +145,6 @@ def test_shapes_that_do_not_fit(shapes: tuple[tuple[int, ...], ...], words: tupl
 # -------------------------------------------------------------------- training
 
 
-def test_without_a_rate_there_is_no_code() -> None:
-    assert type(rated(0.0).stages[0]) is DescriptorStage
-    assert rated(0.0).dejavu.whitening is not None
-
-
 @pytest.mark.parametrize("transform", ["dft", "dct"])
 def test_a_training_with_a_rate_ends_in_a_map_that_finds_its_places(
     tmp_path: Path, transform: Transform
@@ -162,13 +156,6 @@ def test_a_training_with_a_rate_ends_in_a_map_that_finds_its_places(
     figures = task.trainer.callback_metrics
     assert figures["train/bits"] > 0
     assert figures["train/loss"] > figures["train/descriptor"]
-
-
-def test_whitening_is_there_where_it_is_asked_for(tmp_path: Path) -> None:
-    task = rated(whitening=Whitening(numbers=4), mapper=SpectralMapper(10.0))
-    model = fit(tmp_path, task, data_of())
-    assert model.whitening is not None
-    assert model.map.dimension == 4
 
 
 def test_bits_count_for_more_and_more(tmp_path: Path) -> None:
@@ -197,18 +184,7 @@ def test_bits_are_saved_where_they_count(tmp_path: Path) -> None:
     assert bits[1] < 0.7 * bits[0]
 
 
-@pytest.mark.parametrize("rate", [-0.1, math.nan, math.inf])
-def test_a_rate_out_of_range(rate: float) -> None:
-    with refused(f"rate is {rate}", "0 or more"):
-        rated(rate)
-
-
 def test_a_rate_is_of_one_route(tmp_path: Path) -> None:
     several = [ArrayTraverse(footage(0.1 * k, FRAMES), f"route {k}") for k in range(2)]
     with refused("model.rate is 1.0 and there are 2 routes", "model.rate 0"):
         trainer(tmp_path).fit(rated(), RouteData(several, tolerance=2))
-
-
-def test_templates_have_no_rate() -> None:
-    with refused("rate is given, which does nothing for the map of a TemplateMapper"):
-        new_task(mapper=mapper(), rate=1.0)

@@ -58,10 +58,7 @@ def test_a_resumed_run_takes_the_steps_that_are_left(tmp_path: Path, name: str, 
     assert (model.trained.steps, model.map.places) == (STEPS, 40)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [*(("routes", one) for one in (7, None, ["a"], "one")), *(("held", one) for one in (7, None, ["a"]))],
-)
+@pytest.mark.parametrize(("key", "value"), [("routes", ["a"]), ("held", None), ("held", ["a"])])
 def test_damaged_routes_and_stretches_are_refused(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, key: str, value: Any
 ) -> None:

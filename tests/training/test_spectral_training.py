@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 from helpers import refused
-from pytorch_lightning.callbacks import ModelCheckpoint
 from small_training import (
     FRAMES,
     Stop,
@@ -23,13 +22,11 @@ from small_training import (
     trainer,
     warned,
 )
-from test_stages import STILL, Watch, coded
-from test_task import assert_figures
+from test_stages import STILL, coded
 from torch import nn
 
 from dejavu_torch import HOG, DejaVu, SpectralMapper, TemplateMap, Whitening
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.baselines import baselines_of
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.embedding import Embedding
@@ -95,22 +92,6 @@ def test_the_file_holds_the_network_alone(tmp_path: Path) -> None:
     assert model.whitening.learned
 
 
-def test_the_descriptor_is_that_of_a_training_with_a_code(tmp_path: Path) -> None:
-    """The same steps, rates and random numbers, whatever is validated on the way."""
-    states = []
-    for task, steps in ((new_task(backbone=coded(), descriptor=0.5), 10), (spectral(), 5)):
-        torch.manual_seed(3)
-        again = coded()
-        task.dejavu.features.network.load_state_dict(again.network.state_dict())  # type: ignore[union-attr]
-        watch = Watch()
-        running = trainer(tmp_path / str(steps), watch, max_steps=steps, enable_checkpointing=True, **EVERY)
-        running.fit(task, data_of())
-        states.append([{n: t for n, t in s.items() if n.startswith("network.")} for s in watch.states])
-    for code, own in zip(*states, strict=False):
-        assert all(torch.equal(code[name], value) for name, value in own.items())
-    assert not torch.equal(states[1][0]["network.linear.weight"], states[1][-1]["network.linear.weight"])
-
-
 def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path: Path) -> None:
     model = fit(tmp_path, spectral(), data_of(), max_steps=3, **EVERY)
     features = model.extract_all(ArrayTraverse(footage()))
@@ -128,21 +109,6 @@ def test_making_a_map_changes_nothing_and_gives_the_same_again(tmp_path: Path) -
     assert torch.equal(torch.get_rng_state(), state)
     assert task.dejavu.features.training
     assert all(torch.equal(weights[n], value) for n, value in task.dejavu.features.state_dict().items())
-
-
-def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path) -> None:
-    running, task = trainer(tmp_path, precision="bf16-mixed"), spectral()
-    running.fit(task, data_of())
-    assert_figures(running, task, footage(0.2))
-
-
-def test_its_null_is_beside_it(tmp_path: Path) -> None:
-    """Of the same descriptors, coded in shuffled order: nothing of it has to be trained."""
-    model = fit(tmp_path, spectral(), data_of())
-    features, queries = (model.extract_all(ArrayTraverse(footage(noise))) for noise in (0.0, 0.05))
-    null = baselines_of(model, features, queries, tolerance=2)["null"]
-    assert null.name == "null: shuffled frames, as many bytes"
-    assert len(null.found.index) == FRAMES
 
 
 # checkpoints ---------------------------------------------------------------------------------------------
@@ -169,24 +135,6 @@ def test_a_checkpoint_holds_no_map_and_validating_it_makes_one(tmp_path: Path) -
     assert route.trained is not None
     assert route.trained.steps == 4
     assert 5.8 < route.summary().route_bytes / FRAMES <= 6
-
-
-def test_without_frames_there_is_no_map_to_deploy(tmp_path: Path) -> None:
-    given = {"backbone": coded(), "mapper": SpectralMapper(20.0)}
-    task = PlaceRecognitionTask.load_from_checkpoint(part(tmp_path), weights_only=True, **given)
-    with refused("data module is NoneType", "RouteData"):
-        task.deployed()
-
-
-def test_the_map_is_of_the_best_checkpoint(tmp_path: Path) -> None:
-    best = ModelCheckpoint(tmp_path, monitor="val/recall_at_1_augmented", mode="min", filename="best")
-    running = trainer(tmp_path, best, max_steps=6, **EVERY)
-    running.fit(task := spectral(weight_bits=32), data_of())
-    state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
-    model = DejaVu.load(tmp_path / "map.safetensors")
-    name = "network.linear.weight"
-    assert torch.equal(model.features.state_dict()[name], state[f"dejavu.features.{name}"])
-    assert_same_scores(task, model)
 
 
 @pytest.mark.parametrize(

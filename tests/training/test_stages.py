@@ -13,7 +13,6 @@ from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
 from small_training import (
     FRAMES,
     Stop,
-    assert_same_scores,
     backbone,
     data_of,
     fit,
@@ -107,11 +106,6 @@ def test_what_is_learned_finds_places_on_another_day(tmp_path: Path) -> None:
         tmp_path, new_task(**settings), data_of(augmentation=mild), max_steps=500, limit_val_batches=0
     )
     assert recall(model, footage(0.05)) > 0.7
-
-
-def test_task_map_and_exported_program_give_the_same_scores(tmp_path: Path) -> None:
-    task = new_task(backbone=coded())
-    assert_same_scores(task, fit(tmp_path, task, data_of(), max_steps=6))
 
 
 @pytest.mark.parametrize("name", ["hog", "frozen"])
@@ -209,13 +203,6 @@ def test_a_training_that_ends_in_an_earlier_stage_leaves_no_map(
     assert "DescriptorStage" in line
 
 
-def test_ready_features_have_no_descriptor_to_learn(tmp_path: Path) -> None:
-    task = new_task(backbone=coded())
-    model = fit(tmp_path, task, data_of(torch.rand(FRAMES, 6)))
-    assert model.map.dimension == 6
-    assert [type(stage) for stage in task.stages] == [CodeStage]
-
-
 @pytest.mark.parametrize("every", [{"val_check_interval": 1}, {"check_val_every_n_epoch": 1}], ids=str)
 def test_what_watches_a_figure_begins_with_the_last_stage(tmp_path: Path, every: dict[str, int]) -> None:
     """Up to step 10 there is no map: no patience is lost there, and no best checkpoint found."""
@@ -236,26 +223,3 @@ def test_what_watches_a_figure_begins_with_the_last_stage(tmp_path: Path, every:
     assert int(best.best_model_path.partition("step=")[2].removesuffix(".ckpt")) > 10
     assert DejaVu.load(tmp_path / "map.safetensors").features.linear.whitened  # type: ignore[union-attr]
     assert running.callbacks == callbacks  # type: ignore[attr-defined]
-
-
-class Counting(torch.nn.Conv2d):
-    """Counts the frames that it is shown."""
-
-    shown = 0
-
-    def forward(self, frames: Tensor) -> Tensor:
-        self.shown += len(frames)
-        return super().forward(frames)
-
-
-@pytest.mark.parametrize("refresh", [0, 1])
-def test_a_frozen_network_is_shown_every_frame_once_and_every_view_once(tmp_path: Path, refresh: int) -> None:
-    network = Counting(1, 6, 3)
-    task = staged(backbone=coded(network=network, resize=(8, 8), kept=4), freeze=["network"], refresh=refresh)
-    tried = network.shown
-    stages = [type(stage) for stage in task.stages]
-    assert stages == [CodeStage]
-    trainer(tmp_path, max_steps=6, limit_val_batches=0).fit(task, data_of(validation=None))
-    assert task.views is not None
-    frames = len(task.data.sets["reference"])
-    assert network.shown - tried == frames + len(task.views.descriptors)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import shlex
 import shutil
 import signal
@@ -17,7 +16,6 @@ import torch
 import yaml
 from pytorch_lightning import Trainer
 from small_training import CONFIG, FRAMES, MINE, footage, train, warned
-from torch import nn
 
 from dejavu_torch import DejaVu, RouteData, TemplateMap
 from dejavu_torch.cli import main
@@ -68,12 +66,6 @@ def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest
     assert printed(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
 
 
-def test_a_built_in_route(folder: Path, tmp_path: Path) -> None:
-    options = ["--data.source", "sim:aerial?frames=48", "--data.resize", "[16,16]"]
-    train("fit", *options, "--model.backbone.channels", 3, "--trainer.default_root_dir", tmp_path)
-    assert DejaVu.load(tmp_path / "map.safetensors").frame_shape == (3, 16, 16)
-
-
 def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, validations and checkpoints have defaults; here but a few steps are taken."""
     monkeypatch.chdir(tmp_path)
@@ -92,29 +84,10 @@ def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pyt
     assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 120, 160)
 
 
-def test_it_resumes(folder: Path, tmp_path: Path) -> None:
-    shutil.copytree(folder / "run", tmp_path / "run")
-    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    before = torch.load(last, weights_only=True)
-    options = ["--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "run"]
-    train("fit", *options, "--trainer.max_steps", 6)
-    after = torch.load(last, weights_only=True)
-    assert (before["global_step"], after["global_step"]) == (4, 6)
-
-
 def test_auto_is_one_device_of_however_many(folder: Path, tmp_path: Path) -> None:
     options = ["--trainer.default_root_dir", tmp_path, "--trainer.logger", "false"]
     train("fit", "--trainer.devices", "auto", *options)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trainer"]["devices"] == 1
-
-
-def test_a_seed_repeats_a_map(folder: Path, tmp_path: Path) -> None:
-    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        train("fit", "--seed_everything", seed, "--trainer.default_root_dir", tmp_path / name)
-    one, same, other = (DejaVu.load(tmp_path / name / "map.safetensors").state_dict() for name in "abc")
-    tensors = [name for name, value in one.items() if isinstance(value, torch.Tensor)]
-    assert all(torch.equal(one[name], same[name]) for name in tensors)
-    assert not torch.equal(one["map.templates"], other["map.templates"])
 
 
 def test_losses_and_a_users_backbone_by_name(folder: Path, tmp_path: Path) -> None:
@@ -126,19 +99,6 @@ def test_losses_and_a_users_backbone_by_name(folder: Path, tmp_path: Path) -> No
     assert "mine.Plain" in str(read_map(tmp_path / "map.safetensors")[1]["features"])
 
 
-@pytest.mark.parametrize("backbone", ["torch.nn.Identity", None])
-def test_ready_features(
-    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, backbone: str | None
-) -> None:
-    """A backbone that has parameters is left out."""
-    np.save(tmp_path / "features.npy", np.random.default_rng(0).normal(size=(FRAMES, 6)).astype("float32"))
-    options = ["--data.source", tmp_path / "features.npy", "--trainer.default_root_dir", tmp_path]
-    train("fit", *options, *(["--model.backbone", backbone] if backbone else []))
-    assert warned(caplog) == ([] if backbone else ["these are ready features: the backbone is left out"])
-    model = DejaVu.load(tmp_path / "map.safetensors", nn.Identity() if backbone else None)
-    assert (model.map.dimension, "backbone" in model.summary().fixed) == (6, False)
-
-
 def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(
         "model: {backbone: {init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4]}}}\n"
@@ -146,14 +106,8 @@ def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Pat
         "trainer: {max_steps: 2, accelerator: cpu, enable_progress_bar: false}\n"
     )
     options = ["--model.mapper.periods.periods", "[11,12,13,17]", "--data.augmentation.rotation", 0]
-    options += [
-        "--model.mapper.reduction",
-        "sum",
-        "--model.preprocess.contrast",
-        "patch",
-        "--trainer.default_root_dir",
-        tmp_path / "run",
-    ]
+    options += ["--model.mapper.reduction=sum", "--model.preprocess.contrast=patch"]
+    options += ["--trainer.default_root_dir", tmp_path / "run"]
     train("fit", *options, config=str(tmp_path / "short.yaml"))
     model = DejaVu.load(tmp_path / "run" / "map.safetensors")
     assert [layer.phases for layer in model.map.plan] == [11, 12, 13, 17]
@@ -242,12 +196,7 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
     last = run / "checkpoints" / "last.ckpt"
     for size in (12, 6, 1.2):  # the map is made anew of the checkpoint's features
         options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
-        options += [
-            "--data.validation",
-            "two.npy",
-            "--data.validation_truth",
-            "0",
-        ]  # which calibrates the map
+        options += ["--data.validation=two.npy", "--data.validation_truth=0"]  # which calibrates the map
         train("export", "--ckpt_path", last, *options)
         assert ("this route needs about" in capfd.readouterr().out) == (size == 1.2)
     maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("plain", "12", "6")]
@@ -269,27 +218,13 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
 
 
 def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:
-    options = [
-        "--trainer.max_steps",
-        2,
-        "--data.source",
-        "sim:aerial?frames=40",
-        "--trainer.accelerator",
-        "cpu",
-    ]
+    options = ["--trainer.max_steps=2", "--data.source=sim:aerial?frames=40", "--trainer.accelerator=cpu"]
     options += ["--trainer.precision", "32-true", "--trainer.default_root_dir", tmp_path]
     main(["train", "fit", *map(str, options), "--config", "train_small"])
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.trained is not None
     assert model.trained.steps == 2
     assert model.features.resize == (64, 64)
-
-
-@pytest.mark.skipif(importlib.util.find_spec("tensorboard") is None, reason="tensorboard is not installed")
-def test_tensorboard_is_used_where_it_is(folder: Path, tmp_path: Path) -> None:
-    logger = ["--trainer.logger", "TensorBoardLogger", "--trainer.logger.save_dir", tmp_path]
-    train("fit", *logger, "--trainer.default_root_dir", tmp_path)
-    assert list(tmp_path.rglob("events.out.tfevents*"))
 
 
 def test_help_has_our_options_first(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

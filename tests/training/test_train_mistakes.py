@@ -21,69 +21,32 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
         ("fit", [*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["'periods' is not accepted"]),
         ("fit", [*SPECTRAL, *ANOTHER], ["of ['CodeStage']", "['DescriptorStage']"]),
         ("fit", ["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
-        ("export", ["--ckpt_path", "gone.ckpt"], ["gone.ckpt"]),
-        ("export", ["--ckpt_path", "a_file"], ["checkpoint cannot be read"]),
         ("export", ["--ckpt_path", "foreign.ckpt"], ["foreign.ckpt is no checkpoint of a training"]),
         ("export", ["--trainer.default_root_dir", "never"], ["no checkpoint in never/checkpoints"]),
-        ("fit", ["--ckpt_path", "gone.ckpt"], ["gone.ckpt"]),
         ("fit", ["--ckpt_path", "a_file"], ["checkpoint cannot be read"]),
         ("fit", ["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
         ("fit", ["--trainer.max_steps", "0"], ["no steps", "above 0"]),
-        ("fit", ["--trainer.max_epochs", "0"], ["no steps"]),
         ("fit", ["--trainer.val_check_interval", "0"], ["trainer.val_check_interval is 0"]),
+        ("fit", ["--trainer.max_steps", "-2"], ["trainer.max_steps is -2", "-1 for no end"]),
         (
             "fit",
-            ["--trainer.check_val_every_n_epoch", "0"],
-            ["check_val_every_n_epoch is 0", "of at least 1"],
-        ),
-        ("fit", ["--trainer.max_steps", "-2"], ["trainer.max_steps is -2", "-1 for no end"]),
-        *(
-            (
-                command,
-                ["--trainer.devices", devices, "--trainer.strategy", "fsdp"],
-                [f"devices is {devices}", "strategy is fsdp", "or ddp"],
-            )
-            for command, devices in (
-                ("fit", "2"),
-                ("export", "2"),
-                ("fit", "[0, 1]"),
-                ("fit", "0,1"),
-                ("fit", "-1"),
-            )
+            ["--trainer.devices", "[0, 1]", "--trainer.strategy", "fsdp"],
+            ["devices is [0, 1]", "strategy is fsdp", "or ddp"],
         ),
         ("fit", ["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
         ("fit", ["--trainer.num_nodes", "2"], ["num_nodes is 2", "MASTER_ADDR"]),
         ("fit", ["--model.backbone", "mine.Hungry"], ["not enough memory: it ran out"]),
         ("fit", ["--seed_everything", str(2**63)], ["seed_everything", "expected whole numbers of at most"]),
-        ("fit", ["--data.batch_size", str(2**63)], ["data.batch_size", "expected whole numbers of at most"]),
         ("fit", ["--data.resize", "[1000000,1000000]"], ["frames of 1000000 x 1000000", "GB free"]),
-        (
-            "fit",
-            ["--model.mapper.periods.periods", "[1000000000000]"],
-            ["imposed periods are [1000000000000]", "<= 16777216"],
-        ),
         ("fit", ["--model.backbone.widths", "[1000000,1000000]"], ["cannot be built", "memory"]),
         ("fit", ["--trainer.overfit_batches", "2"], ["overfit_batches", "trainer.limit_train_batches"]),
-        (
-            "test",
-            ["--trainer.default_root_dir", "never"],
-            ["no checkpoint in never/checkpoints", "--ckpt_path"],
-        ),
-        ("validate", ["--trainer.default_root_dir", "never"], ["no checkpoint in never/checkpoints"]),
         ("fit", ["--data.source", "gone.npy"], ["gone.npy is not there", "expected a folder"]),
-        ("fit", ["--data.source", "empty"], ["empty holds no images"]),
-        ("fit", ["--data.source", "[1,2]"], ["source is of type int", "expected a path"]),
-        ("fit", ["--data.source", "2021"], ["2021 is not there", "expected a folder"]),
         ("fit", ["--trainer.default_root_dir", "a_file"], ["a_file cannot be made a folder"]),
-        ("fit", ["--trainer.max_steps", "-1"], ["no end", "trainer.max_steps or trainer.max_epochs"]),
-        ("fit", ["--trainer.accelerator", "nix"], ["nix", "accelerator"]),
         ("fit", [*STOP, "--trainer.callbacks.monitor=nix"], ["early stopping", "`nix`"]),
         ("fit", [*WATCH, "--trainer.callbacks.monitor=nix"], ["monitor='nix'"]),
         ("fit", ["--trainer.max_steps", "x"], ["trainer.max_steps", "int", "x"]),
         ("fit", ["--trainer.accelerator", "mps"], ["mps", "not available"]),
-        ("fit", ["--model.backbone", "nix.Nothing"], ["model.backbone", "No module named 'nix'"]),
         ("fit", ["--model.backbone", "mine.Nothing"], ["model.backbone", "no attribute 'Nothing'"]),
-        ("fit", ["--clop", "3"], ["--clop"]),
         ("fit", ["--config", "gone.yaml"], ["gone.yaml is not there"]),
         ("fit", ["--config", "train_smal"], ["train_smal is not there", "train_small"]),
         ("predict", [], ["'predict'", "fit"]),
@@ -109,8 +72,6 @@ def test_a_mistake_is_one_line(
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        ("model:", "clop: 3\nmodel:", ["'clop'"]),
-        ("model:", "model:\n  clop: 3", ["'model.clop'"]),
         ("tolerance: 2", "tolerance: 2, augmentation: {clop: 3}", ["data.augmentation", "'clop'"]),
         ("source: one.npy, ", "", ["required: --data.source"]),
         ("max_steps: 4, ", "max_steps: null, ", ["trainer.max_steps is None"]),
@@ -125,14 +86,6 @@ def test_a_mistake_in_the_config_is_one_line(
 ) -> None:
     (tmp_path / "bad.yaml").write_text(CONFIG.replace(before, after))
     fails(capfd, ["fit", "--config", str(tmp_path / "bad.yaml")], words)
-
-
-@pytest.mark.parametrize("part", ["trainer", "model"])
-def test_a_part_that_is_a_number_is_one_line(
-    folder: Path, capfd: pytest.CaptureFixture[str], tmp_path: Path, part: str
-) -> None:
-    (tmp_path / "bad.yaml").write_text(f"data: {{source: one.npy}}\n{part}: 5\n")
-    fails(capfd, ["fit", "--config", str(tmp_path / "bad.yaml")], [f"{part} is 5", "expected options"])
 
 
 @pytest.mark.parametrize("options", [["--data.source", "short.npy"], ["--ckpt_path", "run/map.safetensors"]])

@@ -11,7 +11,7 @@ from helpers import refused
 from pytorch_lightning import Callback
 from small_training import assert_same_scores, backbone, data_of, footage, new_task, trainer
 
-from dejavu_torch import HOG, DejaVu, SpectralMapper
+from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.weights import is_rounded
@@ -66,17 +66,6 @@ def test_the_training_is_that_of_32_bits(tmp_path: Path, settings: dict[str, Any
     assert torch.equal(torch.stack(narrow.weights), torch.stack(wide.weights))
     assert torch.equal(large.features.linear.weight, wide.weights[-1])  # type: ignore[union-attr,arg-type]
     assert small.summary().fixed["backbone"] < 0.4 * large.summary().fixed["backbone"]
-
-
-def test_a_network_without_weights_has_none_to_round(tmp_path: Path) -> None:
-    task = new_task(backbone=HOG(cell=4))
-    trainer(tmp_path).fit(task, data_of())
-    assert DejaVu.load(tmp_path / "map.safetensors").weight_bits == 32
-
-
-def test_bits_that_there_are_none_of_are_refused() -> None:
-    with refused("weight_bits is 4", "8, 32"):
-        new_task(weight_bits=4)
 
 
 def test_a_training_starts_from_8_bits_and_refuses_damaged_ones(tmp_path: Path) -> None:
