@@ -37,7 +37,6 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.distance import l1_backend
-from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
@@ -165,7 +164,8 @@ def compare(
     off_map = _match_distractors(model, distractors, sequence)
     run = _judge(model, pair, places, queries, candidates, matching, options)
     contenders = _baselines(run, others or {}, options)
-    curve = _storage(run, contenders, options) if storage_curve else None
+    scored = contenders["map"].scores is not None and isinstance(model.map, SpectralMap)
+    curve = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and scored else None
     return _report(run, contenders, candidates, off_map, curve, seconds, options)
 
 
@@ -360,15 +360,6 @@ def _is_plain_hog(model: DejaVu) -> bool:
     return same and model.whitening is None and getattr(model.map, "metric", "l1") == "l1"
 
 
-def _storage(
-    run: Localization, contenders: Mapping[str, Contender], options: _Options
-) -> dict[str, list[Stored]] | None:
-    """The storage curve of a spectral map whose queries are scored."""
-    if not isinstance(run.model.map, SpectralMap) or contenders["map"].scores is None:
-        return None
-    return coded_at_sizes(run, seed=options.seed, progress=options.progress)
-
-
 def _report(
     run: Localization,
     contenders: dict[str, Contender],
@@ -407,11 +398,6 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     began = time.perf_counter()
     yield
     seconds[name] += time.perf_counter() - began
-
-
-def of_shown_frames(match: Match, route: PlaceMap) -> Match:
-    """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
-    return match._replace(index=route.table.scored(match.index))
 
 
 def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:

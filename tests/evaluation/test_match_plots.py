@@ -12,8 +12,8 @@ from dejavu_torch.evaluation.match_plots import (
     PosteriorImage,
     Row,
     diagonal,
+    draw_coverage,
     example_matches,
-    plot_coverage,
     plot_posterior,
     plot_rows,
     plot_score_matrix,
@@ -32,9 +32,9 @@ def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
 
 
 def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
-    figure, axis = plot_coverage(
-        matched(0, 9, -1, 4), torch.arange(4)[:, None], 1, torch.arange(11), torch.arange(4), "frames"
-    )
+    match, truth = matched(0, 9, -1, 4), as_ground_truth(torch.arange(4)[:, None])
+    pictures = draw_coverage(match, truth, 1, torch.arange(11), torch.arange(4), "frames")
+    figure, axis = pictures["coverage"].plot
     assert dots(axis) == {
         "1 wrong": [(1, 9)],
         "2 right": [(0, 0), (3, 4)],
@@ -46,7 +46,7 @@ def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
 def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
     match = matched(4, 9, -1, 2)._replace(probability=sure)
-    figure, axis = plot_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")
+    figure, axis = draw_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")["coverage"].plot
     (points,) = axis.collections
     shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))
     assert shown == {0.2: (1, 9), 0.6: (3, 2), 0.9: (0, 4)}
@@ -59,9 +59,9 @@ def test_without_a_truth_coverage_shows_the_probabilities() -> None:
 def test_coverage_leaves_grey_what_is_not_scored() -> None:
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
     truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
-    figure, axis = plot_coverage(
+    figure, axis = draw_coverage(
         matched(0, 1, 7, -1, 9), truth, 0, torch.arange(11), torch.tensor([10, 20, 30, 40, 50]), "frames"
-    )
+    )["coverage"].plot
     assert dots(axis) == {
         "3 not scored": [(20, 1), (30, 7)],
         "1 wrong": [(50, 9)],
@@ -160,7 +160,7 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
     borders = torch.tensor([0, 2, 4, 6, 30, 31, 32, 33, 34, 35, 40])
     queries, match = torch.tensor([0, 4, 8, 12]), matched(0, 3, -1, 9)
     truth = as_ground_truth(torch.tensor([[0, -1], [4, -1], [2, -1], [9, 5]]))
-    figure, axis = plot_coverage(match, truth, 1, borders, queries, "places")
+    figure, axis = draw_coverage(match, truth, 1, borders, queries, "places")["coverage"].plot
     assert dots(axis) == {"3 right": [(0, 0), (4, 6), (12, 35)], "1 not reported": [(8, 0)]}
     assert (axis.get_xlim(), axis.get_ylim()[1]) == ((0, 12), 40)
     labels = {"query (frame)", "reported place (frame)", "right within 1 places"}
