@@ -280,7 +280,8 @@ def _described_baselines(
     except InputError as error:
         log.info("no %s to compare with: %s", what, error)
         return {}
-    size = partial(stride_bytes, *stored.shape, stored.element_size())
+    (frames, dimension), itemsize = stored.shape, stored.element_size()
+    size = partial(stride_bytes, frames, dimension, itemsize)
     return {
         key: Baseline(name, nearest_frames(stored, queries, k, "l1", text, matching), size(k), k)
         for key, (name, k) in names.items()
