@@ -237,22 +237,18 @@ def _learn(
         if reference.length is not None:
             _check_places(model, reference.length, reference.name)
         places = model.extract_all(reference, text)
-        _check_map(model, places, reference.name, options.tolerance)
+        _check_places(model, len(places), reference.name)
+        sample = torch.arange(0, len(places), max(1, len(places) // SAMPLED))
+        away = (model.localize_descriptors(places[sample]).index - sample).abs()
+        found = int((away <= max(options.tolerance, NEAR)).sum())
+        if found < 0.5 * len(sample) and model.map.summary().covered:
+            log.warning(
+                "the map finds %d of %d frames of %s; expected the reference that it was made of",
+                *(found, len(sample), reference.name),
+            )
     if isinstance(calibration, Views) or (calibration is None and not has_map):
         calibrate_if_possible(model, reference, calibration)
     return places
-
-
-def _check_map(model: DejaVu, features: Tensor, name: str, tolerance: int) -> None:
-    """Refuse a map of another number of places, and warn of one that does not find its own reference."""
-    _check_places(model, len(features), name)
-    sample = torch.arange(0, len(features), max(1, len(features) // SAMPLED))
-    found = (model.localize_descriptors(features[sample]).index - sample).abs() <= max(tolerance, NEAR)
-    if found.float().mean() < 0.5 and model.map.summary().covered:
-        log.warning(
-            "the map finds %d of %d frames of %s; expected the reference that it was made of",
-            *(int(found.sum()), len(sample), name),
-        )
 
 
 def _check_places(model: DejaVu, places: int, name: str) -> None:

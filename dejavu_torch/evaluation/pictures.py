@@ -222,17 +222,15 @@ def draw_posterior(run: Localization) -> dict[str, Picture]:
         return {}
     image = posterior_image(scores_of(run), run.query_features, run.sequence)
     known = "" if run.truth is None else " Circles are around some of the right places; grey: none is right."
-    share = ""
-    if max(image.blocks) > 1:
-        queries, places = image.blocks
-        share = f" A pixel shows the most probable of {queries} queries and {places} places."
+    queries, places = image.blocks
+    share = f" A pixel shows the most probable of {queries} queries and {places} places."
     return {
         "posterior": Picture(
             plot_posterior(image, run.truth, run.borders, run.query_frames),
             "where the filter takes the camera to be",
             "The probability of each place, from a query and all before it. Below, that of being off the map."
             + known
-            + share,
+            + share * (max(image.blocks) > 1),
         )
     }
 
@@ -280,11 +278,7 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
         [float(period_of(j, stop - start, route.transform)) for j in range(1, stop - start)]
     )
     features = {int(number): Lines(*lines) for number, *lines in zip(chosen, amplitudes, kept, strict=True)}
-    where = (
-        ""
-        if len(route.chunks) == 1
-        else f" of the chunk of frames {run.borders[start]} to {run.borders[stop]}"
-    )
+    where = f" of the chunk of frames {run.borders[start]} to {run.borders[stop]}" * (len(route.chunks) > 1)
     return {
         "spectrum": Picture(
             plot_spectrum(features, periods, float(route.steps[chunk]), run.unit),
@@ -335,8 +329,7 @@ def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
 
 def longest_chunk(route: SpectralMap) -> int:
     """Its number; the first of equals."""
-    lengths = [stop - start for start, stop in route.chunks]
-    return lengths.index(max(lengths))
+    return max(range(len(route.chunks)), key=lambda j: route.chunks[j][1] - route.chunks[j][0])
 
 
 def draw_motion(run: Localization) -> dict[str, Picture]:
