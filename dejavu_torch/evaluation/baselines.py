@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -124,10 +124,45 @@ def baselines_of(
         leave_out: also query the reference with itself, see `leave_out_match`.
         progress: show progress bars on a terminal. matching: of all but `leave_out`.
     """
-    stores = _compact_stores if isinstance(model.map, SpectralMap) else _plain_stores
+    spectral = isinstance(model.map, SpectralMap)
     text = "baselines: what is stored as it is" if progress else None
-    found = stores(model, reference, tolerance, partial(_nearest, query, matching, text))
     one = "place" if len(model.map.positions) else "frame"
+    summary, coarsest, (frames, dimension) = model.summary(), max(1, 2 * tolerance), reference.shape
+    needed = ("backbone", "whitening") if spectral else ("backbone",)  # by whatever is stored
+    fixed = sum(summary.fixed.get(part, 0) for part in needed)
+    metric: Metric = getattr(model.map, "metric", "l1")
+    if spectral and metric != "l2":
+        metric = "cosine"
+
+    def nearest(name: str, stored: Tensor, k: int, bytes: int, apart: int = 1) -> Baseline:
+        match = nearest_frames(stored, query, apart, metric, text, matching)
+        return Baseline(name, match, bytes + fixed, k, fixed)
+
+    if spectral:
+        short = as_int8(reference)
+        between, spaced, keys = interpolated(short, summary.route_bytes)
+        every_float = f"its descriptors of all {frames} {one}s, float"
+        every_kth = f"its descriptors of {every(coarsest, one)}, int8"
+        sizes = [stride_bytes(frames, dimension, size, k) for size, k in ((4, 1), (1, coarsest))]
+        lines = f"interpolated between {every(spaced, one)}, int8"
+        found = {
+            "uncompressed": nearest(every_float, reference, 1, sizes[0]),
+            "stride": nearest(
+                every_kth, short, coarsest, stride_bytes(frames, dimension, 1, coarsest), coarsest
+            ),
+            "interpolated": nearest(lines, between, spaced, keys * dimension),
+        }
+    else:
+        size = partial(stride_bytes, frames, dimension, reference.element_size())
+        fair = fair_stride(frames, dimension, reference.element_size(), summary.map_bytes - fixed, tolerance)
+        of = "" if isinstance(model.features, HOG) else "same features, "
+        skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
+        names = {
+            "uncompressed": (f"{of}all {frames} {one}s{skipped}", 1),
+            "stride": (f"{of}{every(fair, one)} (at least the map's bytes)", fair),
+            "stride_coarsest": (f"{of}{every(coarsest, one)} (2 x tolerance)", coarsest),
+        }
+        found = {key: nearest(name, reference, k, size(k), k) for key, (name, k) in names.items()}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
         control, order = null_model(model, reference, seed, same_plan)
@@ -136,7 +171,7 @@ def baselines_of(
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
         log.warning("no null control learned anew: what found the map's periods is not of this package")
-    if isinstance(model.map, SpectralMap):
+    if spectral:
         found["null"] = null(f"shuffled {one}s, as many bytes")
     elif model.trained is None and not foreign:
         found["null"] = null(f"everything learned from shuffled {one}s")
@@ -150,70 +185,6 @@ def baselines_of(
         itself = Match(index, score, score.isfinite())
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     return found
-
-
-def _nearest(
-    query: Tensor,
-    matching: Matching,
-    progress: str | None,
-    name: str,
-    frames: Tensor,
-    k: int,
-    bytes: int,
-    *,
-    apart: int = 1,
-    fixed: int = 0,
-    metric: Metric = "l1",
-) -> Baseline:
-    """What is found among every `apart`-th of frames (N,D) that are stored in so many bytes."""
-    found = nearest_frames(frames, query, apart, metric, progress, matching)
-    return Baseline(name, found, bytes + fixed, k, fixed)
-
-
-def _plain_stores(
-    model: DejaVu, reference: Tensor, tolerance: int, nearest: Callable[..., Baseline]
-) -> dict[str, Baseline]:
-    """The features that a template map is made of, of all frames and of every k-th."""
-    frames, dimension, itemsize = *reference.shape, reference.element_size()
-    summary = model.summary()
-    backbone = summary.fixed.get("backbone", 0)  # frames need it as well
-    fair = fair_stride(frames, dimension, itemsize, summary.map_bytes - backbone, tolerance)
-    coarsest = max(1, 2 * tolerance)
-    of = "" if isinstance(model.features, HOG) else "same features, "
-    one = "place" if len(model.map.positions) else "frame"
-    skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
-    names = {
-        "uncompressed": (f"{of}all {frames} {one}s{skipped}", 1),
-        "stride": (f"{of}{every(fair, one)} (at least the map's bytes)", fair),
-        "stride_coarsest": (f"{of}{every(coarsest, one)} (2 x tolerance)", coarsest),
-    }
-    metric = model.map.metric if isinstance(model.map, TemplateMap) else "l1"
-    found = {}
-    for key, (name, k) in names.items():
-        size = stride_bytes(frames, dimension, itemsize, k)
-        found[key] = nearest(name, reference, k, size, apart=k, fixed=backbone, metric=metric)
-    return found
-
-
-def _compact_stores(
-    model: DejaVu, reference: Tensor, tolerance: int, nearest: Callable[..., Baseline]
-) -> dict[str, Baseline]:
-    """The descriptors that a spectral map codes: all in float, every k-th and interpolated ones in int8."""
-    frames, dimension = reference.shape
-    summary = model.summary()
-    fixed = sum(summary.fixed.get(part, 0) for part in ("backbone", "whitening"))  # all need them
-    one = "place" if len(model.map.positions) else "frame"
-    k, short = max(1, 2 * tolerance), as_int8(reference)
-    between, spaced, keys = interpolated(short, summary.route_bytes)
-    nearest = partial(nearest, fixed=fixed, metric="l2" if model.map.metric == "l2" else "cosine")
-    every_float = f"its descriptors of all {frames} {one}s, float"
-    every_kth = f"its descriptors of {every(k, one)}, int8"
-    lines = f"interpolated between {every(spaced, one)}, int8"
-    return {
-        "uncompressed": nearest(every_float, reference, 1, stride_bytes(frames, dimension, 4, 1)),
-        "stride": nearest(every_kth, short, k, stride_bytes(frames, dimension, 1, k), apart=k),
-        "interpolated": nearest(lines, between, spaced, keys * dimension),
-    }
 
 
 def as_int8(descriptors: Tensor) -> Tensor:
@@ -310,11 +281,11 @@ def _described_baselines(
         log.info("no %s to compare with: %s", what, error)
         return {}
     (frames, dimension), itemsize = stored.shape, stored.element_size()
-    found = {}
-    for key, (name, k) in names.items():
-        size = stride_bytes(frames, dimension, itemsize, k)
-        found[key] = _nearest(queries, matching, text, name, stored, k, size, apart=k)
-    return found
+    size = partial(stride_bytes, frames, dimension, itemsize)
+    return {
+        key: Baseline(name, nearest_frames(stored, queries, k, "l1", text, matching), size(k), k)
+        for key, (name, k) in names.items()
+    }
 
 
 def every(k: int, one: str) -> str:

@@ -37,7 +37,6 @@ from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.distance import l1_backend
-from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
@@ -165,7 +164,8 @@ def compare(
     off_map = _match_distractors(model, distractors, sequence)
     run = _judge(model, pair, places, queries, candidates, matching, options)
     contenders = _baselines(run, others or {}, options)
-    curve = _storage(run, contenders, options) if storage_curve else None
+    scored = contenders["map"].scores is not None and isinstance(model.map, SpectralMap)
+    curve = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and scored else None
     return _report(run, contenders, candidates, off_map, curve, seconds, options)
 
 
@@ -237,22 +237,18 @@ def _learn(
         if reference.length is not None:
             _check_places(model, reference.length, reference.name)
         places = model.extract_all(reference, text)
-        _check_map(model, places, reference.name, options.tolerance)
+        _check_places(model, len(places), reference.name)
+        sample = torch.arange(0, len(places), max(1, len(places) // SAMPLED))
+        away = (model.localize_descriptors(places[sample]).index - sample).abs()
+        found = int((away <= max(options.tolerance, NEAR)).sum())
+        if found < 0.5 * len(sample) and model.map.summary().covered:
+            log.warning(
+                "the map finds %d of %d frames of %s; expected the reference that it was made of",
+                *(found, len(sample), reference.name),
+            )
     if isinstance(calibration, Views) or (calibration is None and not has_map):
         calibrate_if_possible(model, reference, calibration)
     return places
-
-
-def _check_map(model: DejaVu, features: Tensor, name: str, tolerance: int) -> None:
-    """Refuse a map of another number of places, and warn of one that does not find its own reference."""
-    _check_places(model, len(features), name)
-    sample = torch.arange(0, len(features), max(1, len(features) // SAMPLED))
-    found = (model.localize_descriptors(features[sample]).index - sample).abs() <= max(tolerance, NEAR)
-    if found.float().mean() < 0.5 and model.map.summary().covered:
-        log.warning(
-            "the map finds %d of %d frames of %s; expected the reference that it was made of",
-            *(int(found.sum()), len(sample), name),
-        )
 
 
 def _check_places(model: DejaVu, places: int, name: str) -> None:
@@ -360,15 +356,6 @@ def _is_plain_hog(model: DejaVu) -> bool:
     return same and model.whitening is None and getattr(model.map, "metric", "l1") == "l1"
 
 
-def _storage(
-    run: Localization, contenders: Mapping[str, Contender], options: _Options
-) -> dict[str, list[Stored]] | None:
-    """The storage curve of a spectral map whose queries are scored."""
-    if not isinstance(run.model.map, SpectralMap) or contenders["map"].scores is None:
-        return None
-    return coded_at_sizes(run, seed=options.seed, progress=options.progress)
-
-
 def _report(
     run: Localization,
     contenders: dict[str, Contender],
@@ -407,11 +394,6 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     began = time.perf_counter()
     yield
     seconds[name] += time.perf_counter() - began
-
-
-def of_shown_frames(match: Match, route: PlaceMap) -> Match:
-    """Each match at the place of the frame it reports, as a ground truth in frames counts (convention 11)."""
-    return match._replace(index=route.table.scored(match.index))
 
 
 def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:

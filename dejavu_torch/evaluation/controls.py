@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -78,8 +76,12 @@ def null_model(
     if same_plan:
         null.map = _same_layers(template_map_of(model, "the null of the same layers"), mixed)
     else:
-        with without_warnings():
+        log, level = logging.getLogger("dejavu_torch"), logging.getLogger("dejavu_torch").level
+        log.setLevel(logging.ERROR)  # of a null the user asked nothing
+        try:
             null.learn_features(mixed)
+        finally:
+            log.setLevel(level)
     return null, order
 
 
@@ -87,18 +89,6 @@ def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Descriptors in random order: which each is, (N,), and the descriptors (N,D)."""
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
     return order, concatenate(reference[part] for part in order.to(reference.device).split(256))
-
-
-@contextmanager
-def without_warnings() -> Iterator[None]:
-    """Silence what learning warns of: of a null the user asked nothing, and the map's own was told of."""
-    log = logging.getLogger("dejavu_torch")
-    level = log.level
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        log.setLevel(level)
 
 
 def _same_layers(route: TemplateMap, features: Tensor) -> TemplateMap:

@@ -27,8 +27,9 @@ from dejavu_torch.evaluation.curves import (
     recall_at,
     threshold_of_full_precision,
 )
+from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
-from dejavu_torch.evaluation.pictures import draw_coverage, draw_curves
+from dejavu_torch.evaluation.pictures import draw_curves
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report

@@ -29,10 +29,9 @@ from dejavu_torch.evaluation.plots import (
     period_axis,
     pixels,
     show_cells,
-    show_frame,
 )
 from dejavu_torch.periods.spectrogram import Spectrum
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer, Plan
 
 SHOWN = 12  # layers of a chunk
 BLUE = COLOURS["map"]
@@ -181,17 +180,9 @@ def edges_seen(
 
     Convention: an edge lies across its gradient, through the middle of its cell. Bin o holds gradients of
         about (o + 1/2) * 180 / orientations degrees.
-
-    Raises:
-        InputError: an index that HOG of such frames does not have.
     """
     rows, columns = (max(0, pixels // cell - block + 1) for pixels in size)
     shape = (rows, columns, block, block, orientations)
-    if len(features) and not 0 <= int(features.min()) <= int(features.max()) < math.prod(shape):
-        raise InputError(
-            f"got features {int(features.min())}..{int(features.max())}; HOG of frames of {size[0]} x "
-            f"{size[1]} pixels has {math.prod(shape)}"
-        )
     row, column, down, right, orientation = torch.unravel_index(features, shape)
     cells = torch.stack([row + down, column + right, orientation], 1)
     distinct, count = cells.unique(dim=0, return_counts=True)
@@ -393,17 +384,6 @@ def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, u
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, ncols=3, frameon=False, loc="outside lower right", markerscale=3)
     return figure, axes[:, 0]
-
-
-def plot_ground(frame: Tensor, corners: Sequence[Sequence[float]], patch: Tensor) -> Plot:
-    """Where on a frame ground is taken to be, and how it looks from above."""
-    height, width = frame.shape[-2:]
-    figure, (left, right) = canvas(0.65 * WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
-    show_frame(left, frame, "the ground in a frame")
-    show_frame(right, patch, "from above")
-    x, y = zip(*corners, corners[0], strict=True)
-    left.plot(torch.tensor(x) * (width - 1), torch.tensor(y) * (height - 1), color=LAYERS[0], linewidth=1.5)
-    return figure, (left, right)
 
 
 def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.plots import (
@@ -26,6 +26,7 @@ from dejavu_torch.evaluation.plots import (
     RIGHT,
     WIDTH,
     WRONG,
+    Picture,
     Plot,
     canvas,
     empty,
@@ -362,16 +363,17 @@ def plot_posterior(
     return figure, axes
 
 
-def plot_coverage(
+def draw_coverage(
     match: Match,
-    truth: Tensor | GroundTruth | None,
+    truth: GroundTruth | None,
     tolerance: int,
     borders: Tensor,
     queries: Tensor,
     unit: str,
-) -> Plot:
+) -> dict[str, Picture]:
     """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9)."""
     figure, axis = canvas(3.8)
+    caption = "Where along the route each query was found."
     reported, frames = match.index >= 0, int(borders[-1])
 
     def dots(which: Tensor, colour: str, label: str, size: float = 3) -> None:
@@ -391,16 +393,17 @@ def plot_coverage(
         shown = axis.scatter(*dotted, s=9, c=match.probability[order].numpy(), **style)
         bar = figure.colorbar(shown, ax=axis, pad=0.01, aspect=30)
         bar.set_label("probability of being right")
+        caption += " The darker a dot, the more probable its place."
     elif truth is None:
         dots(reported, COLOURS["map"], f"{reported.sum()} reported")
     else:
-        truth = as_ground_truth(truth)
         scored = counted(match.index, truth, tolerance)
         right = scored & is_right(match.index, truth.positives, tolerance)
         wrong = scored & reported & ~right
         dots(reported & ~scored, GREY, f"{(~scored).sum()} not scored")
         dots(wrong, WRONG, f"{wrong.sum()} wrong")
         dots(right, RIGHT, f"{right.sum()} right", 4)
+        caption += " A query in its right place is green, in a wrong one red."
         axis.set_title(f"right within {tolerance} {unit}", fontsize=10)
         missing &= scored
     if missing.any():
@@ -411,4 +414,4 @@ def plot_coverage(
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
     if axis.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
-    return figure, axis
+    return {"coverage": Picture((figure, axis), "places reported", caption)}

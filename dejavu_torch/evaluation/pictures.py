@@ -22,7 +22,6 @@ from dejavu_torch.evaluation.map_plots import (
     plot_autocorrelogram,
     plot_chunks,
     plot_features,
-    plot_ground,
     plot_layers,
     plot_spectrogram,
     plot_spectrum,
@@ -32,15 +31,15 @@ from dejavu_torch.evaluation.map_plots import (
 from dejavu_torch.evaluation.match_plots import (
     Row,
     diagonal,
+    draw_coverage,
     example_matches,
-    plot_coverage,
     plot_posterior,
     plot_rows,
     plot_score_matrix,
     posterior_image,
     score_matrix,
 )
-from dejavu_torch.evaluation.plots import DARK, LETTERS, Picture, label
+from dejavu_torch.evaluation.plots import DARK, LAYERS, LETTERS, WIDTH, Picture, canvas, label, show_frame
 from dejavu_torch.evaluation.score_plots import Stored, draw_sequences, draw_storage, plot_auc, plot_curves
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -129,20 +128,14 @@ def draw_pictures(
     if isinstance(run.model.map, SpectralMap):
         pictures |= draw_spectrum(run, run.model.map) | draw_components(run, run.model.map)
     if isinstance(run.model.map, TemplateMap):
-        pictures |= draw_chunks(run, run.model.map)
+        pictures["chunks"] = Picture(
+            plot_chunks(run.model.map.plan, run.borders, run.unit),
+            "the map's periods along the route",
+            "Dotted lines cut the route into chunks. Each bar is a layer: the features that repeat with one "
+            "period in one chunk; the wider, the more features.",
+        )
         pictures |= draw_features(run, run.model.map) | draw_activations(run, run.model.map)
     return pictures
-
-
-def draw_chunks(run: Localization, route: TemplateMap) -> dict[str, Picture]:
-    """The layers of a map along the route."""
-    picture = Picture(
-        plot_chunks(route.plan, run.borders, run.unit),
-        "the map's periods along the route",
-        "Dotted lines cut the route into chunks. Each bar is a layer: the features that repeat with one "
-        "period in one chunk; the wider, the more features.",
-    )
-    return {"chunks": picture}
 
 
 def draw_pairs(run: Localization) -> dict[str, Picture]:
@@ -182,22 +175,6 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
 def _name(traverse: Traverse, frame: Tensor) -> str:
     """A query or a place by what matches.csv calls it: the frame of its source, and the frame's name."""
     return label(f"frame {frame} {source_of(traverse).frame_name(int(frame))}".strip())
-
-
-def draw_coverage(
-    match: Match, truth: GroundTruth | None, tolerance: int, borders: Tensor, queries: Tensor, unit: str
-) -> dict[str, Picture]:
-    """The places reported; see `plot_coverage`."""
-    colours = "A query in its right place is green, in a wrong one red."
-    if truth is None:
-        known = match.probability is not None
-        colours = "The darker a dot, the more probable its place." if known else ""
-    picture = Picture(
-        plot_coverage(match, truth, tolerance, borders, queries, unit),
-        "places reported",
-        f"Where along the route each query was found. {colours}".strip(),
-    )
-    return {"coverage": picture}
 
 
 def draw_scores(run: Localization) -> dict[str, Picture]:
@@ -245,17 +222,15 @@ def draw_posterior(run: Localization) -> dict[str, Picture]:
         return {}
     image = posterior_image(scores_of(run), run.query_features, run.sequence)
     known = "" if run.truth is None else " Circles are around some of the right places; grey: none is right."
-    share = ""
-    if max(image.blocks) > 1:
-        queries, places = image.blocks
-        share = f" A pixel shows the most probable of {queries} queries and {places} places."
+    queries, places = image.blocks
+    share = f" A pixel shows the most probable of {queries} queries and {places} places."
     return {
         "posterior": Picture(
             plot_posterior(image, run.truth, run.borders, run.query_frames),
             "where the filter takes the camera to be",
             "The probability of each place, from a query and all before it. Below, that of being off the map."
             + known
-            + share,
+            + share * (max(image.blocks) > 1),
         )
     }
 
@@ -303,11 +278,7 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
         [float(period_of(j, stop - start, route.transform)) for j in range(1, stop - start)]
     )
     features = {int(number): Lines(*lines) for number, *lines in zip(chosen, amplitudes, kept, strict=True)}
-    where = (
-        ""
-        if len(route.chunks) == 1
-        else f" of the chunk of frames {run.borders[start]} to {run.borders[stop]}"
-    )
+    where = f" of the chunk of frames {run.borders[start]} to {run.borders[stop]}" * (len(route.chunks) > 1)
     return {
         "spectrum": Picture(
             plot_spectrum(features, periods, float(route.steps[chunk]), run.unit),
@@ -358,8 +329,7 @@ def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
 
 def longest_chunk(route: SpectralMap) -> int:
     """Its number; the first of equals."""
-    lengths = [stop - start for start, stop in route.chunks]
-    return lengths.index(max(lengths))
+    return max(range(len(route.chunks)), key=lambda j: route.chunks[j][1] - route.chunks[j][0])
 
 
 def draw_motion(run: Localization) -> dict[str, Picture]:
@@ -374,11 +344,15 @@ def draw_motion(run: Localization) -> dict[str, Picture]:
         for role, one in pair
         if isinstance(one, ResampledTraverse)
     }
+    corners, (height, width) = odometry.corners, frame.shape[-2:]
+    figure, (left, right) = canvas(0.65 * WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
+    show_frame(left, frame, "the ground in a frame")
+    show_frame(right, ground_patch(frame[None], corners, odometry.size)[0], "from above")
+    x, y = (torch.tensor([*edge, edge[0]]) for edge in zip(*corners, strict=True))
+    left.plot(x * (width - 1), y * (height - 1), color=LAYERS[0], linewidth=1.5)
     return {
         "ground": Picture(
-            plot_ground(
-                frame, odometry.corners, ground_patch(frame[None], odometry.corners, odometry.size)[0]
-            ),
+            (figure, (left, right)),
             "the ground that is measured",
             "The corners are right if what lies straight ahead runs straight down the view from above, and "
             "what repeats along the route repeats at even distances there.",

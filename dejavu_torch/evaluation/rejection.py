@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,17 +16,6 @@ from dejavu_torch.types import Match
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions that a report tells of
 BINS = 10
-
-
-class Accepted(NamedTuple):
-    """What is accepted with at least the probability `asked`, in shares.
-
-    precision: right ones among the accepted, None where none is. kept: accepted ones among the right.
-    """
-
-    asked: float
-    precision: float | None
-    kept: float
 
 
 def rejection_facts(
@@ -51,7 +40,14 @@ def rejection_facts(
             "auc": scores.auc,
             "recall_at_100_precision": scores.recall_at_100_precision,
             "expected_calibration_error": calibration_error(probability, right, BINS),
-            "precision": [accepted_at(asked, probability, right)._asdict() for asked in ASKED],
+            "precision": [
+                {
+                    "asked": asked,
+                    "precision": float(right[accepted].double().mean()) if accepted.any() else None,
+                    "kept": int((accepted & right).sum()) / max(1, int(right.sum())),
+                }
+                for asked, accepted in ((asked, probability >= asked) for asked in ASKED)
+            ],
         }
     return {"rejection": facts}
 
@@ -61,20 +57,6 @@ def judged(match: Match, truth: GroundTruth, tolerance: int) -> tuple[Tensor, Te
     assert match.probability is not None
     kept = counted(match.index, truth, tolerance)
     return match.probability[kept], is_right(match.index[kept], truth.positives[kept], tolerance)
-
-
-def accepted_at(asked: float, probability: Tensor, right: Tensor) -> Accepted:
-    """What is accepted of answers (n,) with these probabilities.
-
-    Example:
-        >>> accepted_at(0.5, torch.tensor([0.9, 0.6, 0.2]), torch.tensor([True, False, True]))
-        Accepted(asked=0.5, precision=0.5, kept=0.5)
-    """
-    accepted = probability >= asked
-    hits = int((accepted & right).sum())
-    return Accepted(
-        asked, hits / int(accepted.sum()) if accepted.any() else None, hits / max(1, int(right.sum()))
-    )
 
 
 def rejection_table(facts: Mapping[str, Any]) -> list[list[str]]:

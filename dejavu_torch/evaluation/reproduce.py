@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.data.source import open_source
-from dejavu_torch.evaluation.compare import Comparison, compare, of_shown_frames
+from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
@@ -288,4 +288,5 @@ def _learned(result: Comparison, mapper: TemplateMapper) -> DejaVu:
 
 
 def _localized(model: DejaVu, result: Comparison) -> Match:
-    return of_shown_frames(model.localize(result.run.query_features), model.map)
+    """At the place of the frame that each match shows, as a ground truth in frames counts."""
+    return model.localize(result.run.query_features).renumbered(model.map.table.scored)

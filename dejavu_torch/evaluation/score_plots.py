@@ -39,13 +39,6 @@ class Stored(NamedTuple):
         return {name: value for name, value in found.items() if value != {}}
 
 
-class Areas(NamedTuple):
-    """The area under the curve of sequences of T queries, by T."""
-
-    name: str
-    auc: Mapping[int, float]
-
-
 class Length(NamedTuple):
     """What a map with chunks of `window` places recognises, and what it stores.
 
@@ -186,50 +179,37 @@ def draw_sequences(
     contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
 ) -> dict[str, Picture]:
     """Areas over the number of queries matched together; nothing where single ones are."""
-    lines = {
-        key: Areas(one.name, {T: scores.auc for T, scores in one.sequences.items()})
-        for key, one in distinct(contenders).items()
-        if one.sequences
-    }
+    lines = {key: (one.name, one.sequences) for key, one in distinct(contenders).items() if one.sequences}
     if not lines:
         return {}
-    shown: dict[float, Areas] = {}
+    shown: dict[float, tuple[str, Mapping[int, Scores]]] = {}
     if "map" in lines and coded:
-        route_bytes = contenders["map"].route_bytes or 0
-        own = route_bytes / places
-        lines["map"] = lines["map"]._replace(name=f"this map, {own:.3g} route bytes per place")
+        own = (contenders["map"].route_bytes or 0) / places
+        lines["map"] = f"this map, {own:.3g} route bytes per place", lines["map"][1]
         for budget in SHOWN:
             nearest = min(coded, key=lambda size: abs(size.route_bytes_per_place - budget))
             size = nearest.route_bytes_per_place
             if all(max(size, other) > ALIKE * min(size, other) for other in (own, *shown)):
-                areas = {T: scores.auc for T, scores in nearest.sequences.items()}
-                shown[size] = Areas(f"the same in {size:.3g} bytes", areas)
-    marked = [(one, _OURS, "-", mark, 1.0) for one, mark in zip(shown.values(), "sD^", strict=False)]
+                shown[size] = f"the same in {size:.3g} bytes", nearest.sequences
     drawn = [
-        (one, colour_of(key), _LINES.get(key.partition("_")[0], "-"), "o", 2.4 if key == "map" else 1.4)
+        (*one, colour_of(key), _LINES.get(key.partition("_")[0], "-"), "o", 2.4 if key == "map" else 1.4)
         for key, one in lines.items()
     ]
-    drawn[1:1] = marked
-    names = [fill(one.name, LETTERS - 8) for one, *_ in drawn]
-    rows = sum(1 + name.count("\n") for name in names)
-    figure, axis = canvas(3.6 + 1.1 * LINE * rows)
-    for order, ((one, colour, style, mark, width), name) in enumerate(zip(drawn, names, strict=True)):
+    drawn[1:1] = [(*one, _OURS, "-", mark, 1.0) for one, mark in zip(shown.values(), "sD^", strict=False)]
+    names = [fill(name, LETTERS - 8) for name, *_ in drawn]
+    figure, axis = canvas(3.6 + 1.1 * LINE * sum(1 + name.count("\n") for name in names))
+    for order, ((_, found, colour, style, mark, width), name) in enumerate(zip(drawn, names, strict=True)):
         axis.plot(
-            *(list(one.auc), [min(max(area, LOWEST), HIGHEST) for area in one.auc.values()], style),
+            *(list(found), drawn_areas([scores.auc for scores in found.values()]), style),
             **{"color": colour, "marker": mark, "markersize": 4.5, "linewidth": width, "label": name},
             markerfacecolor="white" if mark != "o" else colour,
             zorder=3 - order / len(drawn),  # the first on top
         )
-    ticks = sorted({T for one, *_ in drawn for T in one.auc})
+    ticks = sorted({T for _, found, *_ in drawn for T in found})
     axis.set_xticks(ticks, [str(T) for T in ticks])
-    levels = {LOWEST: "0.01", 0.1: "0.1", 0.5: "0.5", 0.9: "0.9", 0.99: "0.99", HIGHEST: "0.999"}
-    axis.set_yscale("logit")
-    axis.set_yticks(list(levels), list(levels.values()))
-    axis.minorticks_off()
-    axis.set(ylim=(0.8 * LOWEST, 1 - 0.8 * (1 - HIGHEST)))
-    axis.set(xlabel="queries matched together, T", ylabel="area under the PR curve")
+    area_axis(axis)
+    axis.set(xlabel="queries matched together, T")
     axis.set_title(f"right within {tolerance}", fontsize=10)
-    axis.grid(alpha=0.25)
     figure.legend(loc="outside lower left", frameon=False, fontsize=9)
     return {
         "sequences": Picture(

@@ -32,13 +32,6 @@ def test_rates_in_closed_form() -> None:
     }
 
 
-def test_a_layer_that_covers_the_route_has_no_outside() -> None:
-    truth = as_ground_truth(torch.tensor([[3], [13]]))
-    rates = activation_rates([layer(10, 10)], [torch.tensor([3, 3])], torch.tensor([3, 3]), truth, 0, 40)
-    assert rates.layers[0] == Rate(1.0, None, 0.1)
-    assert rates.fused.outside is None
-
-
 def test_unknown_queries_and_those_without_an_answer_do_not_count() -> None:
     right = torch.tensor([[3], [13], [-1]])
     truth = GroundTruth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))

@@ -43,10 +43,3 @@ def test_the_strongest_period_alone_is_a_wave() -> None:
     wave = 10 - 8 * (2 * torch.pi * (place - 100) / 24).cos()
     assert torch.allclose(first.scores, wave, atol=0.05)
     assert int(every.scores.argmin()) % 120 == 100  # both waves begin anew after 120 places
-
-
-def test_counts_of_more_periods_than_there_are_give_all_once() -> None:
-    route = SpectralMapper(None, 0.01)(waves())
-    assert [len(one.periods) for one in components(route, waves()[3], counts=(1, 2, 4))] == [1, 2]
-    flat = SpectralMapper(None, 1e6)(waves())
-    assert [len(one.periods) for one in components(flat, waves()[3])] == [0]

@@ -136,11 +136,6 @@ def test_queries_with_equal_scores_report_together() -> None:
     assert points_of(curve) == [(0.75, 0.75, 1.0)]
 
 
-def test_an_unanswerable_query_costs_precision_and_no_recall() -> None:
-    curve = pr_curve(torch.tensor([1.0, 2.0]), torch.tensor([False, True]), torch.tensor([False, True]))
-    assert points_of(curve) == [(0.0, 0.0, 1.0), (0.5, 1.0, 2.0)]
-
-
 # matches and truth
 
 
@@ -170,13 +165,6 @@ def test_judge_equals_literal_loops(rows: list[tuple[float, int, list[int]]], to
     assert evaluate(match, torch.tensor([truth for _, _, truth in rows]), tolerance) == pytest.approx(
         expected
     )
-
-
-def test_a_perfect_matcher_scores_one_save_for_the_missing_starting_point() -> None:
-    scores = evaluate(match_of(list(range(10))), torch.arange(10)[:, None], 0)
-    # the curve begins at recall 1/10, and no point is added before it
-    assert scores.auc == scores.auc_reported == pytest.approx(0.9)
-    assert scores[2:] == (1.0, 1.0, 1.0, 1.0)
 
 
 def test_convention_5_tolerance_is_inclusive_in_every_score() -> None:

@@ -240,9 +240,6 @@ def test_convention_11_all_frames_of_one_place_are_right(resampled: Resampled, t
 
 
 def test_frames_that_the_reference_does_not_have_are_refused(resampled: Resampled, tmp_path: Path) -> None:
-    path = written(tmp_path, HEADER + f"0,{len(REFERENCE)},0.1,1\n")
-    with refused(f"place {len(REFERENCE)}", f"below {len(REFERENCE)}"):
-        evaluate_file(path, "0", map=resampled.map)
     truth = written(tmp_path, "query,place\n0,99999\n", "truth.csv")
     with refused("place 99999", f"0 to {len(REFERENCE) - 1}"):
         evaluate_file(resampled.matches, str(truth), map=resampled.map)

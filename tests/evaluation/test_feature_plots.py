@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from drawn import render, texts
-from helpers import refused
 from torch import Tensor
 
 from dejavu_torch import HOG
@@ -89,13 +88,6 @@ def test_templates_of_any_period_and_of_many_features(period: Fraction, phases: 
     assert shown[0] - -0.5 == pytest.approx(float(period - Fraction(1, 2)) - shown[-1])
     assert below.images[0].get_array().shape == (64, phases)
     render(figure)
-
-
-def test_a_feature_that_hog_does_not_have_is_refused() -> None:
-    size = HOG()(torch.rand(1, 1, 64, 64)).shape[1]
-    edges_seen(torch.tensor([size - 1]), (64, 64))
-    with refused("1764..1764", "64 x 64", "has 1764"):
-        edges_seen(torch.tensor([size]), (64, 64))
 
 
 @pytest.mark.parametrize("degrees", [10, 70, 130])

@@ -12,8 +12,8 @@ from dejavu_torch.evaluation.match_plots import (
     PosteriorImage,
     Row,
     diagonal,
+    draw_coverage,
     example_matches,
-    plot_coverage,
     plot_posterior,
     plot_rows,
     plot_score_matrix,
@@ -31,22 +31,10 @@ def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
     }
 
 
-def test_coverage_tells_right_from_wrong_from_not_reported() -> None:
-    figure, axis = plot_coverage(
-        matched(0, 9, -1, 4), torch.arange(4)[:, None], 1, torch.arange(11), torch.arange(4), "frames"
-    )
-    assert dots(axis) == {
-        "1 wrong": [(1, 9)],
-        "2 right": [(0, 0), (3, 4)],
-        "1 not reported": [(2, 0)],
-    }
-    render(figure)
-
-
 def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
     match = matched(4, 9, -1, 2)._replace(probability=sure)
-    figure, axis = plot_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")
+    figure, axis = draw_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")["coverage"].plot
     (points,) = axis.collections
     shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))
     assert shown == {0.2: (1, 9), 0.6: (3, 2), 0.9: (0, 4)}
@@ -59,9 +47,9 @@ def test_without_a_truth_coverage_shows_the_probabilities() -> None:
 def test_coverage_leaves_grey_what_is_not_scored() -> None:
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
     truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
-    figure, axis = plot_coverage(
+    figure, axis = draw_coverage(
         matched(0, 1, 7, -1, 9), truth, 0, torch.arange(11), torch.tensor([10, 20, 30, 40, 50]), "frames"
-    )
+    )["coverage"].plot
     assert dots(axis) == {
         "3 not scored": [(20, 1), (30, 7)],
         "1 wrong": [(50, 9)],
@@ -139,28 +127,12 @@ def test_few_queries_are_scored_at_a_time(monkeypatch: pytest.MonkeyPatch) -> No
     assert max(asked) == 10
 
 
-def test_the_score_matrix_is_drawn_with_reported_and_right_places() -> None:
-    match, truth = matched(0, 7, -1, 3), as_ground_truth(torch.tensor([[0, 5], [1, -1], [2, -1], [3, -1]]))
-    matrix = score_matrix(lambda rows: torch.rand(len(rows), 10), torch.rand(4, 2))
-    assert matrix is not None
-    figure, axis = plot_score_matrix(matrix, match, truth, torch.arange(11), torch.arange(4))
-    reported, first, second, _ = axis.lines
-    assert list(zip(*reported.get_data(), strict=True)) == [(0, 0), (1, 7), (3, 3)]
-    assert first.get_ydata().tolist() == [0, 1, 2, 3]
-    assert second.get_ydata()[0] == 5
-    assert axis.images[0].get_array().shape == (10, 4)
-    assert {"reported place", "right place"} <= set(texts(figure))
-    assert "right place" not in texts(
-        plot_score_matrix(matrix, match, None, torch.arange(11), torch.arange(4))[0]
-    )
-
-
 def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
     """Of ten places, the camera stands at the fourth from frame 6 to 29; the query moves twice as fast."""
     borders = torch.tensor([0, 2, 4, 6, 30, 31, 32, 33, 34, 35, 40])
     queries, match = torch.tensor([0, 4, 8, 12]), matched(0, 3, -1, 9)
     truth = as_ground_truth(torch.tensor([[0, -1], [4, -1], [2, -1], [9, 5]]))
-    figure, axis = plot_coverage(match, truth, 1, borders, queries, "places")
+    figure, axis = draw_coverage(match, truth, 1, borders, queries, "places")["coverage"].plot
     assert dots(axis) == {"3 right": [(0, 0), (4, 6), (12, 35)], "1 not reported": [(8, 0)]}
     assert (axis.get_xlim(), axis.get_ylim()[1]) == ((0, 12), 40)
     labels = {"query (frame)", "reported place (frame)", "right within 1 places"}
@@ -177,7 +149,8 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
         assert first.get_xdata().tolist() == [0, 4, 8, 12]
         assert first.get_ydata().tolist() == [0, 30, 4, 35]
         assert second.get_ydata()[3] == 31
-        assert {"query (frame)", "place (frame)"} <= set(texts(figure))
+        assert {"query (frame)", "place (frame)", "reported place", "right place"} <= set(texts(figure))
+        assert "right place" not in texts(plot_score_matrix(matrix, match, None, borders, queries)[0])
 
 
 def test_the_cells_that_a_sequence_adds_up_are_drawn_on_the_scores_around_them() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -96,13 +95,6 @@ def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path: Path) -> None:
     assert sequence_table(report(null=aside)) == []
     assert "sequences" not in aside.as_json()
     assert "T = " not in written(tmp_path, report(null=aside))
-
-
-def test_what_stores_the_same_frames_twice_is_listed_once() -> None:
-    row, other = Contender("every 2nd", SCORES, 100, 2), Contender("every 3rd", SCORES, 70, 3)
-    one = report(stride=row, stride_coarsest=row._replace(name="again"), hog=other)
-    assert [cells[0] for cells in score_table(one)[1:]] == ["this map", "every 2nd", "every 3rd"]
-    assert {"stride", "stride_coarsest", "hog"} <= one.as_json().keys()
 
 
 def test_scores_are_those_of_the_columns() -> None:
@@ -207,16 +199,6 @@ def test_the_key_of_a_spectral_map(tmp_path: Path) -> None:
     for kind, words in (("spectral", ["lines", "strongest periods"]), ("templates", ["layer"])):
         below = written(tmp_path, report({"kind": kind})).partition("the map</h2>")[2]
         assert re.findall(r"<dt>([^<]+)</dt>", below) == words
-
-
-def test_report_json_has_the_facts_the_scores_and_an_entry_for_each_contender(tmp_path: Path) -> None:
-    one = report({"frames": 32}, stride=Contender("every 2nd", SCORES, 100, 2), null=Contender("null", None))
-    written(tmp_path, one)
-    found = json.loads((tmp_path / "report.json").read_text())
-    assert found == one.as_json()
-    assert found.keys() == FACTS.keys() | {"frames", *Scores._fields, "stride", "null"}
-    assert found["stride"] == SCORES._asdict() | {"bytes": 100, "route_bytes": 100, "k": 2}
-    assert found["null"] == dict.fromkeys(Scores._fields)
 
 
 def test_names_are_escaped(tmp_path: Path) -> None:
