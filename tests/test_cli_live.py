@@ -284,12 +284,6 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "port": (("sim:aerial?frames=20", "--page", "99999"), ("99999", "65535")),
     "timeout": (("/dev/video99", "--timeout", "0"), ("--timeout 0", "above 0")),
-    "both": (("sim:aerial?frames=20", "--filter", "--sequence", "5"), ("--sequence 5", "--filter")),
-    "searches": (
-        ("sim:aerial?frames=20", "--search_every", "9", "--sequence", "5"),
-        ("--search_every 9", "--filter"),
-    ),
-    "moves": (("sim:aerial?frames=20", "--moves", "[1]", "--sequence", "5"), ("--filter",)),
 }
 
 
