@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import inspect
 import os
 import re
 import shlex
@@ -305,14 +304,6 @@ def test_help_loads_nothing_that_only_a_run_needs(helped: tuple[str, str]) -> No
     assert (helped[0].splitlines()[-1], own) == ("[]", "")
 
 
-def test_every_setting_of_a_model_is_an_option_and_a_key(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        run("learn", "--help")
-    out = capsys.readouterr().out
-    for name in inspect.signature(DejaVu).parameters:
-        assert f"--{name} " in out
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="libgomp is the OpenMP of Linux builds")
 def test_threads_do_not_spin_while_they_wait(helped: tuple[str, str]) -> None:
     assert "OMP_WAIT_POLICY = 'PASSIVE'" in helped[1]
@@ -458,11 +449,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     ),
     "learn a.npy --map m.safetensors --whitening.bits 5": ("shrinkage=null", "bits=5"),
     "learn a.npy --map m.safetensors --mapper HOG": ("--mapper is HOG", "Mapper"),
-    "learn a.npy --map m.safetensors --mapper.chunk some": (
-        "--mapper.chunk is some",
-        "number of places",
-        "10000",
-    ),
+    "learn a.npy --map m.safetensors --mapper.chunk some": ("--mapper.chunk is some", "an integer"),
     "learn a.npy --map m.safetensors --config local_maxima --mapper.periods Foo": (
         "--mapper.periods is Foo",
     ),
@@ -656,7 +643,6 @@ def test_a_map_that_is_given_is_not_learned_and_stays_in_the_report(
 def test_output_that_cannot_be_written(
     small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "does not exist" in fails(capsys, "learn", SMALL, "--map", tmp_path / "no" / "a.safetensors")
     assert "is a folder" in fails(capsys, "localize", small_map, QUERY, "--out", tmp_path)
     (tmp_path / "file").write_text("in the way")
     assert "file" in fails(capsys, "compare", SMALL, QUERY, "--out", tmp_path / "file")

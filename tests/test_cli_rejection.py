@@ -147,9 +147,7 @@ def test_options_that_exclude_each_other_are_told_before_anything_is_read(
         (("--calibration_truth", "0"), ("--calibration SOURCE",)),
         (("--calibration", "nowhere"), ("nowhere is not there",)),
         (("--distractors", AGAIN), ("one of the traverses", "another route")),
-        (("--distractors", SEA, "--sequence", "5"), ("--distractors", "a filter")),
         (("--precision", ".9", "--calibration", "none"), ("--precision 0.9", "calibrated map")),
-        (("--distractors", "nowhere"), ("nowhere is not there",)),
     ],
 )
 def test_traverses_that_do_not_serve(

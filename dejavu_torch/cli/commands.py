@@ -131,10 +131,10 @@ def run_learn(
     model = (model if append is None else _map_to_append_to(append, model, len(sources) > 0)).to(where)
     if cluster is not None:
         _check_cluster(cluster, learning.device)
-        _check_chunks(cluster, model)
-    _check_map_name(map)
-    check_output_file(map)
-    check_not_read(map, *sources, learning.second, *learning.files, average, growing.average_truth)
+        if not isinstance(model.mapper, SpectralMapper):
+            seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none"
+            raise InputError(f"{seen}; expected a spectral map")
+    _check_map_file(map, *sources, learning.second, *learning.files, average, growing.average_truth)
     precision = f"--precision {given}" if given is not None else f"the map's precision, {model.precision},"
     if learning.calibration == NO_CALIBRATION and model.precision is not None:
         seen = f"{precision} with --calibration none"
@@ -528,9 +528,7 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
         map: map file to write (.safetensors)
         features: class of the maps' features, if not ours
     """
-    _check_map_name(map)
-    check_output_file(map)
-    check_not_read(map, *maps)
+    _check_map_file(map, *maps)
     for i, path in enumerate(maps):
         twice = next((one for one in maps[:i] if one.exists() and path.exists() and one.samefile(path)), None)
         if twice is not None:
@@ -599,13 +597,6 @@ def _check_cluster(cluster: str, device: str) -> None:
     check_installed()
 
 
-def _check_chunks(cluster: str, model: DejaVu) -> None:
-    """Refuse to divide among workers what is made as one."""
-    if not isinstance(model.mapper, SpectralMapper):
-        seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none"
-        raise InputError(f"{seen}; expected a spectral map")
-
-
 @contextmanager
 def _coding(cluster: str | None) -> Iterator[Code]:
     """What makes the chunks of a long route: this process, or a cluster, which ends with the block."""
@@ -632,10 +623,13 @@ def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
         yield
 
 
-def _check_map_name(path: Path) -> None:
+def _check_map_file(path: Path, *read: str | Path | None) -> None:
+    """Refuse early a map that cannot be written, or that is what is read."""
     if path.suffix != ".safetensors":
         expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
         raise InputError(f"--map {path} is no name of a map; expected {expected}")
+    check_output_file(path)
+    check_not_read(path, *read)
 
 
 def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
@@ -754,12 +748,7 @@ def _say(text: str) -> None:
 
 
 def _publish(
-    result: Comparison,
-    out: Path,
-    title: str,
-    command: str,
-    given: Path | None = None,
-    top: int | None = None,
+    result: Comparison, out: Path, title: str, command: str, given: Path | None = None, top: int | None = None
 ) -> None:
     """Write map, matches and report of a comparison, and print its scores.
 
