@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import inspect
 import os
 import re
 import shlex
@@ -26,8 +25,6 @@ from dejavu_torch.types import Training
 SMALL = "sim:aerial?frames=96"
 QUERY = "sim:aerial?frames=96&traverse=1"
 LONG = "sim:aerial?frames=256"  # longer than the window of periods that some tests give
-MAPPER = "{class_path: dejavu_torch.TemplateMapper, init_args: {"
-WINDOW = "{class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: "
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +90,6 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
     assert accepted() == 0
 
 
-def test_info_says_what_learn_said(small_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run("info", small_map)
-    out = capsys.readouterr().out
-    assert "places covered" in out
-    assert "HOG" in out
-
-
 def test_folder_of_images_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = write_images(tmp_path / "first", frames(128, seed=1))
     second = write_images(tmp_path / "second", frames(128, seed=2))
@@ -132,15 +122,6 @@ def test_config_and_options(tmp_path: Path) -> None:
     assert {(layer.start, layer.stop) for layer in model.map.plan} == {(0, 128), (128, 256)}
 
 
-def test_parts_of_the_defaults_as_options(tmp_path: Path) -> None:
-    route = tmp_path / "a.safetensors"
-    options = "--mapper.route_bytes_per_place", "2.5", "--features.cell", "16", "--whitening.views", "1"
-    run("learn", SMALL, "--map", route, *options)
-    model = DejaVu.load(route)
-    assert (model.mapper.route_bytes_per_place, model.features.cell, model.whitening.views) == (2.5, 16, 1)
-    assert model.mapper.metric == "cosine"
-
-
 def test_parts_of_a_mapper_of_templates_as_options(tmp_path: Path) -> None:
     route = tmp_path / "a.safetensors"
     np.save(tmp_path / "frames.npy", frames(64, size=16))
@@ -149,12 +130,6 @@ def test_parts_of_a_mapper_of_templates_as_options(tmp_path: Path) -> None:
     model = DejaVu.load(route)
     assert (model.mapper.periods.window, model.mapper.periods.peaks) == (32, "local")
     assert model.whitening is None
-
-
-def test_features_by_class_path(tmp_path: Path) -> None:
-    route = tmp_path / "a.safetensors"
-    run("learn", SMALL, "--map", route, "--features", "dejavu_torch.HOG", "--features.cell", "16")
-    assert DejaVu.load(route).features.cell == 16
 
 
 def test_features_of_another_package_are_named_again_to_localize(
@@ -329,14 +304,6 @@ def test_help_loads_nothing_that_only_a_run_needs(helped: tuple[str, str]) -> No
     assert (helped[0].splitlines()[-1], own) == ("[]", "")
 
 
-def test_every_setting_of_a_model_is_an_option_and_a_key(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        run("learn", "--help")
-    out = capsys.readouterr().out
-    for name in inspect.signature(DejaVu).parameters:
-        assert f"--{name} " in out
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="libgomp is the OpenMP of Linux builds")
 def test_threads_do_not_spin_while_they_wait(helped: tuple[str, str]) -> None:
     assert "OMP_WAIT_POLICY = 'PASSIVE'" in helped[1]
@@ -399,7 +366,13 @@ def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.Capt
 
 @pytest.mark.parametrize(
     "option",
-    [["--mapper.metric", "l2"], ["--batch_size", "9"], ["--velocity"], ["--config", "c.yaml"]],
+    [
+        ["--mapper.metric", "l2"],
+        ["--velocity"],
+        ["--config", "c.yaml"],
+        ["--second", "sim:aerial"],
+        ["--second_truth", "0"],
+    ],
 )
 def test_compare_with_a_map_takes_no_settings(
     trained_map: Path, option: list[str], capsys: pytest.CaptureFixture[str]
@@ -476,11 +449,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     ),
     "learn a.npy --map m.safetensors --whitening.bits 5": ("shrinkage=null", "bits=5"),
     "learn a.npy --map m.safetensors --mapper HOG": ("--mapper is HOG", "Mapper"),
-    "learn a.npy --map m.safetensors --mapper.chunk some": (
-        "--mapper.chunk is some",
-        "number of places",
-        "10000",
-    ),
+    "learn a.npy --map m.safetensors --mapper.chunk some": ("--mapper.chunk is some", "an integer"),
     "learn a.npy --map m.safetensors --config local_maxima --mapper.periods Foo": (
         "--mapper.periods is Foo",
     ),
@@ -491,6 +460,32 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m.safetensors --average c.npy": ("6 frames", "--average_truth"),
     "learn a.npy --map m.safetensors --calibration c.npy": ("6 frames", "--calibration_truth"),
     "learn one.npy --map m.safetensors": ("one.npy has 1 frame", "at least 2"),
+    "learn c.npy --map m.safetensors --config local_maxima": ("6 place", "at least 8"),
+    "learn nan.npy --map m.safetensors": ("frame 70",),
+    "learn text.npy --map m.safetensors": ("text.npy",),
+    "learn nowhere --map m.safetensors": ("nowhere is not there", "expected"),
+    "learn empty --map m.safetensors": ("no images",),
+    "learn strip:a.png --map m.safetensors": ("expected",),
+    "learn sim:moon --map m.safetensors": ("expected",),
+    "learn sim:aerial?colour=red --map m.safetensors": ("expected",),
+    "learn a.npy --map .": ("such as route.safetensors",),
+    "learn nowhere --map a.txt": ("--map a.txt", "a.safetensors"),
+    "learn nowhere --map no/a.safetensors": ("does not exist",),
+    "learn a.npy --map m.safetensors --config": ("--config", "expected one argument"),
+    "learn a.npy --map m.safetensors --config part.yaml": ("--mapper", "HOG"),
+    "learn a.npy --map m.safetensors --config paper --colour red": ("--colour",),
+    "learn a.npy --map m.safetensors --batch_size 0": ("batch_size is 0",),
+    "learn a.npy --map m.safetensors --preprocess.contrast high": ("contrast is high", "patch", "clahe"),
+    "learn a.npy --map m.safetensors --preprocess.grid 2,2": ("grid is 2,2", "a list"),
+    "learn a.npy --map m.safetensors --config local_maxima --mapper.metric l3": ("l3", "l1, l2 or cosine"),
+    "learn a.npy --map m.safetensors --config local_maxima --mapper.periods.windw 3": ("windw",),
+    "learn a.npy --map m.safetensors --config local_maxima --mapper.periods.window 3": ("window=3",),
+    "learn a.npy": ("required: --map",),
+    "localize m": ("required: source, --out",),
+    "evaluate": ("required: matches, --truth, --out",),
+    "compare a.npy b.npy --out r --truth maybe": ("maybe",),
+    "compare a.npy b.npy --out r --tolerance -1": ("tolerance is -1",),
+    "dance": ("dance", "localize"),
     "learn sim:aerial?frames=many --map m.safetensors": ("frames is 'many'", "integer"),
     "localize m a.npy --out m.csv --top some": ("--top is some", "integer"),
     "localize m a.npy --out m.csv --speeds [fast]": ("--speeds is", "fast", "a list"),
@@ -532,6 +527,10 @@ def test_what_is_wrong_is_told_by_options_and_without_python(
     monkeypatch.chdir(tmp_path)
     for name, count in (("a", 18), ("b", 18), ("c", 6), ("one", 1)):
         np.save(f"{name}.npy", frames(count))
+    np.save("nan.npy", np.where(np.arange(100) == 70, np.nan, 1)[:, None] * np.ones(8))
+    Path("text.npy").write_text("hello")
+    Path("empty").mkdir()
+    Path("part.yaml").write_text("mapper: {class_path: dejavu_torch.HOG}\n")
     Path("key.yaml").write_text("mapper:\n  class_path: SpectralMapper\n  init_args: {stepp: 3}\n")
     Path("value.yaml").write_text("batch_size: many\n")
     there = {*tmp_path.iterdir()}
@@ -539,34 +538,6 @@ def test_what_is_wrong_is_told_by_options_and_without_python(
     assert [word for word in WRONG[line] if word not in error] == [], error
     assert not re.search(r"<class|typing\.|Parser key|NoneType|\bNone\b|='|import path string", error), error
     assert {*tmp_path.iterdir()} == there
-
-
-def test_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = fails(capsys, "learn", tmp_path / "nowhere", "--map", tmp_path / "a.safetensors")
-    assert "nowhere" in error
-    assert "expected" in error
-
-
-def test_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "empty").mkdir()
-    assert "no images" in fails(capsys, "learn", tmp_path / "empty", "--map", tmp_path / "a.safetensors")
-    assert not (tmp_path / "a.safetensors").exists()
-
-
-@pytest.mark.parametrize("count", [1, 7])
-def test_too_few_frames(count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_images(tmp_path / "short", frames(count))
-    error = fails(capsys, "learn", folder, "--map", tmp_path / "a.safetensors", *TEMPLATES)
-    assert f"{count} place" in error
-    assert "at least 8" in error
-
-
-def test_paper_preset_refuses_less_than_its_window(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    error = fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "-c", "paper")
-    assert "96" in error
-    assert "1024" in error
 
 
 def test_mixed_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -586,24 +557,6 @@ def test_unreadable_image_in_the_middle(
     assert "77.png" in fails(capsys, "localize", small_map, folder, "--out", tmp_path / "m.csv")
     # the first batch was matched by then: nothing of it may stay
     assert sorted(file.name for file in tmp_path.iterdir()) == ["broken"]
-
-
-def test_nan_features(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    values = np.random.default_rng(0).normal(size=(100, 8))
-    values[70, 3] = np.nan
-    np.save(tmp_path / "nan.npy", values)
-    assert "frame 70" in fails(capsys, "learn", tmp_path / "nan.npy", "--map", tmp_path / "a.safetensors")
-
-
-def test_constant_features_do_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "flat.npy", np.full((100, 8), 0.3, dtype=np.float32))
-    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "a.safetensors", *TEMPLATES)
-    assert "this route does not repeat" in capsys.readouterr().out
-
-
-def test_a_file_that_is_no_array(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "text.npy").write_text("hello")
-    assert "text.npy" in fails(capsys, "learn", tmp_path / "text.npy", "--map", tmp_path / "a.safetensors")
 
 
 def test_features_of_another_dimension(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -649,60 +602,6 @@ def test_missing_config(
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("colour: red\n", "'colour'"),
-        ("mapper: {class_path: nowhere.Mapper}\n", "'nowhere'"),
-        ("mapper: {class_path: dejavu_torch.HOG}\n", "HOG"),
-        (f"mapper: {MAPPER}periods: {{class_path: dejavu_torch.HOG}}}}}}\n", "HOG"),
-        (f"mapper: {MAPPER}periods: {WINDOW}3}}}}}}}}\n", "window=3"),
-        ("mapper: [\n", "bad.yaml"),
-        ("batch_size: many\n", "many"),
-        ("batch_size: 0\n", "batch_size is 0"),
-        (f"mapper: {MAPPER}metric: manhattan}}}}\n", "manhattan"),
-        (
-            "mapper: {class_path: SpectralMapper, init_args: {chunk: route}}\n",
-            "a number of places, such as 10000",
-        ),
-    ],
-)
-def test_bad_config(text: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "bad.yaml").write_text(text)
-    error = fails(
-        capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--config", tmp_path / "bad.yaml"
-    )
-    assert named in error
-
-
-def test_unknown_option_and_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert fails(capsys, "compare", "nowhere", QUERY, "--out", tmp_path / "report")
-    assert not (tmp_path / "report").exists()
-    assert "--colour" in fails(capsys, "learn", SMALL, "--map", tmp_path / "a.safetensors", "--colour", "red")
-    assert "dance" in fails(capsys, "dance")
-    assert "required: --map" in fails(capsys, "learn", SMALL)
-    assert "required: source, --out" in fails(capsys, "localize", "a.safetensors")
-
-
-@pytest.mark.parametrize(
-    "bad", ["sim:moon", "sim:aerial?colour=red", "sim:aerial?frames=many", "strip:a.png"]
-)
-def test_bad_source(bad: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected" in fails(capsys, "learn", bad, "--map", tmp_path / "a.safetensors")
-
-
-@pytest.mark.parametrize("name", ["", ".", "/"])
-def test_a_map_without_a_name_is_one_line(capsys: pytest.CaptureFixture[str], name: str) -> None:
-    fails(capsys, "learn", "sim:aerial?frames=64", "--map", name)
-
-
-@pytest.mark.parametrize("bad", ["a.txt", "a"])
-def test_a_map_has_its_ending(bad: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = fails(capsys, "learn", "nowhere", "--map", tmp_path / bad)  # before anything is read
-    assert str(tmp_path / bad) in error
-    assert "a.safetensors" in error
-
-
-@pytest.mark.parametrize(
     "command",
     [
         "compare sim:aerial?frames=64 sim:aerial?frames=48 --truth maybe",
@@ -741,17 +640,9 @@ def test_a_map_that_is_given_is_not_learned_and_stays_in_the_report(
     assert {key: given[key] for key in ("auc", "null")} == {key: learned[key] for key in ("auc", "null")}
 
 
-def test_bad_truth_and_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "a.npy", frames(64))
-    pair = (tmp_path / "a.npy", tmp_path / "a.npy", "--out", tmp_path / "r")
-    assert "'maybe'" in fails(capsys, "compare", *pair, "--truth", "maybe")
-    assert "-1" in fails(capsys, "compare", *pair, "--tolerance", "-1")
-
-
 def test_output_that_cannot_be_written(
     small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "does not exist" in fails(capsys, "learn", SMALL, "--map", tmp_path / "no" / "a.safetensors")
     assert "is a folder" in fails(capsys, "localize", small_map, QUERY, "--out", tmp_path)
     (tmp_path / "file").write_text("in the way")
     assert "file" in fails(capsys, "compare", SMALL, QUERY, "--out", tmp_path / "file")

@@ -100,8 +100,7 @@ def test_a_pipe_is_brought_to_the_size_of_the_map(
 
 
 @pytest.mark.parametrize(
-    ("after", "words"),
-    [("other.ts", ("64 x 64", "128 x 128")), (None, ("stalled", "0.4"))],
+    ("after", "words"), [("other.ts", ("64 x 64", "128 x 128")), (None, ("stalled", "0.4"))]
 )
 def test_what_was_found_is_kept_where_a_stream_fails(
     after: str | None,
@@ -111,10 +110,7 @@ def test_what_was_found_is_kept_where_a_stream_fails(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     data = b"".join((folder / name).read_bytes() for name in ("second.ts", after) if name)
-    with (
-        piped(tmp_path, data, open_for=0 if after else 20) as pipe,
-        pytest.raises(SystemExit) as stop,
-    ):
+    with piped(tmp_path, data, open_for=0 if after else 20) as pipe, pytest.raises(SystemExit) as stop:
         run("live", folder / "map.safetensors", pipe, "--timeout", "0.4")
     out, err = capsys.readouterr()
     assert stop.value.code == 2
@@ -284,12 +280,6 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "port": (("sim:aerial?frames=20", "--page", "99999"), ("99999", "65535")),
     "timeout": (("/dev/video99", "--timeout", "0"), ("--timeout 0", "above 0")),
-    "both": (("sim:aerial?frames=20", "--filter", "--sequence", "5"), ("--sequence 5", "--filter")),
-    "searches": (
-        ("sim:aerial?frames=20", "--search_every", "9", "--sequence", "5"),
-        ("--search_every 9", "--filter"),
-    ),
-    "moves": (("sim:aerial?frames=20", "--moves", "[1]", "--sequence", "5"), ("--filter",)),
 }
 
 

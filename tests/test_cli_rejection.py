@@ -106,26 +106,6 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--precision", "0"), ("precision is 0", "above 0")),
-        (("--precision", "1"), ("precision is 1", "below 1")),
-        (("--precision", ".9", "--threshold", "1"), ("--threshold", "--precision", "one of them")),
-    ],
-)
-def test_precisions_that_cannot_be_asked_for(
-    learned: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    words: tuple[str, ...],
-    told: tuple[str, ...],
-) -> None:
-    error = fails(capsys, "localize", learned, AGAIN, "--out", tmp_path / "m.csv", *words)
-    assert [word for word in told if word not in error] == [], error
-    assert not (tmp_path / "m.csv").exists()
-
-
-@pytest.mark.parametrize(
     ("words", "told", "commands"),
     [
         ("--sequence 5 --precision .9", ("--sequence 5", "--precision 0.9"), "localize live compare"),
@@ -138,6 +118,9 @@ def test_precisions_that_cannot_be_asked_for(
             "localize live",
         ),
         ("--search_every 9", ("--search_every 9", "--filter"), "localize"),
+        ("--precision 1", ("precision is 1", "below 1"), "localize"),
+        ("--moves [1]", ("--moves [1.0]", "--filter"), "localize"),
+        ("--speeds [2]", ("--speeds [2.0]", "--sequence"), "localize"),
     ],
 )
 def test_options_that_exclude_each_other_are_told_before_anything_is_read(
@@ -164,9 +147,7 @@ def test_options_that_exclude_each_other_are_told_before_anything_is_read(
         (("--calibration_truth", "0"), ("--calibration SOURCE",)),
         (("--calibration", "nowhere"), ("nowhere is not there",)),
         (("--distractors", AGAIN), ("one of the traverses", "another route")),
-        (("--distractors", SEA, "--sequence", "5"), ("--distractors", "a filter")),
         (("--precision", ".9", "--calibration", "none"), ("--precision 0.9", "calibrated map")),
-        (("--distractors", "nowhere"), ("nowhere is not there",)),
     ],
 )
 def test_traverses_that_do_not_serve(

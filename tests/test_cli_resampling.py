@@ -110,8 +110,6 @@ def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
     [
         (["--velocity.corners", "[[0,0],[1,0],[1,1.5],[0,1]]"], "lie outside the frame"),
         (["--velocity.corners", "[[1,1],[0,1],[0,0]]"], "3 corners"),
-        (["--velocity.size", "[8,8]"], "(8, 8)"),
-        (["--velocity.step", "-1"], "step is -1"),
         (["--velocity.step", "4000", *CORNERS], "expected at least one step, 4000"),
         (["--velocity", "true"], "velocity"),
     ],

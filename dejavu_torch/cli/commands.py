@@ -89,19 +89,12 @@ def run_demo(
     settings: dict[str, Any] = {"seed": seed, "second": views, "others": others, "progress": True}
     result = compare(reference, query, model=model, storage_curve=True, **settings)
     _publish(result, out, "dejavu demo: the built-in route", command)
-    tries = (
-        [
-            "localize",
-            str(out / "map.safetensors"),
-            localized,
-            *_features_of(model, command),
-            "--out",
-            "matches.csv",
-        ],
+    kept, features = str(out / "map.safetensors"), _features_of(model, command)
+    for words in (
+        ["localize", kept, localized, *features, "--out", "matches.csv"],
         ["compare", learned, localized, "--config", "local_maxima", "--out", "templates"],
         ["compare", "MORNING", "EVENING", "--out", "report"],
-    )
-    for words in tries:
+    ):
         _say(f"or try: {shlex.join(['dejavu', *words])}")
 
 
@@ -131,10 +124,10 @@ def run_learn(
     model = (model if append is None else _map_to_append_to(append, model, len(sources) > 0)).to(where)
     if cluster is not None:
         _check_cluster(cluster, learning.device)
-        _check_chunks(cluster, model)
-    _check_map_name(map)
-    check_output_file(map)
-    check_not_read(map, *sources, learning.second, *learning.files, average, growing.average_truth)
+        if not isinstance(model.mapper, SpectralMapper):
+            seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none"
+            raise InputError(f"{seen}; expected a spectral map")
+    _check_map_file(map, *sources, learning.second, *learning.files, average, growing.average_truth)
     precision = f"--precision {given}" if given is not None else f"the map's precision, {model.precision},"
     if learning.calibration == NO_CALIBRATION and model.precision is not None:
         seen = f"{precision} with --calibration none"
@@ -181,7 +174,7 @@ def run_learn(
     if done:
         _say(done)
     if model.map.summary().covered:
-        _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+        _print_localize(map, model, command)
     else:
         print("next: try more frames, another --preprocess.contrast, or `dejavu train fit`")
 
@@ -341,11 +334,8 @@ def run_compare(
     """
     from dejavu_torch.evaluation.compare import compare
 
-    where, top, calibration = (
-        device_of(learning.device, learns=map is None),
-        judging.top,
-        learning.calibration,
-    )
+    where = device_of(learning.device, learns=map is None)
+    top, calibration = judging.top, learning.calibration
     filter, within = sequences.filter, max(0, judging.tolerance)
     matcher = sequences.matcher(within, model.threshold)
     Acceptance(model.threshold, model.precision).check(matcher, judging.distractors)
@@ -448,19 +438,13 @@ def run_reproduce(
         seed: which routes
         tolerance: right within this many places, inclusive
     """
-    from dejavu_torch.evaluation.paper_tables import (
-        FOOTAGE,
-        PUBLISHED,
-        boundary_lines,
-        route_lines,
-        section_five,
-    )
+    from dejavu_torch.evaluation import paper_tables as tables
     from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
     from dejavu_torch.evaluation.reproduce import lengths_picture, reproduce
 
-    if dataset not in ("all", *PUBLISHED):
-        raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(PUBLISHED)} or all")
-    names = list(PUBLISHED) if dataset == "all" else [dataset]
+    names = list(tables.PUBLISHED) if dataset == "all" else [dataset]
+    if not {*names} <= {*tables.PUBLISHED}:
+        raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(tables.PUBLISHED)} or all")
     check_output_folder(out)
     reports: dict[str, Report] = {}
     for name in names:
@@ -472,7 +456,8 @@ def run_reproduce(
             write_report(folder, result.report, result.pictures, title, command, plan)
             _write_matches(folder / "matches.csv", [run.match], run.query, run.model)
         reports[name] = result.report
-    rows, notes = section_five(reports), [*route_lines(reports), *boundary_lines(reports), FOOTAGE]
+    rows = tables.section_five(reports)
+    notes = [*tables.route_lines(reports), *tables.boundary_lines(reports), tables.FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
     with whole_folder(out) as folder:
         write_index(folder, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
@@ -528,9 +513,7 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
         map: map file to write (.safetensors)
         features: class of the maps' features, if not ours
     """
-    _check_map_name(map)
-    check_output_file(map)
-    check_not_read(map, *maps)
+    _check_map_file(map, *maps)
     for i, path in enumerate(maps):
         twice = next((one for one in maps[:i] if one.exists() and path.exists() and one.samefile(path)), None)
         if twice is not None:
@@ -544,7 +527,7 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
         raise InputError(f"merging {', '.join(str(path) for path in maps)}: {error}") from error
     model.save(map)
     print_map(model)
-    _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+    _print_localize(map, model, command)
 
 
 def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> None:
@@ -576,18 +559,16 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.weight_bits < 32:
         print(f"weights of {model.weight_bits} bits, a scale for each output channel")
     print(f"map format {FORMAT}, its checksums agree")
-    known = [
-        name for name, platt in (model.calibration or Calibration())._asdict().items() if platt is not None
-    ]
+    calibration = (model.calibration or Calibration())._asdict()
+    known = [name for name, platt in calibration.items() if platt is not None]
     print(f"calibrated for: {', '.join(known) or 'nothing'}; precision: {model.precision}")
     print(f"single queries: {model.acceptance()}")
     print(f"L1 here by {l1_backend()}, spectrogram by {BACKEND}")
     if model.map.places:
-        _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+        _print_localize(map, model, command)
     else:
-        _print_next(
-            "learn", "ROUTE", "--descriptor", map, *_features_of(model, command), "--map", "route.safetensors"
-        )
+        words = _features_of(model, command)
+        _print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
 
 
 def _check_cluster(cluster: str, device: str) -> None:
@@ -597,13 +578,6 @@ def _check_cluster(cluster: str, device: str) -> None:
     if device != "cpu":
         raise InputError(f"--cluster {cluster} and --device {device}; expected one of them")
     check_installed()
-
-
-def _check_chunks(cluster: str, model: DejaVu) -> None:
-    """Refuse to divide among workers what is made as one."""
-    if not isinstance(model.mapper, SpectralMapper):
-        seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none"
-        raise InputError(f"{seen}; expected a spectral map")
 
 
 @contextmanager
@@ -632,10 +606,13 @@ def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
         yield
 
 
-def _check_map_name(path: Path) -> None:
+def _check_map_file(path: Path, *read: str | Path | None) -> None:
+    """Refuse early a map that cannot be written, or that is what is read."""
     if path.suffix != ".safetensors":
         expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
         raise InputError(f"--map {path} is no name of a map; expected {expected}")
+    check_output_file(path)
+    check_not_read(path, *read)
 
 
 def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
@@ -744,6 +721,10 @@ def route_lines(route: PlaceMap) -> list[str]:
     return lines
 
 
+def _print_localize(map: Path, model: DejaVu, command: str) -> None:
+    _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+
+
 def _print_next(*words: str | Path) -> None:
     _say(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
@@ -754,12 +735,7 @@ def _say(text: str) -> None:
 
 
 def _publish(
-    result: Comparison,
-    out: Path,
-    title: str,
-    command: str,
-    given: Path | None = None,
-    top: int | None = None,
+    result: Comparison, out: Path, title: str, command: str, given: Path | None = None, top: int | None = None
 ) -> None:
     """Write map, matches and report of a comparison, and print its scores.
 

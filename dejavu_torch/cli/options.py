@@ -194,9 +194,7 @@ class Learning:
     ) -> tuple[Traverse, Views | None]:
         """The reference, and the second traverse that whitening learns from."""
         if self.second is None:
-            if self.second_truth is not None:
-                seen = f"--second_truth {self.second_truth} is of no traverse"
-                raise InputError(f"{seen}; expected --second SOURCE with it")
+            check_no_truth("second", self.second_truth)
             return reference, None
         traverse = open_source(self.second)
         if query is not None and same_as(traverse, [query]):
@@ -212,9 +210,7 @@ class Learning:
         """The reference, and the traverse that its map is calibrated by."""
         source, truth = self.calibration, self.calibration_truth
         if source in UNREAD:
-            if truth is not None:
-                seen = f"--calibration_truth {truth} is of no traverse"
-                raise InputError(f"{seen}; expected --calibration SOURCE with it")
+            check_no_truth("calibration", truth)
             return reference, None
         traverse = open_source(str(source))
         if self.second is not None and same_as(traverse, [open_source(self.second)]):
@@ -256,9 +252,7 @@ class Growth:
     def check(self, sources: Iterable[str], calibration: str | None) -> None:
         """Refuse to average a traverse with itself, or to calibrate by what a map has been averaged with."""
         if self.average is None:
-            if self.average_truth is not None:
-                seen = f"--average_truth {self.average_truth} is of no traverse"
-                raise InputError(f"{seen}; expected --average SOURCE with it")
+            check_no_truth("average", self.average_truth)
             return
         traverse = open_source(self.average)
         if same_as(traverse, [open_source(one) for one in sources]):
@@ -306,6 +300,12 @@ class Judging:
                     f"--distractors {other.name} is one of the traverses; expected another route"
                 )
         return others
+
+
+def check_no_truth(option: str, truth: str | None) -> None:
+    """Refuse a truth of a traverse that is not given."""
+    if truth is not None:
+        raise InputError(f"--{option}_truth {truth} is of no traverse; expected --{option} SOURCE with it")
 
 
 @contextmanager

@@ -238,8 +238,6 @@ def _by_options(message: str, error: Exception | None) -> str:
         return f"{option}.{setting[1]}: {option} {value[1]} has no settings; expected one or the other"
     types = re.search(r"Subtypes: \[(.*)\]\n|Expected an? (.*?)\. Got", text)
     wanted = "" if types is None else _wanted(types[1] or types[2])
-    if re.search(r"\bchunk$", option):  # which was "route" once
-        wanted = "a number of places, such as 10000"
     return f"{option} is {value[1] or value[2]}; expected {wanted or 'a class by its import path'}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -47,63 +48,55 @@ def check_config(path: Path) -> None:
     """Refuse what is no YAML file of options, ahead of what makes objects of it.
 
     Raises:
-        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `check_yaml`.
+        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `ConfigLoader`.
     """
     if check_regular(path, EXPECTED) > LARGEST:
         raise InputError(f"{path} is larger than {LARGEST} bytes; expected {EXPECTED}")
     text = read_text(path, EXPECTED)
     with reading(path, "is no YAML", EXPECTED):
-        check_yaml(text)
-        if not isinstance(yaml.safe_load(text), dict):
+        if not isinstance(ConfigLoader(text).get_single_data(), dict):
             raise InputError(f"{path} holds no options; expected {EXPECTED}, as KEY: VALUE")
 
 
-def check_yaml(text: str) -> None:
-    """Refuse a text of more, deeper or longer values than any config has, or with a key twice in one mapping.
+class ConfigLoader(yaml.SafeLoader):  # type: ignore[misc]
+    """Refuses more, deeper or longer values than any config has, or a key twice in one mapping,
+    as a ValueError that names the line, before any value is made.
 
-    It goes through the events of the parser, one by one: no value is made, and nothing calls itself. Loaders
-    do: aliases that name each other keep them busy for hours, and many levels end the process.
-
-    Raises:
-        ValueError: naming the line. yaml.YAMLError: no YAML.
+    Other loaders do not: aliases that name each other keep them busy for hours, and many levels end the
+    process.
     """
-    sizes: dict[str, int] = {}  # values below each anchor
-    open_: list[_Collection] = [_Collection(None, False)]
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        here, line = open_[-1], f"line {event.start_mark.line + 1}"
-        if isinstance(event, yaml.ScalarEvent):
-            if len(event.value) > LONGEST:
-                raise ValueError(f"{line}: a value of {len(event.value)} characters")
-            here.add(1, event.value, line)
-            sizes[event.anchor or ""] = 1
-        elif isinstance(event, yaml.AliasEvent):
-            here.add(sizes.get(event.anchor, MOST), None, line)  # its own anchor is not yet there
-        elif isinstance(event, yaml.CollectionStartEvent):
-            open_.append(_Collection(event.anchor, isinstance(event, yaml.MappingStartEvent)))
-        elif isinstance(event, yaml.CollectionEndEvent):
-            open_.pop()
-            sizes[here.anchor or ""] = here.size
-            open_[-1].add(here.size, None, line)
-        if open_[-1].size >= MOST or len(open_) > DEEPEST:
-            raise ValueError(f"{line}: over {MOST} values, or {DEEPEST} levels")
 
+    level = 0
 
-class _Collection:
-    """A list or mapping that a YAML text has begun."""
-
-    def __init__(self, anchor: str | None, mapping: bool) -> None:
-        self.anchor, self.mapping = anchor, mapping
-        self.size = 1
-        self.keys: set[str] = set()
-        self.parts = 0
-
-    def add(self, size: int, text: str | None, line: str) -> None:
-        self.size += size
-        if self.mapping and self.parts % 2 == 0 and text is not None:
-            if text in self.keys:
-                raise ValueError(f"{line}: {text} appears twice")
-            self.keys.add(text)
-        self.parts += 1
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """A node, which keeps how many values it has."""
+        event = self.peek_event()
+        line = f"line {event.start_mark.line + 1}"
+        if len(getattr(event, "value", "")) > LONGEST:
+            raise ValueError(f"{line}: a value of {len(event.value)} characters")
+        self.level += 1
+        if self.level > DEEPEST:
+            raise ValueError(f"{line}: over {DEEPEST} levels")
+        node = super().compose_node(parent, index)
+        self.level -= 1
+        if isinstance(event, yaml.AliasEvent):
+            return node
+        parts, keys = [], []
+        if isinstance(node, yaml.SequenceNode):
+            parts = node.value
+        elif isinstance(node, yaml.MappingNode):
+            parts = [part for pair in node.value for part in pair]
+            keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        seen: set[str] = set()
+        for key in keys:
+            if key.value in seen:
+                raise ValueError(f"line {key.start_mark.line + 1}: {key.value} appears twice")
+            seen.add(key.value)
+        # an alias of what it lies in has no size yet
+        node.size = 1 + sum(getattr(part, "size", MOST) for part in parts)
+        if node.size >= MOST:
+            raise ValueError(f"{line}: over {MOST} values")
+        return node
 
 
 def check_word(word: str) -> None:
@@ -114,7 +107,7 @@ def check_word(word: str) -> None:
         raise InputError(f"{word[:40]} ...: a word of {len(word)} characters; expected at most {LONGEST}")
     if "&" in word and "*" in word:  # aliases
         try:
-            check_yaml(word.partition("=")[2] if word.startswith("--") else word)
+            ConfigLoader(word.partition("=")[2] if word.startswith("--") else word).get_single_node()
         except yaml.YAMLError:  # an address, or a name
             pass
         except ValueError as error:

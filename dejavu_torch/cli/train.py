@@ -171,10 +171,8 @@ class TrainCLI(LightningCLI):
             if (number and not least <= value <= most) or (value is None and name not in MAY_BE_NULL):
                 raise InputError(f"{name} is {value}; expected a number {expected}")
         counts = {name: chosen["trainer"][name] for name in ("devices", "num_nodes")}
-        strategy, told = (
-            chosen["trainer"]["strategy"],
-            ", ".join(f"trainer.{k} is {v}" for k, v in counts.items()),
-        )
+        strategy = chosen["trainer"]["strategy"]
+        told = ", ".join(f"trainer.{name} is {count}" for name, count in counts.items())
         if (_several(counts["devices"]) or counts["num_nodes"] != 1) and strategy not in ("auto", "ddp"):
             raise InputError(f"{told:.99}, trainer.strategy is {strategy!s:.40}; expected 1 of each, or ddp")
         if counts["num_nodes"] != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
@@ -330,7 +328,11 @@ class TrainCLI(LightningCLI):
         """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""
         chosen, last = self.config_init[self.subcommand], self._last_checkpoint()
         if chosen.get("ckpt_path") not in (None, "", "last"):
-            self._check_there(chosen["ckpt_path"])
+            path = chosen["ckpt_path"]
+            if (
+                path in ("best", "hpc") or not Path(path).exists()
+            ):  # words of Lightning's, which mean none here
+                raise InputError(f"{path} is not there; {EXPECTED}")
             return
         if last is None:
             raise InputError(
@@ -340,11 +342,6 @@ class TrainCLI(LightningCLI):
         chosen["ckpt_path"] = str(last)
 
     before_test = before_export = before_validate
-
-    def _check_there(self, path: str) -> None:
-        """Lightning has words for some checkpoints, such as best, which mean none here."""
-        if path in ("best", "hpc") or not Path(path).exists():
-            raise InputError(f"{path} is not there; {EXPECTED}")
 
     def after_validate(self) -> None:
         """Say what the figures are of, and what to do next."""
