@@ -356,6 +356,14 @@ def noisy(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "one.npy", tmp_path / "two.npy"
 
 
+def assert_same_matches(one: Path, other: Path) -> None:
+    """Equal but for rounding: a command that localizes alone multiplies other batches."""
+    tables = [list(csv.DictReader(path.open(newline=""))) for path in (one, other)]
+    scores = [[float(row.pop("score")) for row in table] for table in tables]
+    assert tables[0] == tables[1]
+    assert scores[0] == pytest.approx(scores[1], rel=1e-5)
+
+
 def test_a_sequence_is_of_the_map_and_of_all_beside_it(
     noisy: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -380,7 +388,7 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(
 
     matches = tmp_path / "matches.csv"
     run("localize", tmp_path / "9" / "map.safetensors", two, "--sequence", 9, "--out", matches)
-    assert matches.read_text() == (tmp_path / "9" / "matches.csv").read_text()
+    assert_same_matches(matches, tmp_path / "9" / "matches.csv")
 
 
 def test_a_filter_is_of_the_map_and_of_all_beside_it(
@@ -399,7 +407,7 @@ def test_a_filter_is_of_the_map_and_of_all_beside_it(
 
     matches, route = tmp_path / "matches.csv", out / "map.safetensors"
     run("localize", route, two, "--filter", "--out", matches)
-    assert matches.read_text() == (out / "matches.csv").read_text()
+    assert_same_matches(matches, out / "matches.csv")
     rows = list(csv.DictReader(matches.open(newline="")))
     assert {row["accepted"] for row in rows} == {"0", "1"}
     assert all((float(row["score"]) < math.log(2)) == (row["accepted"] == "1") for row in rows)

@@ -71,7 +71,7 @@ def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Tra
     assert frames.grad is not None
     assert frames.grad.isfinite().all()
     assert frames.grad.abs().max() > 0
-    assert torch.allclose(next(model.describer.descriptors(ArrayTraverse(frames, "eight"))), descriptors)
+    assert torch.allclose(next(model.describer.descriptors(ArrayTraverse(frames, "four"))), descriptors[:4])
 
 
 def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:

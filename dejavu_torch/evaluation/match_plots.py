@@ -140,6 +140,7 @@ def example_matches(match: Match, truth: GroundTruth | None, tolerance: int) -> 
     example.
 
     Example:
+        >>> from dejavu_torch.data.ground_truth import as_ground_truth
         >>> match = Match(torch.tensor([0, 9]), torch.tensor([0.1, 0.2]), torch.tensor([True, False]))
         >>> for example in example_matches(match, as_ground_truth(torch.tensor([[0], [1]])), tolerance=0):
         ...     print(example)
