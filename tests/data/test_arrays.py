@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -109,13 +108,6 @@ def test_a_file_that_is_no_array_is_refused(tmp_path: Path, content: bytes) -> N
         read_array(path)
 
 
-def test_an_archive_named_npy_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", FEATURES)
-    path = (tmp_path / "a.npz").rename(tmp_path / "a.npy")
-    with refused(str(path), "expected frames"):
-        read_array(path)
-
-
 def test_a_truncated_array_is_refused_at_any_length(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     np.save(path, FEATURES)
@@ -136,11 +128,6 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
     with refused(str(path), "no whole .npy array"):
         read_array(path)
     assert not (tmp_path / "ran").exists()
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with refused("missing.npy", "expected frames"):
-        read_array(tmp_path / "missing.npy")
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 5), (60, 140), (64, 128), (199, 200), (190, 400), (7, 7)])
@@ -226,9 +213,3 @@ def test_float_frames_of_a_file_lie_from_0_to_1(tmp_path: Path, bad: float) -> N
     assert len(next(traverse.batches(5))) == 5
     with refused("a.npy", "frame 5", "expected 0 to 1"):
         all_of(traverse, 3)
-
-
-def test_a_fifo_is_no_array(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.npy")
-    with refused("a.npy", "no regular file"):
-        read_array(tmp_path / "a.npy")

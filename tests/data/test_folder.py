@@ -50,19 +50,6 @@ def with_alpha(pixels: np.ndarray) -> np.ndarray:
         (Image.fromarray(COLOUR), "a.PPM", COLOUR / 255),
         (Image.fromarray(GREY), "a.pgm", GREY[..., None] / 255),
     ],
-    ids=[
-        "grey",
-        "colour",
-        "alpha",
-        "grey-alpha",
-        "16-bit",
-        "16-bit-tif",
-        "1-bit",
-        "palette",
-        "bmp",
-        "ppm",
-        "pgm",
-    ],
 )
 def test_pixel_formats(image: Image.Image, name: str, expected: np.ndarray, tmp_path: Path) -> None:
     image.save(tmp_path / name)
@@ -126,12 +113,6 @@ def test_other_files_and_folders_are_passed_over(tmp_path: Path) -> None:
 def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with refused("missing", "expected a folder"):
         ImageFolder(tmp_path / "missing")
-
-
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    write(tmp_path, "1.png")
-    with refused("1.png", "expected a folder"):
-        ImageFolder(tmp_path / "1.png")
 
 
 def test_a_folder_without_images_is_refused(tmp_path: Path) -> None:
