@@ -74,6 +74,7 @@ class Camera:
         self.source, self.size, self.name = source, size, without_password(source)
         self.ends = source == PIPE or _mode_is(source, stat.S_ISFIFO)
         self.device = not self.ends and (source.startswith("/dev/") or _mode_is(source, stat.S_ISCHR))
+        self._expected = "a camera such as /dev/video0" if self.device else "a video stream"
         if source == PIPE:
             self.name = "standard input"
         self.note = ""
@@ -107,10 +108,6 @@ class Camera:
             raise InputError(f"{self.name} gave no frames; expected {self._expected}")
         if not self.ends:
             raise InputError(f"{self.name} ended after {number} frames; expected it to go on")
-
-    @property
-    def _expected(self) -> str:
-        return "a camera such as /dev/video0" if self.device else "a video stream"
 
     def _open(self) -> Any:
         import av

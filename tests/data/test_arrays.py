@@ -46,18 +46,6 @@ def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path)
     assert traverse.length == 7
 
 
-@pytest.mark.parametrize("batch", [1, 2, 3, 7, 100])
-@pytest.mark.parametrize(
-    "values", [GREY, COLOUR, FRAMES, FEATURES], ids=["grey", "colour", "float", "features"]
-)
-def test_the_batch_size_changes_nothing(values: np.ndarray, batch: int) -> None:
-    traverse = ArrayTraverse(values)
-    sizes = [len(part) for part in traverse.batches(batch)]
-    assert max(sizes) <= batch
-    assert torch.equal(all_of(traverse, batch), all_of(traverse))
-    assert torch.equal(all_of(traverse, batch), all_of(traverse, batch)), "a second reading differs"
-
-
 def test_a_batch_is_a_copy_of_a_file(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", FEATURES)
     traverse = read_array(tmp_path / "a.npy")
@@ -128,13 +116,6 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
     with refused(str(path), "no whole .npy array"):
         read_array(path)
     assert not (tmp_path / "ran").exists()
-
-
-@pytest.mark.parametrize(("start", "stop"), [(0, 5), (60, 140), (64, 128), (199, 200), (190, 400), (7, 7)])
-def test_frames_between_are_those_frames(start: int, stop: int) -> None:
-    clip = torch.rand(200, 1, 2, 2)
-    parts = list(ArrayTraverse(clip).between(start, stop))
-    assert torch.equal(torch.cat([clip[:0], *parts]), clip[start:stop])
 
 
 def written(path: Path, header: str, body: bytes = bytes(256), version: int = 1) -> Path:

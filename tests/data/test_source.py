@@ -237,9 +237,3 @@ def test_a_step_beyond_the_end_takes_one_frame(sources: dict[str, str], kind: st
     source = open_source(f"{address}{'&' if '?' in address else '?'}step={step}")
     torch.testing.assert_close(all_of(source), all_of(open_source(address))[:1])
     assert source.place is None or len(source.place) == 1
-
-
-@pytest.mark.parametrize("rows", ["²:5", f"{'9' * 5000}:5", ":", "0:17", "-1:3", "nan:3", "1.5:3", "3:1e400"])
-def test_rows_of_a_strip_are_whole_numbers_inside_it(sources: dict[str, str], rows: str) -> None:
-    with refused("expected first:stop inside 0:16"):
-        open_source(f"{sources['strip']}&rows={rows}")
