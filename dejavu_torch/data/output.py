@@ -194,53 +194,43 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
         >>> folder.exists()
         False
     """
-    _remove_abandoned(parent)
+    # the name, which a folder has from its first moment on, says that it is ours, and of this host: locks of
+    # a network file system may hold on one host only
+    for left in parent.glob(f"{HERE}{'?' * 8}"):  # of tempfile
+        if left.is_dir() and not left.is_symlink():
+            with _locked(left, wait=False) as abandoned:  # the system took the lock of a process it killed
+                if abandoned:
+                    shutil.rmtree(left, ignore_errors=True)
     while True:
         folder = Path(tempfile.mkdtemp(prefix=HERE, dir=parent))
         _temporary.add(folder)
         with suppress(FileNotFoundError):  # as below
             folder.chmod(0o700)  # whatever the umask
-        lock = _locked(folder)
-        if folder.is_dir():  # else another took it for abandoned before it was locked
-            break
-        _release(lock)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        _temporary.discard(folder)
-        _release(lock)
-
-
-def _remove_abandoned(parent: Path) -> None:
-    """Remove what processes of this host that were killed left: the system took their locks.
-
-    The name, which a folder has from its first moment on, says that it is ours, and of this host: locks of a
-    network file system may hold on one host only.
-    """
-    for folder in parent.glob(f"{HERE}{'?' * 8}"):  # of tempfile
-        if folder.is_dir() and not folder.is_symlink():
-            lock = _locked(folder, wait=False)
-            if lock is not None:
+        with _locked(folder):
+            if not folder.is_dir():  # another took it for abandoned before it was locked
+                continue
+            try:
+                yield folder
+            finally:
                 shutil.rmtree(folder, ignore_errors=True)
-            _release(lock)
+                _temporary.discard(folder)
+            return
 
 
-def _locked(folder: Path, wait: bool = True) -> int | None:
-    """A lock on a folder until it is released; None where another has it, or the system knows none."""
-    lock = None
+@contextmanager
+def _locked(folder: Path, wait: bool = True) -> Iterator[bool]:
+    """Lock a folder: whether it is, and not where another has it, or the system knows no locks."""
+    place: int | None = None
+    locked = False
     try:
-        lock = os.open(folder, os.O_RDONLY)
-        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except (OSError, AttributeError):
-        _release(lock)
-        return None
-    return lock
-
-
-def _release(lock: int | None) -> None:
-    if lock is not None:
-        os.close(lock)
+        with suppress(OSError, AttributeError):
+            place = os.open(folder, os.O_RDONLY)
+            fcntl.flock(place, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            locked = True
+        yield locked
+    finally:
+        if place is not None:
+            os.close(place)
 
 
 def _finish(written: Path, path: Path) -> None:
