@@ -418,6 +418,7 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
     """An npz of the matrices (reference frames, query frames) GThard and/or GTsoft."""
     expected = "boolean matrices GThard and/or GTsoft"
     matrices: list[Tensor] = []
+    shapes: set[tuple[int, ...]] = set()
     with reading(path, "is no whole .npz file of arrays", expected), zipfile.ZipFile(path) as archive:
         there = [name.removesuffix(".npy") for name in archive.namelist()]
         for name in ("GThard", "GTsoft"):
@@ -438,11 +439,12 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} holds numbers that are not finite")
             matrix = values.reshape(shape, order="F" if by_columns else "C")[:, numbers.numpy()]
+            shapes.add(shape)
             matrices.append(torch.from_numpy(matrix.astype(bool)).T)
     if not matrices:
         raise InputError(f"{path} holds {', '.join(there) or 'nothing'}; expected {expected}")
     hard, *soft = matrices
-    if soft and soft[0].shape != hard.shape:
+    if len(shapes) > 1:
         raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
     found = as_ground_truth(padded(_true_columns(hard)))
     return found._replace(ignored=padded(_true_columns(soft[0] & ~hard))) if soft else found

@@ -519,6 +519,8 @@ def test_other_npz_files_are_refused(tmp_path: Path) -> None:
         read(saved(tmp_path, gt=square, S=square), 3, 3)
     with refused("differ in shape"):
         read(saved(tmp_path, GThard=square, GTsoft=np.ones((2, 3))), None, 3)
+    with refused("differ in shape"):
+        read(saved(tmp_path, GThard=square, GTsoft=np.ones((3, 4))), None, torch.tensor([0, 1]))
     with refused("no whole .npz"):
         read(saved(tmp_path, GThard=np.array([[{}]], dtype=object)), 1, 1)
     with refused("GThard", "<U1"):
