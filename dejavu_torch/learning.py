@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.selection import Selection
+from dejavu_torch.data.frame_range import Selection
 from dejavu_torch.features.extract import check_alone, feature_batches, warn_of_bright
 from dejavu_torch.features.views import (
     LEAST,

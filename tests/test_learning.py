@@ -20,7 +20,7 @@ from torch import Tensor
 
 from dejavu_torch import growth, learning
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.chain import Chain
+from dejavu_torch.data.frame_range import Chain
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views

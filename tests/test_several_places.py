@@ -135,26 +135,13 @@ def test_the_first_of_several_places_has_the_probability(
 
 
 def test_compare_and_evaluate_agree(route: Path, pair: tuple[Path, Path], tmp_path: Path) -> None:
-    run(
-        "compare",
-        *pair,
-        "--map",
-        route,
-        "--truth",
-        "0",
-        "--tolerance",
-        "1",
-        "--top",
-        "12",
-        "--out",
-        tmp_path / "c",
-    )
+    options = "--truth", "0", "--tolerance", "1", "--map", route
+    run("compare", *pair, *options, "--top", "12", "--out", tmp_path / "c")
     rows = rows_of(tmp_path / "c" / "matches.csv")
     assert len(rows) == 96 * 12
     places = torch.tensor([int(row["place"]) for row in rows]).view(96, 12)
     near = (places[:, :, None] - places[:, None]).abs() <= 1
     assert not (near & (places >= 0)[:, None]).sum(2).gt(1).any()
-    options = "--truth", "0", "--tolerance", "1", "--map", route
     run("evaluate", tmp_path / "c" / "matches.csv", *options, "--out", tmp_path / "e")
     right = (places - torch.arange(96)[:, None]).abs() <= 1
     for first in (1, 5, 10):
@@ -213,6 +200,3 @@ def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp
     read = read_matches(path)
     assert torch.equal(read.query, steps.frame)
     assert torch.equal(read.candidates, model.map.frame_of(candidates.index))
-
-
-# what is refused

@@ -34,7 +34,7 @@ from dejavu_torch.cli.options import (
     load_map,
     truth_by,
 )
-from dejavu_torch.data.chain import chained
+from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable

@@ -12,7 +12,7 @@ from torch import nn
 
 from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.data.chain import parts_of
+from dejavu_torch.data.frame_range import parts_of
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu, check_precision

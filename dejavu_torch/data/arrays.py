@@ -77,9 +77,8 @@ class ArrayTraverse(IndexedTraverse):
         part = self.values[frames.start : frames.stop : frames.step]
         if isinstance(part, Tensor):
             return part
-        return torch.from_numpy(
-            np.array(part, dtype=part.dtype.newbyteorder("="))
-        )  # writable, of this machine
+        # writable, of this machine
+        return torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))
 
     def state(self, start: int, stop: int) -> str:
         if self.path is not None:

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
-from dejavu_torch.data.folder import check_pixels
-from dejavu_torch.data.video import FORMATS, pixels_of
-from dejavu_torch.resize import MOST_PIXELS, is_stretched
+from dejavu_torch.data.video import FORMATS, check_alike, pixels_of, seconds_of, stream_of
+from dejavu_torch.resize import is_stretched
 from dejavu_torch.text import one_line, printable
 from dejavu_torch.types import InputError, Traverse
-
-if TYPE_CHECKING:
-    from av.container import InputContainer
-    from av.video.stream import VideoStream
 
 PIPE = "-"  # standard input
 PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,rtmp,rtmps,rtmpt,srt,crypto,data"
@@ -80,18 +74,27 @@ class Camera:
         self.source, self.size, self.name = source, size, without_password(source)
         self.ends = source == PIPE or _mode_is(source, stat.S_ISFIFO)
         self.device = not self.ends and (source.startswith("/dev/") or _mode_is(source, stat.S_ISCHR))
+        self._expected = "a camera such as /dev/video0" if self.device else "a video stream"
         if source == PIPE:
             self.name = "standard input"
         self.note = ""
 
     def __iter__(self) -> Iterator[Frame]:
         number = 0
+        first: tuple[int, int] | None = None
+        high, wide = self.size or (0, 0)
         try:
-            container, stream = self._open()
-            with container:
-                for shot in self._shots(container, stream):
-                    number = shot.number + 1
-                    yield shot
+            with self._open() as container:
+                # threads by frames hold some of them back
+                stream = stream_of(container, self.name, self._expected, "SLICE")
+                for frame in container.decode(stream):
+                    if first is None:
+                        first = (frame.height, frame.width)
+                        self.note = stretched(self.name, first, self.size)
+                    check_alike(self.name, number, frame, first)
+                    pixels = pixels_of(frame, Path(self.name), wide, high)
+                    number += 1
+                    yield Frame(number - 1, seconds_of(frame.pts, stream.time_base), pixels)
         except InputError:
             raise
         except Exception as error:  # FFmpeg's, of any type
@@ -106,17 +109,10 @@ class Camera:
         if not self.ends:
             raise InputError(f"{self.name} ended after {number} frames; expected it to go on")
 
-    @property
-    def _expected(self) -> str:
-        return "a camera such as /dev/video0" if self.device else "a video stream"
-
-    def _open(self) -> tuple[InputContainer, VideoStream]:
+    def _open(self) -> Any:
         import av
 
-        options: dict[str, str] = {
-            "protocol_whitelist": "pipe",
-            "format_whitelist": f"{FORMATS},nut,yuv4mpegpipe",
-        }
+        options = {"protocol_whitelist": "pipe", "format_whitelist": f"{FORMATS},nut,yuv4mpegpipe"}
         settings: dict[str, Any] = {"metadata_errors": "replace"}
         address: Any = self.source
         if self.device:
@@ -124,42 +120,15 @@ class Camera:
                 raise InputError(f"{self.name} is not there; expected {self._expected}")
             settings["format"] = "v4l2"
             options = {}
-        elif (
-            self.source == PIPE
-        ):  # without a buffer, whose lock a thread would hold to the end of the process
-            address = open(0, "rb", buffering=0, closefd=False)  # noqa: SIM115
-        elif self.ends:
-            address = open(self.source, "rb", buffering=0)  # noqa: SIM115
+        elif self.ends:  # without a buffer, whose lock a thread would hold to the end of the process
+            pipe = self.source == PIPE
+            address = open(0 if pipe else self.source, "rb", buffering=0, closefd=not pipe)  # noqa: SIM115
         else:
             options["protocol_whitelist"] = PROTOCOLS  # and no file of this machine that an answer may name
             options["format_whitelist"] += ",rtsp,sdp,rtp,hls,dash,mpjpeg"
             options["rtsp_transport"] = "tcp"
             settings["timeout"] = (OPENING, None)
-        container = av.open(address, "r", container_options=options, **settings)
-        stream: Any = container.streams.best("video")
-        if stream is None or stream.codec_context is None:
-            container.close()
-            raise InputError(f"{self.name} has no video that can be decoded; expected {self._expected}")
-        check_pixels(Path(self.name), stream.codec_context.height, stream.codec_context.width, MOST_PIXELS)
-        stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
-        stream.thread_type = "SLICE"  # threads by frames hold some of them back
-        return container, stream
-
-    def _shots(self, container: InputContainer, stream: VideoStream) -> Iterator[Frame]:
-        first: tuple[int, int] | None = None
-        high, wide = self.size or (0, 0)
-        base = stream.time_base
-        for number, frame in enumerate(container.decode(stream)):
-            shape = (frame.height, frame.width)
-            if first is None:
-                first, self.note = shape, stretched(self.name, shape, self.size)
-            if shape != first:
-                raise InputError(
-                    f"frame {number} of {self.name} is {shape[0]} x {shape[1]} pixels; expected "
-                    f"{first[0]} x {first[1]} as frame 0"
-                )
-            seconds = math.nan if frame.pts is None or base is None else float(frame.pts * base)
-            yield Frame(number, seconds, pixels_of(frame, Path(self.name), wide, high))
+        return av.open(address, "r", container_options=options, **settings)
 
 
 def _mode_is(path: str, test: Any) -> bool:

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from dejavu_torch.data.chain import Chain
+from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.frame_range import Chain, FrameRange, Selection
 from dejavu_torch.data.video import Video
 from dejavu_torch.resize import is_stretched, resize_frames
 from dejavu_torch.types import InputError, Traverse
 
 
-class Fitted(Traverse):
+class Fitted(Selection):
     """Frames brought to another shape (C,H,W): sizes are resized, colours made grey or grey ones repeated.
 
     Raises:
@@ -25,16 +25,12 @@ class Fitted(Traverse):
     def __init__(self, traverse: Traverse, shape: tuple[int, ...]) -> None:
         if len(traverse.frame_shape) != 3 or len(shape) != 3:
             raise InputError(f"{traverse.name} has no frames of the map's kind; expected frames")
-        self.traverse, self.shape = traverse, shape
-        self.name, self.length = traverse.name, traverse.length
-        self.place, self.cut = traverse.place, traverse.cut
-        self.seeks, self.sized = traverse.seeks, True
+        super().__init__(traverse, range(LARGEST if traverse.length is None else traverse.length))
+        self.shape, self.sized = shape, True
+        self.length, self.place, self.cut = traverse.length, traverse.place, traverse.cut
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        return map(self._fit, self.traverse.batches(min(size, self.traverse.batch_size(size))))
-
-    def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        return map(self._fit, self.traverse.between(start, stop))
+    def _read(self, frame: Tensor | range, size: int) -> Iterator[Tensor]:
+        return map(self._fit, super()._read(frame, self.traverse.batch_size(size)))
 
     def _fit(self, batch: Tensor) -> Tensor:
         channels, height, width = self.shape
@@ -53,15 +49,6 @@ class Fitted(Traverse):
 
     def identity(self) -> str:
         return f"{self.traverse.identity()} {' x '.join(map(str, self.shape))}"
-
-    def state(self, start: int, stop: int) -> str:
-        return self.traverse.state(start, stop)
-
-    def frame_name(self, i: int) -> str:
-        return self.traverse.frame_name(i)
-
-    def frame_time(self, i: int) -> float:
-        return self.traverse.frame_time(i)
 
 
 def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
@@ -101,8 +88,6 @@ def size_like(own: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, int]:
 
 def resize_like(frames: Tensor, shape: tuple[int, ...] | None) -> Tensor:
     """Frames (B,C,H,W) at the size of frames of a shape (C,H,W); others, and ready features, as they are."""
-    return (
-        frames
-        if frames.ndim != 4 or shape is None
-        else resize_frames(frames, size_like(frames.shape[2:], shape))
-    )
+    if frames.ndim != 4 or shape is None:
+        return frames
+    return resize_frames(frames, size_like(frames.shape[2:], shape))

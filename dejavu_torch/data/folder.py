@@ -20,16 +20,8 @@ from dejavu_torch.types import InputError
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 MOST_READ = 2**28  # pixels of an image, such as a long strip; a small file can claim any number
 ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
-FORMATS = (
-    "PNG",
-    "JPEG",
-    "BMP",
-    "DIB",
-    "TIFF",
-    "WEBP",
-    "PPM",
-    "GIF",
-)  # and no other, such as one that starts a program
+# and no other, such as one that starts a program
+FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF"
 BYTES_A_PIXEL = 24  # that reading takes at most: decoded, as an array, and as floats
 
 
@@ -54,17 +46,13 @@ class ImageFolder(IndexedTraverse):
         check_size(folder, width, height)
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
-        files = [
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() in SUFFIXES and file.is_file() and file.name[0] != "."
-        ]
-        if not files:
-            inner = next(
-                (f"; it has folders such as {file.name}" for file in folder.iterdir() if file.is_dir()), ""
-            )
+        inside = sorted(folder.iterdir(), key=lambda file: natural(file.name))
+        images = [file for file in inside if file.suffix.lower() in SUFFIXES and file.name[0] != "."]
+        self.files = [file for file in images if file.is_file()]
+        if not self.files:
+            names = [file.name for file in inside if file.is_dir()]
+            inner = f"; it has folders such as {names[0]}" if names else ""
             raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
-        self.files = sorted(files, key=lambda file: natural(file.name))
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
         self.length = len(self.files)

@@ -1,14 +1,18 @@
-"""Part of a traverse, and traverses whose frames can be read in any order."""
+"""Traverses whose frames can be read in any order, parts of a traverse, and several as one."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from itertools import accumulate
+from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST
-from dejavu_torch.data.selection import Selection
 from dejavu_torch.types import InputError, Traverse
 
 
@@ -36,6 +40,62 @@ class IndexedTraverse(Traverse):
             yield self.read(there[first : first + size])
 
 
+class Selection(Traverse):
+    """The frames of a traverse with these numbers; names, times and places follow.
+
+    Args:
+        frame: (n,) int64, never decreasing, or a range.
+
+    Convention: frames count from 0 again. A traverse that does not seek is read through once.
+
+    Example:
+        >>> from dejavu_torch.data.arrays import ArrayTraverse
+        >>> some = Selection(ArrayTraverse(torch.arange(9.0)[:, None]), torch.tensor([1, 2, 6]))
+        >>> torch.cat(list(some.batches(64))).flatten()
+        tensor([1., 2., 6.])
+    """
+
+    skips = True  # whether a gap is not read, if the traverse seeks
+
+    def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
+        self.traverse, self.frame = traverse, frame
+        self.name, self.length = traverse.name, len(frame)
+        self.seeks, self.sized = traverse.seeks, traverse.sized
+        if traverse.place is not None:
+            at = slice(frame.start, frame.stop, frame.step) if isinstance(frame, range) else frame
+            self.place = traverse.place[at].contiguous()
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        return self._read(self.frame, size)
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        return self._read(self.frame[start:stop], self.batch_size())
+
+    def _read(self, frame: Tensor | range, size: int) -> Iterator[Tensor]:
+        if not len(frame):
+            return
+        if isinstance(frame, range):
+            yield from self.traverse.select(frame, size)
+            return
+        whole = range(int(frame[0]), int(frame[-1]) + 1)
+        for run in runs(frame) if self.skips and self.traverse.seeks else [whole]:
+            yield from picked(self.traverse.select(run, size), run, frame, size)
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.traverse.frame_shape
+
+    def state(self, start: int, stop: int) -> str:
+        part = self.frame[start:stop]
+        return self.traverse.state(int(part[0]), int(part[-1]) + 1) if len(part) else ""
+
+    def frame_name(self, i: int) -> str:
+        return self.traverse.frame_name(int(self.frame[i]))
+
+    def frame_time(self, i: int) -> float:
+        return self.traverse.frame_time(int(self.frame[i]))
+
+
 class FrameRange(Selection):
     """The frames [start, stop) of a traverse, every step-th of them; names and positions follow.
 
@@ -51,7 +111,6 @@ class FrameRange(Selection):
             no such frames.
 
     Example:
-        >>> import torch
         >>> from dejavu_torch.data.arrays import ArrayTraverse
         >>> part = FrameRange(ArrayTraverse(torch.arange(6.0)[:, None]), start=1, stop=6, step=2)
         >>> part.length, next(part.batches(64)).flatten()
@@ -90,3 +149,121 @@ class FrameRange(Selection):
 
     def identity(self) -> str:
         return f"{self.frame} of {self.traverse.identity()}"
+
+
+class Chain(Traverse):
+    """The frames of several traverses, one behind the other: parts of one route.
+
+    Args:
+        traverses: at least one; all of frames of one size, or of features of one dimension.
+
+    Convention: a frame's name begins with that of its traverse: `morning/0001.png`. Where it truly was is
+        not known, as the traverses count for themselves.
+
+    Raises:
+        InputError: frames of different sizes.
+
+    Example:
+        >>> from dejavu_torch.data.arrays import ArrayTraverse
+        >>> parts = [ArrayTraverse(torch.zeros(3, 2)), ArrayTraverse(torch.ones(4, 2))]
+        >>> torch.cat(list(Chain(parts).between(2, 5)))[:, 0]
+        tensor([0., 1., 1.])
+    """
+
+    def __init__(self, traverses: Sequence[Traverse]) -> None:
+        self.traverses = list(traverses)
+        if not self.traverses:
+            raise InputError("a chain of no traverses; expected at least one")
+        first = self.traverses[0]
+        for other in self.traverses:
+            if other.frame_shape != first.frame_shape:
+                own, expected = (" x ".join(map(str, one.frame_shape)) for one in (other, first))
+                seen = f"{other.name} has frames of {own}"
+                raise InputError(f"{seen}; expected {expected} as {first.name}, which it follows")
+        self.name = " + ".join(one.name for one in self.traverses)
+        self.seeks = all(one.seeks for one in self.traverses)
+        self.sized = any(one.sized for one in self.traverses)
+        lengths = [one.length for one in self.traverses]
+        if None not in lengths:
+            self.length = sum(length or 0 for length in lengths)
+
+    @cached_property
+    def starts(self) -> list[int]:
+        """The frame with which each begins, and the number of all frames."""
+        return list(accumulate((one.count() for one in self.traverses), initial=0))
+
+    def count(self) -> int:
+        return self.starts[-1]
+
+    def batches(self, size: int) -> Iterator[Tensor]:
+        for traverse in self.traverses:
+            yield from traverse.batches(size)
+
+    def between(self, start: int, stop: int) -> Iterator[Tensor]:
+        for traverse, first, last in self._within(start, stop):
+            yield from traverse.between(first, last)
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.traverses[0].frame_shape
+
+    def identity(self) -> str:
+        return " + ".join(one.identity() for one in self.traverses)
+
+    def state(self, start: int, stop: int) -> str:
+        return " + ".join(traverse.state(first, last) for traverse, first, last in self._within(start, stop))
+
+    def frame_name(self, i: int) -> str:
+        traverse, i = self._at(i)
+        name = traverse.frame_name(i)
+        return name and f"{Path(traverse.name).name}/{name}"
+
+    def frame_time(self, i: int) -> float:
+        traverse, i = self._at(i)
+        return traverse.frame_time(i)
+
+    def _within(self, start: int, stop: int) -> Iterator[tuple[Traverse, int, int]]:
+        """Which frames of which traverses the frames [start, stop) are."""
+        for traverse, first, end in zip(self.traverses, self.starts, self.starts[1:], strict=False):
+            if max(start, first) < min(stop, end):
+                yield traverse, max(0, start - first), min(stop, end) - first
+
+    def _at(self, i: int) -> tuple[Traverse, int]:
+        """The traverse that frame i is of, and its number there."""
+        which = bisect_right(self.starts, i, hi=len(self.traverses)) - 1
+        return self.traverses[which], i - self.starts[which]
+
+
+def chained(traverses: Sequence[Traverse]) -> Traverse:
+    """Several traverses as one route; a single one as it is."""
+    return traverses[0] if len(traverses) == 1 else Chain(traverses)
+
+
+def parts_of(traverse: Traverse) -> list[Traverse]:
+    """What a traverse was chained of; itself where it was not."""
+    return traverse.traverses if isinstance(traverse, Chain) else [traverse]
+
+
+def picked(batches: Iterator[Tensor], span: range, frame: Tensor, size: int) -> Iterator[Tensor]:
+    """The frames with these numbers, never decreasing, out of batches of the frames of a span."""
+    start, stop = torch.searchsorted(frame, torch.tensor([span.start, span.stop])).tolist()
+    first, frame = span.start, frame[start:stop]
+    for batch in batches:
+        ready = int(torch.searchsorted(frame, first + len(batch)))
+        for part in frame[:ready].split(size) if ready else ():
+            yield batch[part - first]
+        first, frame = first + len(batch), frame[ready:]
+        if not len(frame):
+            return
+
+
+def runs(numbers: Tensor) -> list[range]:
+    """Increasing whole numbers as runs without gaps.
+
+    Example:
+        >>> runs(torch.tensor([1, 2, 3, 7]))
+        [range(1, 4), range(7, 8)]
+    """
+    last = torch.cat([numbers.diff() != 1, numbers.new_ones(min(1, len(numbers)), dtype=torch.bool)])
+    first = last.roll(1)  # after the last of one run the next begins
+    return [range(a, b + 1) for a, b in zip(numbers[first].tolist(), numbers[last].tolist(), strict=True)]

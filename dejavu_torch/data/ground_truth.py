@@ -1,16 +1,12 @@
-"""The ground truth: which reference frames each query may report.
-
-A new format of ground truth is one function that reads it and one line of `FORMATS`.
-"""
+"""The ground truth: which reference frames each query may report."""
 
 from __future__ import annotations
 
 import math
 import zipfile
 from collections.abc import Callable, Iterable
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +19,10 @@ from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse
 
 PAIRS_AT_ONCE = 2**20
+EXPECTED = (
+    "an integer offset such as 0, a .csv of query,place, an .npz with GThard or utm:25 for coordinates in "
+    "image names"
+)
 PLACE_BYTES = 32  # of each place in a table of right places, with what is computed from it
 
 
@@ -116,8 +116,12 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
         distance = torch.cdist(part, reference.double(), compute_mode="donot_use_mm_for_euclid_dist")
         near = distance <= radius
         check_table(len(query), int(near.sum(1).max()))
-        rows += _columns(near)
+        rows += _true_columns(near)
     return padded(rows)
+
+
+def _true_columns(which: Tensor) -> list[Tensor]:
+    return [row.nonzero()[:, 0] for row in which]
 
 
 def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
@@ -147,57 +151,26 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
     return truth._replace(positives=place_of(truth.positives), ignored=place_of(truth.ignored))
 
 
-# what is read -------------------------------------------------------------------------------------------
-
-
-class Request(NamedTuple):
-    """What a ground truth is needed for; see `find_ground_truth`.
-
-    numbers: (Q,) int64, the frame of each query. every: whether they are all frames of their source.
-    """
-
-    reference: Traverse | None
-    query: Traverse | None
-    frames: int | None
-    numbers: Tensor
-    every: bool
-    interpolate: bool
-    resampled: bool
-
-    def numbers_below(self, count: int) -> Tensor:
-        """The numbers, if the query's traverse has so many frames."""
-        last = int(self.numbers.max())
-        if last >= count:
-            raise InputError(f"there is a query {last}; expected numbers below {count}")
-        return self.numbers
-
-
-class Format(NamedTuple):
-    """One way to give a ground truth as text.
-
-    expected: its name in messages. parse: what a text says, None if it is of another format. read: the ground
-    truth from that. describe: in words.
-    """
-
-    expected: str
-    parse: Callable[[str], Any]
-    read: Callable[[Any, Request], GroundTruth]
-    describe: Callable[[Any], str] = str
-
-
-def check_ground_truth(truth: str, interpolate: bool = False) -> tuple[Format, Any]:
-    """The format of a text and what it says; refuses one that is no ground truth early, before long work.
+def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | Path:
+    """What a text says: an offset, a radius in metres, or a file; refused early, before long work.
 
     Raises:
-        InputError: none of `FORMATS`, a file that cannot be opened, or interpolation of anything but a .csv.
+        InputError: none of these, a file that cannot be opened, or interpolation of anything but a .csv.
     """
-    for format in FORMATS:
-        said = format.parse(truth)
-        if said is not None:
-            if interpolate and format.read is not read_table:
-                raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
-            return format, said
-    raise InputError(f"truth {truth!r} is not known; expected {_expected()}")
+    suffix = Path(truth).suffix.lower()
+    said: int | float | Path | None = offset_of(truth)
+    if suffix in (".csv", ".npz"):
+        check_regular(Path(truth), EXPECTED)
+        said = Path(truth)
+    elif said is None:
+        name, colon, radius = truth.partition(":")
+        metres = as_number(radius) if colon else 25.0
+        if name != "utm" or metres is None or metres < 0:
+            raise InputError(f"truth {truth!r} is not known; expected {EXPECTED}")
+        said = metres
+    if interpolate and suffix != ".csv":
+        raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
+    return said
 
 
 def find_ground_truth(
@@ -246,28 +219,45 @@ def find_ground_truth(
         [[-1], [0], [1]]
     """
     numbers, every = (torch.arange(queries), True) if isinstance(queries, int) else (queries, False)
-    request = Request(reference, query, frames, numbers, every, interpolate, resampled)
     if truth is None:
-        return _default(request, aligned)
-    format, said = check_ground_truth(truth, interpolate)
-    found = format.read(said, request)
+        if reference is None or query is None:
+            return None
+        if reference.place is not None and query.place is not None:
+            position = query.place[_below(numbers, len(query.place))]
+            return as_ground_truth(position_truth(reference.place, position))
+        count = len(numbers) if every else query.length
+        if resampled or count is None or count != frames:
+            return None
+        alike = aligned or say_aligned(reference, query, count)
+        return as_ground_truth(offset_truth(numbers, frames)) if alike else None
+    said = check_ground_truth(truth, interpolate)
+    if isinstance(said, int):
+        found = as_ground_truth(offset_truth(numbers, frames, said))
+    elif isinstance(said, float):
+        if reference is None or query is None:
+            raise InputError(f"truth utm:{said:g} lies in the names of images; expected both traverses")
+        coordinates = utm_coordinates(query)
+        coordinates = coordinates[_below(numbers, len(coordinates))]
+        found = as_ground_truth(near_truth(utm_coordinates(reference), coordinates, said))
+    elif said.suffix.lower() == ".csv":
+        length = query.length if query is not None and resampled else None
+        found = _read_table(said, numbers, frames, length, interpolate, resampled)
+    else:
+        found = _read_matrices(said, numbers, frames, every)
     if not (found.positives >= 0).any():
-        raise InputError(f"no query has a right answer: {format.describe(said)}")
+        if isinstance(said, int):
+            last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
+            expected = f"an offset from {-int(numbers.max())}{last}"
+            raise InputError(f"no query has a right answer with truth {said}; expected {expected}")
+        raise InputError(f"no query has a right answer: {describe_ground_truth(truth)}")
     return found
 
 
-def _default(request: Request, aligned: bool) -> GroundTruth | None:
-    reference, query, frames = request.reference, request.query, request.frames
-    if reference is None or query is None:
-        return None
-    if reference.place is not None and query.place is not None:
-        position = query.place[request.numbers_below(len(query.place))]
-        return as_ground_truth(position_truth(reference.place, position))
-    count = len(request.numbers) if request.every else query.length
-    if request.resampled or count is None or count != frames:
-        return None
-    alike = aligned or say_aligned(reference, query, count)
-    return as_ground_truth(offset_truth(request.numbers, frames)) if alike else None
+def _below(numbers: Tensor, count: int) -> Tensor:
+    last = int(numbers.max())
+    if last >= count:
+        raise InputError(f"there is a query {last}; expected numbers below {count}")
+    return numbers
 
 
 def say_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
@@ -305,39 +295,23 @@ def describe_ground_truth(truth: str | None, interpolate: bool = False, position
     if truth is None:
         carried = "the positions that both traverses carry"
         return carried if positions else "place = query, as the sources say themselves"
-    format, said = check_ground_truth(truth)
-    words = format.describe(said)
-    return f"{words}, interpolated" if interpolate else words
+    said = check_ground_truth(truth)
+    if isinstance(said, int):
+        return "place = query" + (f" {'-' if said < 0 else '+'} {abs(said)}" if said else "")
+    if isinstance(said, float):
+        return f"within {said:g} m by the coordinates in image names"
+    return f"{truth}, interpolated" if interpolate else truth
 
 
 def offset_of(truth: str | None, positions: bool = False) -> int | None:
     """The offset of a ground truth place = query + offset, as of `describe_ground_truth`; None for others."""
     if truth is None:
         return None if positions else 0
-    return _offset(truth)
-
-
-# offsets and coordinates --------------------------------------------------------------------------------
-
-
-def read_offset(offset: int, request: Request) -> GroundTruth:
-    """An integer: place = query + offset."""
-    numbers, frames = request.numbers, request.frames
-    positives = offset_truth(numbers, frames, offset)
-    if not (positives >= 0).any():
-        last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
-        expected = f"an offset from {-int(numbers.max())}{last}"
-        raise InputError(f"no query has a right answer with truth {offset}; expected {expected}")
-    return as_ground_truth(positives)
-
-
-def read_coordinates(radius: float, request: Request) -> GroundTruth:
-    """`utm:25`: every reference frame within 25 metres."""
-    if request.reference is None or request.query is None:
-        raise InputError(f"truth utm:{radius:g} lies in the names of images; expected both traverses")
-    query = utm_coordinates(request.query)
-    query = query[request.numbers_below(len(query))]
-    return as_ground_truth(near_truth(utm_coordinates(request.reference), query, radius))
+    try:
+        offset = int(truth)
+    except ValueError:
+        return None
+    return offset if abs(offset) < LARGEST else None
 
 
 def utm_coordinates(traverse: Traverse) -> Tensor:
@@ -349,35 +323,29 @@ def utm_coordinates(traverse: Traverse) -> Tensor:
     names = [traverse.frame_name(i) for i in range(traverse.length or 0)]
     if not any(names):
         raise InputError(f"{traverse.name} has no image names; expected folders of images for truth utm")
-    rows = []
-    for name in names:
-        row = [as_number(part) for part in name.split("@")[1:3]]
+    rows = [[as_number(part) for part in name.split("@")[1:3]] for name in names]
+    for name, row in zip(names, rows, strict=True):
         if len(row) != 2 or None in row:
-            raise InputError(
-                f"{traverse.name}: {name} has no UTM coordinates; expected @easting@northing@...@.jpg"
-            )
-        rows.append(row)
+            seen = f"{traverse.name}: {name} has no UTM coordinates"
+            raise InputError(f"{seen}; expected @easting@northing@...@.jpg")
     return torch.tensor(rows, dtype=torch.float64)
 
 
-# tables -------------------------------------------------------------------------------------------------
-
-
-def read_table(truth: str, request: Request) -> GroundTruth:
-    """A csv of `query,place[,place...]`."""
-    path, numbers = Path(truth), request.numbers
-    listed = _listed(path, request.frames, request.interpolate)
+def _read_table(
+    path: Path, numbers: Tensor, frames: int | None, length: int | None, interpolate: bool, resampled: bool
+) -> GroundTruth:
+    """A csv of `query,place[,place...]`; `length`: of a query traverse that is resampled."""
+    listed = _listed(path, frames, interpolate)
     first, last = min(listed), max(listed)
     queries = numbers.tolist()
-    if request.interpolate:
+    if interpolate:
         knots = sorted(listed)
         between = np.interp(numbers.numpy(), knots, [listed[query][0] for query in knots]).tolist()
         places = {query: [at] for query, at in zip(queries, between, strict=True) if first <= query <= last}
     else:
-        length = None if request.query is None else request.query.length
-        if request.resampled and length is not None and last >= length:
+        if length is not None and last >= length:
             raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
-        places = _at_shown(listed, numbers) if request.resampled else listed
+        places = _at_shown(listed, numbers) if resampled else listed
     judged = torch.tensor([query in places for query in queries])
     if not judged.any():
         wanted = f"{int(numbers.min())} to {int(numbers.max())}"
@@ -402,11 +370,27 @@ def _at_shown(listed: dict[int, list[float]], frames: Tensor) -> dict[int, list[
 
 def _listed(path: Path, frames: int | None, interpolate: bool) -> dict[int, list[float]]:
     """The places of each query that a csv lists."""
+    rows = read_rows(path, "lines of query,place")
+    if rows and all(as_number(cell) is None for cell in rows[0][1] if cell):
+        number, names = rows.pop(0)
+        first, *others = names
+        # another column, such as a distance, would count as a right place
+        if first.lower() != "query" or not all(name.lower().startswith("place") for name in others if name):
+            raise InputError(
+                f"{path}, line {number}: columns {','.join(names)}; expected query,place[,place...]"
+            )
     listed: dict[int, list[float]] = {}
-    for line, cells in _table_rows(path):
+    for line, cells in rows:
         where = f"{path}, line {line}"
-        query, *found = (_frame_number(cell, where) for cell in cells)
-        found = [place for place in found if place != -1]
+        while not cells[-1]:
+            del cells[-1]
+        values = []
+        for cell in cells:
+            value = as_number(cell)
+            if value is None:
+                raise InputError(f"{where}: {cell!r} is no frame number; expected query,place")
+            values.append(value)
+        query, found = values[0], [place for place in values[1:] if place != -1]
         if query < 0 or query % 1:
             raise InputError(f"{where}: query {cells[0]}; expected a whole number of at least 0")
         if query in listed:
@@ -426,57 +410,15 @@ def _listed(path: Path, frames: int | None, interpolate: bool) -> dict[int, list
     return listed
 
 
-def _table_rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Number and cells of each line that is not blank, without the header."""
-    rows = read_rows(path, "lines of query,place")
-    for _, cells in rows:
-        while not cells[-1]:
-            del cells[-1]
-    if rows and all(as_number(cell) is None for cell in rows[0][1]):
-        number, names = rows.pop(0)
-        first, *others = [name.lower() for name in names]
-        # another column, such as a distance, would count as a right place
-        if first != "query" or any(name and not name.startswith("place") for name in others):
-            raise InputError(
-                f"{path}, line {number}: columns {','.join(names)}; expected query,place[,place...]"
-            )
-    return rows
-
-
-def _frame_number(cell: str, where: str) -> float:
-    value = as_number(cell)
-    if value is None:
-        raise InputError(f"{where}: {cell!r} is no frame number; expected query,place")
-    return value
-
-
 def _rounded(place: float) -> int:
     return math.floor(place + 0.5)
 
 
-# matrices -----------------------------------------------------------------------------------------------
-
-
-def read_matrices(truth: str, request: Request) -> GroundTruth:
+def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool) -> GroundTruth:
     """An npz of the matrices (reference frames, query frames) GThard and/or GTsoft."""
-    path = Path(truth)
-    matrices = _load_matrices(path, request)
-    if len({matrix.shape for matrix in matrices.values()}) > 1:
-        raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
-    hard, *soft = [torch.from_numpy(m[:, request.numbers.numpy()].astype(bool)).T for m in matrices.values()]
-    found = as_ground_truth(padded(_columns(hard)))
-    return found._replace(ignored=padded(_columns(soft[0] & ~hard))) if soft else found
-
-
-def _columns(which: Tensor) -> list[Tensor]:
-    """(Q,N) bool -> Q of (n,) int64, the columns that are true in each row."""
-    return [row.nonzero()[:, 0] for row in which]
-
-
-def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
-    """GThard and GTsoft in this order, those that are there; nothing is read of one that does not fit."""
     expected = "boolean matrices GThard and/or GTsoft"
-    found: dict[str, np.ndarray] = {}
+    matrices: list[Tensor] = []
+    shapes: set[tuple[int, ...]] = set()
     with reading(path, "is no whole .npz file of arrays", expected), zipfile.ZipFile(path) as archive:
         there = [name.removesuffix(".npy") for name in archive.namelist()]
         for name in ("GThard", "GTsoft"):
@@ -487,24 +429,32 @@ def _load_matrices(path: Path, request: Request) -> dict[str, np.ndarray]:
                 raise ValueError("another compression than numpy's")  # a few bytes of it can be endless
             with archive.open(entry) as file:
                 shape, kind, by_columns, start = read_header(file.read(HEADER))
-            _check_shape(f"{path}: {name} is {shape} {kind}", shape, kind, request)
+            _check_shape(f"{path}: {name} is {shape} {kind}", shape, kind, numbers, frames, every)
             count = math.prod(shape)
             if start + count * kind.itemsize != entry.file_size:
                 raise ValueError(f"{name} is {shape} {kind} in {entry.file_size} bytes")
             check_room(2.0 * entry.file_size + 16.0 * count, f"{path}: {name} {shape} {kind}")
             with archive.open(entry) as file:  # no more than it says, whatever it unpacks to
-                numbers = np.frombuffer(file.read(entry.file_size), kind, count, start)
-            if not np.isfinite(numbers).all():
+                values = np.frombuffer(file.read(entry.file_size), kind, count, start)
+            if not np.isfinite(values).all():
                 raise ValueError(f"{name} holds numbers that are not finite")
-            found[name] = numbers.reshape(shape, order="F" if by_columns else "C")
-    if not found:
+            matrix = values.reshape(shape, order="F" if by_columns else "C")[:, numbers.numpy()]
+            shapes.add(shape)
+            matrices.append(torch.from_numpy(matrix.astype(bool)).T)
+    if not matrices:
         raise InputError(f"{path} holds {', '.join(there) or 'nothing'}; expected {expected}")
-    return found
+    hard, *soft = matrices
+    if len(shapes) > 1:
+        raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
+    found = as_ground_truth(padded(_true_columns(hard)))
+    return found._replace(ignored=padded(_true_columns(soft[0] & ~hard))) if soft else found
 
 
-def _check_shape(seen: str, shape: tuple[int, ...], kind: np.dtype, request: Request) -> None:
+def _check_shape(
+    seen: str, shape: tuple[int, ...], kind: np.dtype, numbers: Tensor, frames: int | None, every: bool
+) -> None:
     """Refuse what is no matrix (reference frames, query frames), and say if it is transposed."""
-    frames, count = request.frames, int(request.numbers.max()) + 1
+    count = int(numbers.max()) + 1
     rows = "reference frames" if frames is None else frames
     wanted = f"expected a matrix of ({rows}, {count}), a column a query frame"
     if len(shape) != 2 or kind.kind not in "biuf":
@@ -512,55 +462,9 @@ def _check_shape(seen: str, shape: tuple[int, ...], kind: np.dtype, request: Req
 
     def fits(rows: int, columns: int) -> bool:
         # queries that are given by number may be some of those in the matrix
-        enough = columns == count or (columns > count and not request.every)
+        enough = columns == count or (columns > count and not every)
         return enough and frames in (None, rows)
 
     # as many rows as queries speak for a transposed matrix if the reference is not known
     if not fits(*shape) or (frames is None and shape[1] != count == shape[0]):
         raise InputError(f"{seen}; {wanted}{'; transposed it fits' if fits(*shape[::-1]) else ''}")
-
-
-# the registry -------------------------------------------------------------------------------------------
-
-
-def _offset(truth: str) -> int | None:
-    try:
-        offset = int(truth)
-    except ValueError:
-        return None
-    return offset if abs(offset) < LARGEST else None
-
-
-def _radius(truth: str) -> float | None:
-    name, colon, radius = truth.partition(":")
-    metres = as_number(radius) if colon else 25.0
-    return metres if name == "utm" and metres is not None and metres >= 0 else None
-
-
-def _file(suffix: str, truth: str) -> str | None:
-    """The text if it names a file of a kind; refuses one that cannot be opened."""
-    if Path(truth).suffix.lower() != suffix:
-        return None
-    check_regular(Path(truth), _expected())
-    return truth
-
-
-def _describe_offset(offset: int) -> str:
-    return "place = query" + (f" {'-' if offset < 0 else '+'} {abs(offset)}" if offset else "")
-
-
-def _describe_radius(radius: float) -> str:
-    return f"within {radius:g} m by the coordinates in image names"
-
-
-def _expected() -> str:
-    *first, last = [format.expected for format in FORMATS]
-    return f"{', '.join(first)} or {last}"
-
-
-FORMATS = (
-    Format("an integer offset such as 0", _offset, read_offset, _describe_offset),
-    Format("a .csv of query,place", partial(_file, ".csv"), read_table),
-    Format("an .npz with GThard", partial(_file, ".npz"), read_matrices),
-    Format("utm:25 for coordinates in image names", _radius, read_coordinates, _describe_radius),
-)

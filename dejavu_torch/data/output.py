@@ -10,10 +10,9 @@ import stat
 import tempfile
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
 
 try:
     import fcntl
@@ -91,10 +90,8 @@ def make_output_folder(path: Path) -> None:
         InputError: see `check_output_folder`, or the system refuses it.
     """
     check_output_folder(path)
-    try:
+    with _refusing(path, "cannot be made a folder"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path} cannot be made a folder: {error.strerror}; expected a new path") from error
 
 
 def remove_empty_folders(path: Path) -> None:
@@ -128,7 +125,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         _finish(folder / path.name, path)
         with _signals_later():
             (folder / path.name).replace(_target(path))
-        _sync_names(_target(path).parent)
+        with suppress(OSError):
+            _sync(_target(path).parent)
 
 
 @contextmanager
@@ -163,7 +161,7 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
         with _signals_later():
             if not path.is_dir():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                mode = _mode_of_new(folder, os.mkdir, os.rmdir)
+                mode = _mode_of_new(folder)
                 with suppress(OSError):  # another process made one meanwhile
                     folder.rename(path)
                     path.chmod(mode)  # no sooner: one that may not be written in could not be moved
@@ -172,7 +170,8 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
             for name in {*earlier} - {*names}:
                 (path / name).unlink(missing_ok=True)
         for place in (path, path.parent):
-            _sync_names(place)
+            with suppress(OSError):
+                _sync(place)
 
 
 def remove_temporaries() -> None:
@@ -195,53 +194,43 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
         >>> folder.exists()
         False
     """
-    _remove_abandoned(parent)
+    # the name, which a folder has from its first moment on, says that it is ours, and of this host: locks of
+    # a network file system may hold on one host only
+    for left in parent.glob(f"{HERE}{'?' * 8}"):  # of tempfile
+        if left.is_dir() and not left.is_symlink():
+            with _locked(left, wait=False) as abandoned:  # the system took the lock of a process it killed
+                if abandoned:
+                    shutil.rmtree(left, ignore_errors=True)
     while True:
         folder = Path(tempfile.mkdtemp(prefix=HERE, dir=parent))
         _temporary.add(folder)
         with suppress(FileNotFoundError):  # as below
             folder.chmod(0o700)  # whatever the umask
-        lock = _locked(folder)
-        if folder.is_dir():  # else another took it for abandoned before it was locked
-            break
-        _release(lock)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        _temporary.discard(folder)
-        _release(lock)
-
-
-def _remove_abandoned(parent: Path) -> None:
-    """Remove what processes of this host that were killed left: the system took their locks.
-
-    The name, which a folder has from its first moment on, says that it is ours, and of this host: locks of a
-    network file system may hold on one host only.
-    """
-    for folder in parent.glob(f"{HERE}{'?' * 8}"):  # of tempfile
-        if folder.is_dir() and not folder.is_symlink():
-            lock = _locked(folder, wait=False)
-            if lock is not None:
+        with _locked(folder):
+            if not folder.is_dir():  # another took it for abandoned before it was locked
+                continue
+            try:
+                yield folder
+            finally:
                 shutil.rmtree(folder, ignore_errors=True)
-            _release(lock)
+                _temporary.discard(folder)
+            return
 
 
-def _locked(folder: Path, wait: bool = True) -> int | None:
-    """A lock on a folder until it is released; None where another has it, or the system knows none."""
-    lock = None
+@contextmanager
+def _locked(folder: Path, wait: bool = True) -> Iterator[bool]:
+    """Lock a folder: whether it is, and not where another has it, or the system knows no locks."""
+    place: int | None = None
+    locked = False
     try:
-        lock = os.open(folder, os.O_RDONLY)
-        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except (OSError, AttributeError):
-        _release(lock)
-        return None
-    return lock
-
-
-def _release(lock: int | None) -> None:
-    if lock is not None:
-        os.close(lock)
+        with suppress(OSError, AttributeError):
+            place = os.open(folder, os.O_RDONLY)
+            fcntl.flock(place, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            locked = True
+        yield locked
+    finally:
+        if place is not None:
+            os.close(place)
 
 
 def _finish(written: Path, path: Path) -> None:
@@ -250,12 +239,8 @@ def _finish(written: Path, path: Path) -> None:
     Its owner as well, where that is allowed.
     """
     written.chmod(0o600)  # whatever the umask
-    file = os.open(written, os.O_RDONLY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
-    mode = _mode_of_new(written.parent, Path.touch, os.unlink)  # some writers make private files
+    _sync(written)
+    mode = _mode_of_new(written.parent) & 0o666  # some writers make private files
     with suppress(FileNotFoundError):
         old = path.stat()
         mode = stat.S_IMODE(old.st_mode)
@@ -264,29 +249,24 @@ def _finish(written: Path, path: Path) -> None:
     written.chmod(mode)
 
 
-def _sync_names(folder: Path) -> None:
-    """Have the disk hold the names in a folder, where the system can be asked to."""
-    with suppress(OSError):
-        names = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(names)
-        finally:
-            os.close(names)
+def _sync(path: Path) -> None:
+    """Have the disk hold a file, or the names in a folder where the system can be asked to."""
+    place = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(place)
+    finally:
+        os.close(place)
 
 
 @contextmanager
 def _signals_later() -> Iterator[None]:
     """Signals that a process may handle are handled behind the block, which is short."""
     came: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        came.append(number)
-
     ours = threading.current_thread() is threading.main_thread()  # the only one that handles signals
     kept = {number: signal.getsignal(number) for number in SIGNALS if ours}
     kept = {number: handler for number, handler in kept.items() if callable(handler)}
     for number in kept:
-        signal.signal(number, note)
+        signal.signal(number, lambda number, _: came.append(number))
     try:
         yield
     finally:
@@ -329,10 +309,10 @@ def _check_name(path: Path) -> None:
         )
 
 
-def _mode_of_new(folder: Path, make: Callable[[Path], None], remove: Callable[[Path], None]) -> int:
-    """The mode of what is made; asking the system for its mask would change that for a moment."""
+def _mode_of_new(folder: Path) -> int:
+    """The mode of a folder that is made; asking the system for its mask would change that for a moment."""
     fresh = Path(tempfile.mktemp(dir=folder))  # a name that no file in it has; the folder is our own
-    make(fresh)
-    mode = stat.S_IMODE(fresh.stat().st_mode)
-    remove(fresh)
+    fresh.mkdir()
+    mode = fresh.stat().st_mode & 0o777
+    fresh.rmdir()
     return mode

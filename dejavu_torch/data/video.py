@@ -84,13 +84,8 @@ class Video(Traverse):
         batch: list[np.ndarray] = []
         with closing(self._frames()) as decoded:
             for i, frame in enumerate(decoded):
-                shape = (frame.height, frame.width)
-                first = first or shape
-                if shape != first:
-                    raise InputError(
-                        f"frame {i} of {self.name} is {shape[0]} x {shape[1]} pixels; "
-                        f"expected {first[0]} x {first[1]} as frame 0"
-                    )
+                first = first or (frame.height, frame.width)
+                check_alike(self.name, i, frame, first)
                 if i in frames:
                     batch.append(self._pixels(frame))
                 if len(batch) == size:
@@ -153,7 +148,7 @@ class Video(Traverse):
         packets = 0
         try:
             with self._open() as (container, stream):
-                base = float("nan") if stream.time_base is None else stream.time_base
+                base = stream.time_base
                 avi = container.format.name == "avi"
                 # packets are in decoding order; .avi stores no other: its decoded frames carry a wrong one
                 in_order = decode and not avi
@@ -164,14 +159,13 @@ class Video(Traverse):
                     if packet.is_corrupt:
                         raise self._broken(len(seconds), "the data are incomplete")
                     if not decode:
-                        seconds += (
-                            [_seconds(packet.pts, base)] if packet.size and not packet.is_discard else []
-                        )
+                        if packet.size and not packet.is_discard:
+                            seconds.append(seconds_of(packet.pts, base))
                         continue
                     for frame in packet.decode():
                         if frame.is_corrupt:
                             raise self._broken(len(seconds), "the picture is damaged")
-                        seconds.append(_seconds(frame.pts, base))
+                        seconds.append(seconds_of(frame.pts, base))
                         yield frame
                 if (avi and packets < len(stream.index_entries)) or len(seconds) < (self.length or 0):
                     raise self._broken(len(seconds), "frames are missing")
@@ -207,7 +201,6 @@ class Video(Traverse):
     @contextmanager
     def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
         import av
-        from av.stream import Disposition
 
         options: dict[str, Any] = {"metadata_errors": "replace"}
         options["container_options"] = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
@@ -217,19 +210,32 @@ class Video(Traverse):
             # "file:" so that a colon in the name is not taken for a protocol
             container = av.open(f"file:{self.path}", "r", **options)
         with container:
-            stream: Any = container.streams.best("video")
-            if stream is None or stream.disposition & Disposition.attached_pic:  # the cover of a song
-                raise InputError(f"{self.name} has no video stream; expected a video")
-            if stream.codec_context is None:
-                raise InputError(f"{self.name} has a codec that cannot be decoded; expected such as H.264")
-            check_pixels(self.path, stream.codec_context.height, stream.codec_context.width, MOST_PIXELS)
-            # a frame may be of another size than the stream
-            stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
-            stream.thread_type = "AUTO"
-            yield container, stream
+            yield container, stream_of(container, self.name, "a video", "AUTO")
 
     def _broken(self, frame: int, why: str) -> InputError:
         return InputError(f"{self.name} is broken near frame {frame}: {why}; expected a whole video file")
+
+
+def stream_of(container: InputContainer, name: str, expected: str, threads: str) -> Any:
+    """The video stream of what FFmpeg opened; `name` and `expected` are for messages."""
+    from av.stream import Disposition
+
+    stream: Any = container.streams.best("video")
+    # the cover of a song is no video
+    if stream is None or stream.disposition & Disposition.attached_pic or stream.codec_context is None:
+        raise InputError(f"{name} has no video stream that can be decoded; expected {expected}")
+    check_pixels(Path(name), stream.codec_context.height, stream.codec_context.width, MOST_PIXELS)
+    # a frame may be of another size than the stream
+    stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
+    stream.thread_type = threads
+    return stream
+
+
+def check_alike(name: str, number: int, frame: VideoFrame, first: tuple[int, int]) -> None:
+    """Refuse a frame of another size than the first, (height, width)."""
+    if (frame.height, frame.width) != first:
+        seen = f"frame {number} of {name} is {frame.height} x {frame.width} pixels"
+        raise InputError(f"{seen}; expected {first[0]} x {first[1]} as frame 0")
 
 
 def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) -> np.ndarray:
@@ -247,8 +253,9 @@ def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) ->
     return np.rot90(frame.reformat(width, height, "rgb24", interpolation=how).to_ndarray(), turns)
 
 
-def _seconds(stamp: int | None, base: Fraction | float) -> float:
-    return float("nan" if stamp is None else stamp * base)
+def seconds_of(stamp: int | None, base: Fraction | None) -> float:
+    """The seconds of a timestamp; NaN where there is none."""
+    return math.nan if stamp is None or base is None else float(stamp * base)
 
 
 def _as_tensor(frames: list[np.ndarray]) -> Tensor:

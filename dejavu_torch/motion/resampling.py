@@ -8,9 +8,9 @@ from hashlib import blake2b
 
 from torch import Tensor
 
+from dejavu_torch.data.frame_range import Selection, picked
 from dejavu_torch.data.ground_truth import GroundTruth, find_ground_truth
 from dejavu_torch.data.positions import NEAR, shown_frames
-from dejavu_torch.data.selection import Selection, picked
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError, Traverse
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -45,18 +44,6 @@ def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path)
     assert found.dtype == expected.dtype
     assert torch.equal(found, expected)
     assert traverse.length == 7
-
-
-@pytest.mark.parametrize("batch", [1, 2, 3, 7, 100])
-@pytest.mark.parametrize(
-    "values", [GREY, COLOUR, FRAMES, FEATURES], ids=["grey", "colour", "float", "features"]
-)
-def test_the_batch_size_changes_nothing(values: np.ndarray, batch: int) -> None:
-    traverse = ArrayTraverse(values)
-    sizes = [len(part) for part in traverse.batches(batch)]
-    assert max(sizes) <= batch
-    assert torch.equal(all_of(traverse, batch), all_of(traverse))
-    assert torch.equal(all_of(traverse, batch), all_of(traverse, batch)), "a second reading differs"
 
 
 def test_a_batch_is_a_copy_of_a_file(tmp_path: Path) -> None:
@@ -109,13 +96,6 @@ def test_a_file_that_is_no_array_is_refused(tmp_path: Path, content: bytes) -> N
         read_array(path)
 
 
-def test_an_archive_named_npy_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", FEATURES)
-    path = (tmp_path / "a.npz").rename(tmp_path / "a.npy")
-    with refused(str(path), "expected frames"):
-        read_array(path)
-
-
 def test_a_truncated_array_is_refused_at_any_length(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     np.save(path, FEATURES)
@@ -136,18 +116,6 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
     with refused(str(path), "no whole .npy array"):
         read_array(path)
     assert not (tmp_path / "ran").exists()
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with refused("missing.npy", "expected frames"):
-        read_array(tmp_path / "missing.npy")
-
-
-@pytest.mark.parametrize(("start", "stop"), [(0, 5), (60, 140), (64, 128), (199, 200), (190, 400), (7, 7)])
-def test_frames_between_are_those_frames(start: int, stop: int) -> None:
-    clip = torch.rand(200, 1, 2, 2)
-    parts = list(ArrayTraverse(clip).between(start, stop))
-    assert torch.equal(torch.cat([clip[:0], *parts]), clip[start:stop])
 
 
 def written(path: Path, header: str, body: bytes = bytes(256), version: int = 1) -> Path:
@@ -226,9 +194,3 @@ def test_float_frames_of_a_file_lie_from_0_to_1(tmp_path: Path, bad: float) -> N
     assert len(next(traverse.batches(5))) == 5
     with refused("a.npy", "frame 5", "expected 0 to 1"):
         all_of(traverse, 3)
-
-
-def test_a_fifo_is_no_array(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.npy")
-    with refused("a.npy", "no regular file"):
-        read_array(tmp_path / "a.npy")

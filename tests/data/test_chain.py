@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from dejavu_torch import types
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.chain import Chain, chained
-from dejavu_torch.data.selection import Selection, runs
+from dejavu_torch.data.frame_range import Chain, Selection, chained, runs
 from dejavu_torch.data.source import open_source
 from dejavu_torch.types import Traverse
 

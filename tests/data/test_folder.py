@@ -50,19 +50,6 @@ def with_alpha(pixels: np.ndarray) -> np.ndarray:
         (Image.fromarray(COLOUR), "a.PPM", COLOUR / 255),
         (Image.fromarray(GREY), "a.pgm", GREY[..., None] / 255),
     ],
-    ids=[
-        "grey",
-        "colour",
-        "alpha",
-        "grey-alpha",
-        "16-bit",
-        "16-bit-tif",
-        "1-bit",
-        "palette",
-        "bmp",
-        "ppm",
-        "pgm",
-    ],
 )
 def test_pixel_formats(image: Image.Image, name: str, expected: np.ndarray, tmp_path: Path) -> None:
     image.save(tmp_path / name)
@@ -96,48 +83,34 @@ def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
     assert torch.equal(all_of(ImageFolder(tmp_path))[:, 0, 0, 0] * 255, torch.arange(9.0))
 
 
-def test_names_that_begin_with_numbers_and_names_that_do_not(tmp_path: Path) -> None:
-    write(tmp_path, "10.png", "9.png", "a.png", "007.png", "7.png")
-    assert [file.name for file in ImageFolder(tmp_path).files] == [
-        "007.png",
-        "7.png",
-        "9.png",
-        "10.png",
-        "a.png",
-    ]
-
-
-@pytest.mark.parametrize("batch", [1, 2, 4, 5, 100])
-def test_the_batch_size_changes_nothing(tmp_path: Path, batch: int) -> None:
-    write(tmp_path, *(f"{j}.png" for j in range(5)))
-    folder = ImageFolder(str(tmp_path))
-    assert folder.length == 5
-    assert max(len(part) for part in folder.batches(batch)) <= batch
-    assert torch.equal(all_of(folder, batch), all_of(folder))
-
-
 def test_other_files_and_folders_are_passed_over(tmp_path: Path) -> None:
     write(tmp_path, "1.png", "2.png")
     (tmp_path / "truth.csv").write_text("query,place")
     (tmp_path / "3.png").mkdir()
     assert ImageFolder(tmp_path).length == 2
+    assert [ImageFolder(tmp_path).frame_name(i) for i in range(2)] == ["1.png", "2.png"]
 
 
-def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
-    with refused("missing", "expected a folder"):
-        ImageFolder(tmp_path / "missing")
-
-
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    write(tmp_path, "1.png")
-    with refused("1.png", "expected a folder"):
-        ImageFolder(tmp_path / "1.png")
-
-
-def test_a_folder_without_images_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    with refused(str(tmp_path), "no images", "expected"):
-        ImageFolder(tmp_path)
+@pytest.mark.parametrize(
+    ("name", "given", "words"),
+    [
+        ("missing", (), ("missing", "expected a folder")),
+        ("empty", (), ("empty", "holds no images", "expected files such as .png")),
+        (".", (), ("holds no images", "it has folders such as empty")),
+        ("full", (-1, 0), ("width=-1", "expected width and height of at least 0")),
+        ("full", (10**12, 0), ("expected", "at most")),
+        ("full", (10**5, 10**5), ("expected", "at most")),
+    ],
+)
+def test_what_is_no_folder_of_images_and_sizes_that_no_frame_has(
+    tmp_path: Path, name: str, given: tuple[int, ...], words: tuple[str, ...]
+) -> None:
+    for folder in ("empty", "full"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "empty" / "notes.txt").touch()
+    write(tmp_path / "full", "1.png")
+    with refused(*words):
+        all_of(ImageFolder(tmp_path / name, *given))
 
 
 @pytest.mark.parametrize("batch", [1, 64])
@@ -200,8 +173,6 @@ def test_images_are_resized_as_they_are_read(tmp_path: Path) -> None:
         frames = all_of(ImageFolder(tmp_path, *size))
         assert tuple(frames.shape) == (3, 3, *shape)
         assert frames.mean((1, 2, 3)).mul(255).tolist() == pytest.approx([20, 60, 100], abs=1e-3)
-    with refused("width=-1", "expected width and height of at least 0"):
-        ImageFolder(tmp_path, width=-1)
 
 
 def test_a_camera_held_upright_is_turned(tmp_path: Path) -> None:
@@ -213,12 +184,6 @@ def test_a_camera_held_upright_is_turned(tmp_path: Path) -> None:
     assert np.allclose(all_of(ImageFolder(tmp_path))[0, 0].numpy(), expected)
 
 
-def test_a_folder_of_folders_is_told(tmp_path: Path) -> None:
-    (tmp_path / "day").mkdir()
-    with refused("holds no images", "it has folders such as day"):
-        ImageFolder(tmp_path)
-
-
 def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
     write(tmp_path, *(f"{j}.png" for j in range(10)))
     for broken in (4, 9):  # the first one tells how large frames are
@@ -226,11 +191,6 @@ def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
     folder = ImageFolder(tmp_path)
     assert torch.cat(list(folder.select(range(1, 9, 2), 3)))[:, 0, 0, 0].mul(255).tolist() == [1, 3, 5, 7]
     assert torch.cat(list(folder.between(5, 8)))[:, 0, 0, 0].mul(255).tolist() == [5, 6, 7]
-
-
-def test_frames_are_called_by_their_files(tmp_path: Path) -> None:
-    write(tmp_path, "b10.png", "b9.png")
-    assert [ImageFolder(tmp_path).frame_name(i) for i in range(2)] == ["b9.png", "b10.png"]
 
 
 def png(rows: int, columns: int) -> bytes:
@@ -287,11 +247,7 @@ def test_float_images_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
     Image.fromarray(pixels).save(tmp_path / "a.tif")
     with refused("a.tif", "expected 0 to 1"):
         read_image(tmp_path / "a.tif")
-
-
-@pytest.mark.parametrize("bad", [-5, 70_000])
-def test_whole_numbers_beyond_16_bits_are_refused(tmp_path: Path, bad: int) -> None:
-    Image.fromarray(np.full((4, 5), bad, np.int32)).save(tmp_path / "a.tif")
+    Image.fromarray(np.full((4, 5), -5 if bad < 0 else 70_000, np.int32)).save(tmp_path / "a.tif")
     with refused("a.tif", "expected 0 to 1"):
         read_image(tmp_path / "a.tif")
 
@@ -306,10 +262,3 @@ def test_a_name_of_any_bytes_is_one_line(tmp_path: Path, name: bytes) -> None:
     folder.mkdir()
     write(folder, "1.png")
     assert ImageFolder(folder).name.isprintable()
-
-
-@pytest.mark.parametrize("given", [(10**12, 0), (0, 10**30), (10**5, 10**5)])
-def test_a_size_beyond_reason_is_refused(tmp_path: Path, given: tuple[int, int]) -> None:
-    write(tmp_path, "1.png")
-    with refused("expected", "at most"):
-        all_of(ImageFolder(tmp_path, *given))

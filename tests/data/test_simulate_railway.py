@@ -459,35 +459,19 @@ def has(given: str, *expected: str) -> tuple[str, list[str]]:
     ("query", "words"),
     [
         has("seed=-1", "seed >= 0, a whole number"),
-        has("traverse=-1", "0 <= traverse <= 9, a whole number"),
         has("traverse=10", "0 <= traverse <= 9, a whole number"),
-        has("frames=-1", "frames >= 0, a whole number"),
         has("height=15", "16 <= height <= 512, a whole number"),
-        has("height=513", "16 <= height <= 512"),
-        has("width=15", "16 <= width <= 1024, a whole number"),
         has("width=1025", "16 <= width <= 1024"),
         has("speed=4.9", "5 <= speed <= 40"),
-        has("speed=40.1", "5 <= speed <= 40"),
-        has("noise=-0.1", "0 <= noise <= 1"),
         has("noise=1.1", "0 <= noise <= 1"),
-        has("shake=-0.1", "0 <= shake <= 3"),
         has("shake=3.1", "0 <= shake <= 3"),
-        *(
-            has(f"{key}={bad}", f"<= {key} <=")
-            for key in ("speed", "noise", "shake")
-            for bad in ("nan", "inf")
-        ),
+        has("speed=nan", "<= speed <="),
+        has("shake=inf", "<= shake <="),
         ("height=16&width=1024", ["has height=16 and width=1024", "a width of 0.5 to 4 times the height"]),
-        ("height=512&width=16", ["has height=512 and width=16", "a width of 0.5 to 4 times the height"]),
-        ("height=32&width=129", ["has height=32 and width=129", "expected a width of 0.5 to 4"]),
         ("height=257", ["has height=257 and width=128", "expected a width of 0.5 to 4"]),
         ("frames=1.5", ["frames is '1.5'", "expected int"]),
-        ("traverse=abc", ["traverse is 'abc'", "expected int"]),
-        ("seed=", ["seed is ''", "expected int"]),
         ("seed", ["seed is ''", "expected int"]),
-        ("seed=nan", ["seed is 'nan'", "expected int"]),
         ("speed=fast", ["speed is 'fast'", "expected float"]),
-        ("noise=", ["noise is ''", "expected float"]),
         ("colour=red", ["unknown 'colour'", "seed, traverse, frames, height, width, speed, noise, shake"]),
     ],
 )
