@@ -77,7 +77,15 @@ class Augmentation(nn.Module):
     ) -> None:
         super().__init__()
         given = locals()
-        self.strengths = {name: _checked(name, given[name]) for name in LARGEST}
+        self.strengths: dict[str, tuple[float, ...]] = {}
+        for name, most in LARGEST.items():
+            value = given[name]
+            numbers = tuple(value) if isinstance(value, (tuple, list)) else (value,)
+            fit = len(numbers) == len(most) and all(isinstance(number, (int, float)) for number in numbers)
+            if not fit or not all(0 <= number <= limit for number, limit in zip(numbers, most, strict=True)):
+                expected = " and ".join(f"a number from 0 to {limit}" for limit in most)
+                raise InputError(f"{name} is {value!r}; expected {expected}")
+            self.strengths[name] = numbers
 
     @property
     def acts(self) -> bool:
@@ -178,17 +186,6 @@ class Augmentation(nn.Module):
     def extra_repr(self) -> str:
         shown = {name: value if len(value) > 1 else value[0] for name, value in self.strengths.items()}
         return ", ".join(f"{name}={value}" for name, value in shown.items())
-
-
-def _checked(name: str, value: object) -> tuple[float, ...]:
-    """The numbers of a strength, refused if out of range."""
-    numbers = tuple(value) if isinstance(value, (tuple, list)) else (value,)
-    most = LARGEST[name]
-    fit = len(numbers) == len(most) and all(isinstance(number, (int, float)) for number in numbers)
-    if not fit or not all(0 <= number <= limit for number, limit in zip(numbers, most, strict=True)):
-        expected = " and ".join(f"a number from 0 to {limit}" for limit in most)
-        raise InputError(f"{name} is {value!r}; expected {expected}")
-    return numbers
 
 
 def _uniform(clips: Tensor, low: float, high: float) -> Tensor:

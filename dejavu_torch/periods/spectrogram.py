@@ -197,7 +197,12 @@ class SpectrogramAnalysis(PeriodFinder):
             self._warn_once(f"window shrunk from {self.window} to {len(features)} places, the whole route")
         for start, stop in chunks:
             bins, share = self._strongest(features[start:stop])
-            if self._exceeds_noise(share, start, stop):
+            alarm = self.false_alarm
+            least = 0.0 if alarm is None else noise_share((stop - start) // 2, len(share), alarm)
+            if least > HANN_PEAK:
+                places = f"places {start}-{stop - 1}"
+                self._warn_once(f"{places}: too few to tell a period from noise; no layers here")
+            if alarm is None or (share > least).any():
                 layers += layers_of(bins, start, stop)
         return tuple(layers)
 
@@ -219,14 +224,6 @@ class SpectrogramAnalysis(PeriodFinder):
             found.append(bins)
             shares.append(share.where(bins > 0, 0.0).amax(0))
         return torch.cat(found, 1), torch.cat(shares)
-
-    def _exceeds_noise(self, share: Tensor, start: int, stop: int) -> bool:
-        if self.false_alarm is None:
-            return True
-        least = noise_share((stop - start) // 2, len(share), self.false_alarm)
-        if least > HANN_PEAK:
-            self._warn_once(f"places {start}-{stop - 1}: too few to tell a period from noise; no layers here")
-        return bool((share > least).any())
 
     def _warn_once(self, message: str) -> None:
         if message not in self._logged:

@@ -75,14 +75,6 @@ def test_a_clip_of_equal_frames_stays_one_but_for_noise() -> None:
         assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6) == (name != "noise")
 
 
-def test_a_clip_is_one_day_and_clips_differ() -> None:
-    clips = torch.rand(1, 1, 3, 16, 16).expand(6, 5, 3, 16, 16)
-    after = Augmentation(**{**DEFAULTS, "noise": 0.0})(clips)
-    assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6)
-    first = after[:, 0].flatten(1)
-    assert (torch.cdist(first, first) > 0.1).sum() == 6 * 5
-
-
 def test_noise_is_of_the_frame_and_whether_there_is_any_is_of_the_clip() -> None:
     clips = torch.full((100, 6, 1, 16, 16), 0.5)
     spread = (only(noise=0.03)(clips) - clips).flatten(2).std(2)

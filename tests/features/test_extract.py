@@ -90,11 +90,6 @@ def test_keeps_no_gradients() -> None:
         assert not features.requires_grad
 
 
-def test_keeps_no_gradients_of_ready_features() -> None:
-    features = torch.rand(4, 3, requires_grad=True)
-    assert not next(feature_batches(ArrayTraverse(features), HOG())).requires_grad
-
-
 def test_ready_features_pass_as_they_are() -> None:
     module = Pooled()
     features = torch.rand(7, 3)

@@ -122,16 +122,6 @@ def test_frames_are_resized_as_everywhere() -> None:
     assert torch.equal(hog(frames, resize=(32, 40)), hog(small))
 
 
-def test_resize_to_the_size_it_has_changes_nothing() -> None:
-    frames = torch.rand(2, 1, 32, 40)
-    assert torch.equal(hog(frames, resize=(32, 40)), hog(frames))
-
-
-def test_frames_of_any_size_give_features_of_one_length() -> None:
-    module = HOG(resize=(32, 32))
-    assert {module(torch.rand(1, 1, *size)).shape[1] for size in SIZES} == {324}
-
-
 def test_a_batch_is_its_frames_one_by_one() -> None:
     for bins in ("hard", "linear"):
         for channels in (1, 3):
@@ -160,10 +150,6 @@ def test_module_equals_function() -> None:
         module = HOG(**arguments)
         assert torch.equal(module(frames), hog(frames, **arguments))
         assert torch.equal(HOG(**recipe_of(module).init_args)(frames), module(frames))
-
-
-def test_double_follows_the_input() -> None:
-    assert HOG().double()(torch.rand(1, 1, 32, 32, dtype=torch.float64)).dtype == torch.float64
 
 
 def test_frames_that_do_not_fit_are_refused() -> None:
@@ -297,8 +283,3 @@ def test_each_pixel_takes_its_strongest_channel() -> None:
     for together, apart in zip(gradients(frames), zip(*alone, strict=True), strict=True):
         expected = torch.stack(apart).gather(0, strongest[None])[0]
         torch.testing.assert_close(together, expected, rtol=0, atol=1e-12)
-
-
-def test_the_function_refuses_unknown_names() -> None:
-    with refused("bins='soft'"):
-        hog(torch.rand(1, 1, 16, 16), bins="soft")

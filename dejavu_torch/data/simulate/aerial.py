@@ -25,14 +25,9 @@ CHEVRON_PERIOD = 171
 VIEW = 64  # the camera sees VIEW x VIEW image pixels
 MARGIN = 8  # columns beyond the first and the last view, so that yaw never leaves the image
 HEIGHT = 96  # rows of the painted image; the camera flies along the middle one
-TILES = (
-    997,
-    1009,
-)  # columns of the two tiles of ground that repeats; co-prime, so that no place is like another
-LONGEST = {
-    "once": 2**17,
-    "repeat": math.lcm(*TILES),
-}  # frames, by ground: where nothing repeats, of one image
+# columns of the two tiles of ground that repeats; co-prime, so that no place is like another
+TILES = (997, 1009)
+LONGEST = {"once": 2**17, "repeat": math.lcm(*TILES)}  # frames, by ground
 PLAIN = 9  # rows from the middle of the view to the edge of the road between tiles: over a cell of HOG
 
 ROAD = 40.0  # image row of the road's middle
@@ -363,10 +358,8 @@ class AerialRoad(SimulatedRoute):
         if self.ground == "once":
             seen = _sample(self._scene, at, column, row)
         else:
-            halves = [
-                _sample(tile, at % period, column, row)
-                for tile, period in zip(self._tiles, TILES, strict=True)
-            ]
+            tiles = zip(self._tiles, TILES, strict=True)
+            halves = [_sample(tile, at % period, column, row) for tile, period in tiles]
             seen = torch.where((row < HEIGHT / 2)[:, None], halves[0], halves[1])
         seen = F.avg_pool2d(seen, fine) * self._gain[at, :, None, None]
         seen = seen ** self._gamma[at, None, None, None]

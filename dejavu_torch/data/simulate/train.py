@@ -181,7 +181,9 @@ class Railway(SimulatedRoute):
         sway = swing * torch.stack([0.06 * path["aside"], 0.04 * path["lift"]], 1)
         seen = self._painter.draw(self.distance[at], self._step[at], sway)
         seen = self._turned(seen, swing, path)
-        gain, gamma, warm = self._looks
+        random = Random(self.kind, "looks", self.seed, self.traverse)
+        looks = [random.pick(values) for values in ((0.72, 0.82, 1.18), (0.85, 1.18), (-0.09, 0.09))]
+        gain, gamma, warm = looks if self.traverse else (1.0, 1.0, 0.0)
         warmth = warm + 0.02 * path["warm"]
         balance = torch.stack([1 + warmth, torch.ones_like(warmth), 1 - warmth], 1)
         level = gain * (1 + 0.06 * path["gain"])
@@ -190,14 +192,6 @@ class Railway(SimulatedRoute):
         for frame, i in zip(seen, at.tolist(), strict=True):
             frame += self.noise * Random(self.kind, "noise", self.seed, self.traverse, i).normal(*frame.shape)
         return seen.clamp_(0, 1)
-
-    @property
-    def _looks(self) -> tuple[float, float, float]:
-        """Gain, gamma and warmth of a traverse's camera."""
-        if not self.traverse:
-            return 1.0, 1.0, 0.0
-        random = Random(self.kind, "looks", self.seed, self.traverse)
-        return random.pick((0.72, 0.82, 1.18)), random.pick((0.85, 1.18)), random.pick((-0.09, 0.09))
 
     def _turned(self, seen: Tensor, swing: float, path: dict[str, Tensor]) -> Tensor:
         """The frames without their margin, shifted by pitch and yaw and turned by roll."""
