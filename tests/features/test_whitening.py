@@ -52,6 +52,20 @@ def test_in_closed_form_where_the_numbers_are_independent() -> None:
     torch.testing.assert_close(projection.abs(), torch.tensor([[0.0], [expected]]), rtol=0, atol=1e-6)
 
 
+def test_a_season_is_whitened_away() -> None:
+    """What a season changes alike everywhere tells nothing any more, though it is the largest change."""
+    _, places = pairs(k=20)
+    season = torch.cat([torch.tensor([90.0, -50.0, 40.0]), torch.zeros(17)])
+    winter = places + season + 0.1 * torch.randn(places.shape, generator=torch.Generator().manual_seed(1))
+    raw = torch.cdist(winter, places).argmin(1) == torch.arange(len(places))
+    mean, projection = learned_whitening(winter[:100], places[:100], 16)
+    projected = [(x[100:] - mean) @ projection for x in (winter, places)]
+    unit = [nn.functional.normalize(x, dim=1) for x in projected]
+    found = torch.cdist(*unit).argmin(1) == torch.arange(100)
+    assert raw.float().mean() < 0.3
+    assert found.float().mean() > 0.9
+
+
 def test_what_cannot_be_whitened() -> None:
     for views, places, words in (
         (torch.ones(3, 2), torch.ones(3, 2), ("the descriptors of 3 views", "by 0 in", "an augmentation")),
