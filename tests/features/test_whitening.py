@@ -60,7 +60,7 @@ def test_a_season_is_whitened_away() -> None:
     raw = torch.cdist(winter, places).argmin(1) == torch.arange(len(places))
     mean, projection = learned_whitening(winter[:100], places[:100], 16)
     projected = [(x[100:] - mean) @ projection for x in (winter, places)]
-    unit = [nn.functional.normalize(x, dim=1) for x in projected]
+    unit = [torch.nn.functional.normalize(x, dim=1) for x in projected]
     found = torch.cdist(*unit).argmin(1) == torch.arange(100)
     assert raw.float().mean() < 0.3
     assert found.float().mean() > 0.9
