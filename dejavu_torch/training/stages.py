@@ -177,8 +177,8 @@ class RateStage(DescriptorStage):
         self.log_widths = nn.Parameter(torch.zeros(0))  # of one dimension, which weight decay leaves alone
 
     def make(self, stretches: int, dimension: int, task: Task) -> None:
+        super().make(stretches, dimension, task)
         bands = int(bands_of(stretches, getattr(task.dejavu.mapper, "transform", "dft")).max()) + 1
-        self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
         self.log_widths = nn.Parameter(torch.zeros(bands * dimension, device=task.device))
 
     def losses(self, task: Task, batch: Batch) -> Losses:
@@ -214,21 +214,20 @@ class CodeStage(Stage):
 
     def trained(self, task: Task) -> list[nn.Parameter]:
         features = task.dejavu.features
-        learns = task.dejavu.features.coder if has_descriptor(features) else features
+        learns = features.coder if has_descriptor(features) else features
         return [task.log_temperature, *_trainable(learns), *task.route.parameters()]
 
     def losses(self, task: Task, batch: Batch) -> Losses:
-        if task.views is None:
-            positives = batch.truth.positives
-            with own_random(task.global_step):
+        descriptors, positives = task.views or (None, batch.truth.positives)
+        if descriptors is not None:
+            drawn = own_part(torch.randint(len(descriptors), (BATCH,))).to(descriptors.device)
+            descriptors, positives = descriptors[drawn], positives[drawn]
+        with own_random(task.global_step):
+            if descriptors is None:
                 frames = task.data.augmented(batch.frames, task.data.clip)
                 features = features_of(frames, task.dejavu.describe, "the batch")
-        else:
-            n, device = len(task.views.descriptors), task.views.descriptors.device
-            drawn = own_part(torch.randint(n, (BATCH,))).to(device)
-            with own_random(task.global_step):
-                features = task.dejavu.features.code(task.views.descriptors[drawn])
-            positives = task.views.positives[drawn]
+            else:
+                features = task.dejavu.features.code(descriptors)
         distances = task.route.distances(features)
         temperature, tolerance = task.log_temperature.exp(), task.data.tolerance
         scores, objective = task.scores(distances), cast(Objective, task.losses)
