@@ -239,10 +239,7 @@ class CodeStage(Stage):
 
 
 def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: float = 0.0) -> list[Stage]:
-    """The stages that a backbone needs: where the map is made of the descriptor, that is all that is learned;
-    for one that is trained an `Embedding` with a hidden layer learns its descriptor, for a share of the
-    steps, then its code. What is whitened or has nothing to train, and other backbones, have the last only.
-    """
+    """The stages that a backbone needs; what is whitened or has nothing to train has the last only."""
     if made:
         return [RateStage(rate)] if rate else [DescriptorStage()]
     if whitens(backbone) and _trainable(network_of(backbone)):
@@ -278,8 +275,7 @@ def _trainable(module: nn.Module) -> list[nn.Parameter]:
 
 @torch.no_grad()
 def views_of(task: Task, rounds: int, most: int) -> Iterator[Views]:
-    """Batches of descriptors of augmented training frames of known places, each shown in so many rounds, but
-    no more than `most` in all beside the first round."""
+    """Batches of augmented training frames of known places, at most `most` in all behind the first round."""
     data, describe = task.data, descriptor_of(task)
     loader = data.training_batches()
     rounds = min(rounds, most // len(loader.dataset)) if data.augmentation.acts else 1
@@ -294,10 +290,7 @@ def views_of(task: Task, rounds: int, most: int) -> Iterator[Views]:
 
 
 def check_map(task: Task, places: int, dimension: int) -> None:
-    """Refuse ahead of the training a map that could not be made behind it, as of too few bytes.
-
-    Bytes that the user did not ask for give way: what a map takes without any line comes on top of them.
-    """
+    """Refuse ahead of the training a map of too few bytes; those that nobody asked for give way."""
     whitening, mapper = task.dejavu.whitening, task.dejavu.mapper
     numbers = dimension if whitening is None else whitening.kept(places, dimension, True)
     descriptors = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0))
@@ -328,8 +321,7 @@ def place_descriptors(task: Task) -> Tensor:
 
 
 def make_map(task: Task) -> None:
-    """Learn the whitening, from the training's own views, and the map of the present descriptors. None of
-    training's random numbers are taken, and the same descriptors always give the same map."""
+    """Learn the whitening and the map of the present descriptors, with no random number of the training."""
     model, whitening = task.dejavu, task.dejavu.whitening
     with torch.random.fork_rng(), torch.no_grad(), in_mode(model, False):
         features = stored_features(task, model.describe)
@@ -344,27 +336,21 @@ def make_map(task: Task) -> None:
         model.learn_features(model.whitened(features), alone)
 
 
-def stored_features(task: Task, describe: Callable[[Tensor], Tensor], shuffled: bool = False) -> Tensor:
-    """Features of the stored reference frames, (N,D), see `in_batches`."""
-    frames = task.data.sets["reference"]
+@torch.no_grad()
+def stored_features(
+    task: Task, describe: Callable[[Tensor], Tensor], shuffled: bool = False, places: Tensor | None = None
+) -> Tensor:
+    """Features of the stored reference frames, (N,D), or codes of their descriptors; NaN is refused. Batches
+    are drawn from all over the route where running statistics are gathered from them."""
 
     def make(index: Tensor) -> Tensor:
-        return described(task, frames[index.tolist()].frames, describe)
+        if places is None:
+            return described(task, frames[index.tolist()].frames, describe)
+        with torch.autocast(task.device.type, enabled=False):
+            return describe(places[index.to(places.device)])
 
-    return in_batches(task, len(frames), make, shuffled)
-
-
-def coded_places(task: Task, shuffled: bool) -> Tensor:
-    """The same of the descriptors that are kept: the code alone is run."""
-    code, places = task.dejavu.features.code, place_descriptors(task)
-    with torch.autocast(task.device.type, enabled=False):
-        return in_batches(task, len(places), lambda index: code(places[index.to(places.device)]), shuffled)
-
-
-@torch.no_grad()
-def in_batches(task: Task, count: int, make: Callable[[Tensor], Tensor], shuffled: bool) -> Tensor:
-    """What is made of so many places, batch by batch, in their order; NaN is refused. Batches are drawn from
-    all over the route where running statistics are gathered from them."""
+    frames = task.data.sets["reference"]
+    count = len(frames)
     order = torch.randperm(count) if shuffled else torch.arange(count)
     batches = min(-(-count // task.dejavu.batch_size), count // 2)  # none of a single frame
     features = torch.cat([make(batch) for batch in order.tensor_split(batches)])

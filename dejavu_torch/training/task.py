@@ -40,9 +40,9 @@ from dejavu_torch.training.stages import (
     RateStage,
     Stage,
     Views,
-    coded_places,
     has_descriptor,
     make_map,
+    place_descriptors,
     stages_of,
     stored_features,
     whitens,
@@ -284,10 +284,9 @@ class PlaceRecognitionTask(pl.LightningModule):
         else:
             first, weights = not self.route.places, self.route.weights
             with in_mode(self, first):  # the first are made in training mode: running statistics are gathered
-                if has_descriptor(self.dejavu.features):
-                    features = coded_places(self, shuffled=first)
-                else:
-                    features = stored_features(self, self.dejavu.describe, shuffled=first)
+                coded = has_descriptor(self.dejavu.features)
+                code: Any = self.dejavu.features.code if coded else self.dejavu.describe
+                features = stored_features(self, code, first, place_descriptors(self) if coded else None)
                 self.dejavu.learn_features(features, self.data.reference)
             if not self.route.plan:
                 name = self.data.reference.name
@@ -623,8 +622,7 @@ def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
 
 
 def start_from(backbone: nn.Module, path: str | Path) -> None:
-    """Give a backbone the weights of a map file, without the code of a whitened descriptor, which is of its
-    route; only the network if an `Embedding` gives the descriptor itself, here or there."""
+    """Give a backbone the weights of a map file, without the code of a whitened descriptor, of its route."""
     prefix = "features."
     with opened(Path(path)) as (tensors, header):
         stored = unpacked(tensors, prefix)
@@ -649,8 +647,7 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
 def freeze_parts(
     backbone: nn.Module, prefixes: Sequence[str], batch_norm: Literal["train", "frozen"]
 ) -> set[str]:
-    """Take the gradient from parameters; return the names of modules whose running statistics have to stay,
-    those in frozen parts at least. The arguments are the task's."""
+    """Take the gradient from parameters; return the names of modules whose running statistics stay."""
     for prefix in prefixes:
         chosen = [p for name, p in backbone.named_parameters() if name.startswith(prefix)]
         if not chosen:

@@ -154,7 +154,6 @@ trainer:
     templates = DejaVu.load(tmp_path / "run" / "map.safetensors").map.templates
     assert torch.equal(templates, checkpoint["state_dict"]["dejavu.map.templates"])
     assert checkpoint["epoch"] == 0  # stopped at the first
-    train("validate", "--trainer.default_root_dir", tmp_path / "run", config=str(tmp_path / "watch.yaml"))
 
 
 def test_checkpoints_can_be_switched_off(folder: Path, tmp_path: Path) -> None:
