@@ -187,7 +187,8 @@ class RateStage(DescriptorStage):
         )
         place = self.losses_to(coded.proxies, task, batch)
         per_place = coded.bits / len(task.data.sets["reference"])
-        total = place.total + self.rate * task.progress * per_place
+        progress = (task.global_step - task.began) / max(1, task.stop() - task.began)
+        total = place.total + self.rate * progress * per_place
         return Losses(total, place.parts | {"bits": per_place}, place.left_out)
 
 

@@ -206,11 +206,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         return self.index == len(self.stages) - 1
 
     @property
-    def progress(self) -> float:
-        """How many of the stage's steps are done, from 0 to 1."""
-        return (self.global_step - self.began) / max(1, self._stop() - self.began)
-
-    @property
     def frame_size(self) -> tuple[int, int] | None:
         """(height, width) to which the backbone resizes frames, so that they may be stored in it; None if it
         does not, or a contrast is evened before, at the frames' own size."""
@@ -349,10 +344,10 @@ class PlaceRecognitionTask(pl.LightningModule):
         steps = float(self.trainer.estimated_stepping_batches)
         if not math.isfinite(steps):
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
-        if self._stop() <= self.began and not self.in_last_stage:
+        if self.stop() <= self.began and not self.in_last_stage:
             self._advance(self.began)
         self.stage.begin(self)
-        trained, count = self.stage.trained(self), self._stop() - self.began
+        trained, count = self.stage.trained(self), self.stop() - self.began
         groups = [
             {"params": [p for p in trained if p.ndim > 1], "weight_decay": self.weight_decay},
             {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
@@ -367,7 +362,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         schedule = {"scheduler": LambdaLR(optimizer, height), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": schedule}
 
-    def _stop(self) -> int:
+    def stop(self) -> int:
         """The step that ends the stage."""
         steps = int(self.trainer.estimated_stepping_batches)
         return steps if self.in_last_stage else min(self.began + round(self.stage.share * steps), steps - 1)
@@ -398,7 +393,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Drop a map of the features before; begin the next stage if the steps of this one are over."""
         if self.made and self.map.places:
             self.dejavu.load_state_dict(self._unmade(), strict=False)
-        if not self.in_last_stage and self.global_step >= self._stop():
+        if not self.in_last_stage and self.global_step >= self.stop():
             self._advance(self.global_step)
             self.trainer.strategy.setup_optimizers(self.trainer)
             if self.in_last_stage:
@@ -427,7 +422,7 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"the loss is {float(figures[0])} at step {self.global_step} ({seen}); expected a finite "
                 "number: try a lower lr, or 32-bit precision"
             )
-        if self.global_step - self.began >= warm_up(self._stop() - self.began):
+        if self.global_step - self.began >= warm_up(self.stop() - self.began):
             self.last.add(parts)
         self.log_dict({f"train/{name}": part for name, part in parts.items()})
         several = self.trainer.world_size > 1
