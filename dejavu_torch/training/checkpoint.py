@@ -112,8 +112,11 @@ def check_content(checkpoint: Any, size: int) -> None:
         if not isinstance(name, str) or not (isinstance(value, Tensor) or name.endswith(EXTRA)):
             raise InputError(f"{str(name)[:80]!r} in its state_dict is no tensor")
         ours = name.startswith("dejavu.") and not name.startswith("dejavu.features.")
-        if ours and name.endswith(EXTRA) and not all(map(is_plain, leaves(value))):
-            raise InputError(f"{name[:80]} is not of plain numbers and text")
+        for leaf in leaves(value) if ours and name.endswith(EXTRA) else ():
+            if not isinstance(leaf, str | int | float | None) or (
+                isinstance(leaf, float) and not isfinite(leaf)
+            ):
+                raise InputError(f"{name[:80]} is not of plain numbers and text")
         if name == f"dejavu.{EXTRA}":
             checked_fields(value, STATE, name)
     for tensor in (leaf for leaf in leaves(checkpoint) if isinstance(leaf, Tensor)):
@@ -121,11 +124,6 @@ def check_content(checkpoint: Any, size: int) -> None:
         held = min(size, tensor.untyped_storage().nbytes()) if dense else 0
         if not dense or tensor.numel() * tensor.element_size() > held:
             raise InputError(f"a tensor {tuple(tensor.shape)} has more numbers than the file")
-
-
-def is_plain(value: Any) -> bool:
-    """Whether a value is a text, a finite number or nothing."""
-    return value is None or isinstance(value, str | int) or (isinstance(value, float) and isfinite(value))
 
 
 def leaves(value: Any) -> Iterator[Any]:

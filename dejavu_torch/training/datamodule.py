@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -15,13 +15,12 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.files import LARGEST
-from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.frame_range import runs as runs_of
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import open_source, routes_of
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.features.views import STRETCH, AugmentedTraverse, augmented_segments
+from dejavu_torch.features.views import STRETCH
 from dejavu_torch.memory import check_room, concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
@@ -194,19 +193,16 @@ class RouteData(LightningDataModule):
             self.truths[name] = self._one_each(f"{name}_truth" if name != "query" else "truth", known)
         if not self.listed["source"]:
             raise InputError("source is an empty list; expected at least one traverse")
-        for name, every in self.listed.items():
-            for one in every:
-                if not isinstance(one, (str, Path, Traverse, Tensor)) and (
-                    one is not None or name == "source"
-                ):
-                    raise InputError(
-                        f"{name} is of type {type(one).__name__}; expected a path or `sim:` address, a "
-                        "Traverse, or a tensor of frames or features"
-                    )
+        for name, one in ((name, one) for name, every in self.listed.items() for one in every):
+            missing = one is None and name != "source"
+            if not missing and not isinstance(one, (str, Path, Traverse, Tensor)):
+                raise InputError(
+                    f"{name} is of type {type(one).__name__}; expected a path or `sim:` address, a Traverse, "
+                    "or a tensor of frames or features"
+                )
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
-        for one in paths:
-            if paths.count(one) > 1:
-                raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
+        for one in (one for one in paths if paths.count(one) > 1):
+            raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
         # as it was given where there is one route
         self.sources = {
             name: given if len(given) > 1 and any(one is not None for one in given) else given[0]
@@ -223,9 +219,7 @@ class RouteData(LightningDataModule):
     def _one_each(self, name: str, given: Any) -> list[Any]:
         """What is given for each of the routes."""
         count = len(self.listed["source"])
-        each = (
-            list(given) if isinstance(given, (list, tuple)) else [given] * (1 if given is not None else count)
-        )
+        each = list(given) if isinstance(given, (list, tuple)) else [given] * (count if given is None else 1)
         if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
             raise InputError(
                 f"{name} is given, and there are {count} routes, which make no map; expected none, and "
@@ -246,8 +240,7 @@ class RouteData(LightningDataModule):
     @property
     def route_name(self) -> str:
         """Of the routes, for messages."""
-        more = f" and {len(self.routes) - 1} more" * (len(self.routes) > 1)
-        return f"{self.reference.name}{more}"
+        return self.reference.name + f" and {len(self.routes) - 1} more" * (len(self.routes) > 1)
 
     @property
     def lengths(self) -> list[int]:
@@ -271,16 +264,6 @@ class RouteData(LightningDataModule):
         count = max(FEWEST, round(self.held_out * len(frames) / STRETCH))
         return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]
 
-    def held_frames(
-        self, starts: list[int], strengths: Mapping[str, Any], shape: tuple[int, ...] | None = None
-    ) -> AugmentedTraverse | None:
-        """Those of these stretches that begin at `starts`, in frames of `shape`, as they may look on another
-        visit (see `augmented_segments`); None without any."""
-        if not starts:
-            return None
-        reference = self.reference if shape is None else fitted(self.reference, shape)
-        return augmented_segments(reference, len(self.sets["reference"].values), strengths, starts=starts)
-
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
         task = None if self.trainer is None else self.trainer.lightning_module
@@ -294,7 +277,7 @@ class RouteData(LightningDataModule):
             self.sets.clear()
             self._wanted = wanted
         if "reference" not in self.sets:
-            opened = [self._fit(_open(source)) for source in self.listed["source"]]
+            opened = [self._open(source) for source in self.listed["source"]]
             self.routes = [resampled(route, self.velocity, self.batch_size) for route in opened]
             size, parts = self._size, []
             for route in self.routes:
@@ -327,22 +310,22 @@ class RouteData(LightningDataModule):
 
     def unseen(self) -> tuple[Traverse, GroundTruth] | None:
         """The traverse to validate on, else the one to test on, and its places; None without either."""
-        name = next((name for name in ("validation", "query") if self.sources[name] is not None), None)
-        if name is None:
-            return None
-        if name not in self.sets:
-            self.sets[name] = self._read(name)
-        return self._opened(name), self.sets[name].truth
+        for name in (name for name in ("validation", "query") if self.sources[name] is not None):
+            if name not in self.sets:
+                self.sets[name] = self._read(name)
+            return self._opened(name), self.sets[name].truth
+        return None
 
     def _opened(self, name: str, i: int = 0) -> Traverse:
         """Another traverse of route i, at its steps."""
         route = self.routes[i]
         step = route.step if isinstance(route, ResampledTraverse) else None
-        traverse = self._fit(_open(self.listed[name][i]), route.frame_shape)
+        traverse = self._open(self.listed[name][i], route.frame_shape)
         return resampled(traverse, self.velocity, self.batch_size, step)
 
-    def _fit(self, traverse: Traverse, shape: tuple[int, ...] | None = None) -> Traverse:
+    def _open(self, source: Any, shape: tuple[int, ...] | None = None) -> Traverse:
         """At the size that `DejaVu.fit` of the task's model gives; as it is where `resize` gives one."""
+        traverse = as_traverse(source) if isinstance(source, (Traverse, Tensor)) else open_source(source)
         model = None if self.trainer is None else getattr(self.trainer.lightning_module, "dejavu", None)
         return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
 
@@ -483,10 +466,6 @@ def _other_frames(name: str, seen: tuple[int, ...], reference: tuple[int, ...]) 
         f"{name} has frames of {seen}, the reference of {reference}; expected the same channels, and one "
         "size, as data.resize makes"
     )
-
-
-def _open(source: str | Path | Traverse | Tensor) -> Traverse:
-    return as_traverse(source) if isinstance(source, (Traverse, Tensor)) else open_source(source)
 
 
 def _loader(frames: StoredFrames, batches: Iterable[list[int]]) -> DataLoader[Batch]:

@@ -20,7 +20,7 @@ from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import Views, augmented_segments
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.template_map import TemplateMapper
@@ -72,11 +72,17 @@ class MapExport(Callback):
             return
         if self.began in (None, step):
             log.warning("nothing was trained: step %d is reached; max_steps counts from the start", step)
-        best = best_checkpoint(trainer)
-        if best is not None and not Path(best).is_file():
-            log.warning("%s is gone: the map is of the last step", best)
-        elif best is not None:
-            load_weights(pl_module, best)
+        for callback in trainer.checkpoint_callbacks:
+            if not isinstance(callback, ModelCheckpoint) or not callback.monitor:
+                continue
+            best = callback.best_model_path
+            if best and Path(best).is_file():
+                load_weights(pl_module, best)
+            else:
+                told = f"{best} is gone" if best else f"{callback.monitor} was never measured"
+                log.warning("%s: the map is of the last step", told)
+            if best:
+                break
         data = pl_module.data
         self.write(pl_module, Path(trainer.default_root_dir), data)
         if self.written is None or not self.written[1].map.places:
@@ -118,10 +124,14 @@ class MapExport(Callback):
 def held_frames(
     model: DejaVu, data: RouteData, starts: list[int], shape: tuple[int, ...] | None = None
 ) -> tuple[Traverse, GroundTruth] | None:
-    """The stretches that training never saw, changed, in frames of `shape`, and their places, if any."""
+    """The stretches that begin at `starts`, in frames of `shape`, as they may look on another visit, and
+    their places; None without any."""
+    if not starts:
+        return None
     strengths = STRENGTHS if model.whitening is None else model.whitening.strengths
-    found = data.held_frames(starts, strengths, shape)
-    return None if found is None else (found, as_ground_truth(found.places[:, None]))
+    reference = data.reference if shape is None else fitted(data.reference, shape)
+    found = augmented_segments(reference, len(data.sets["reference"].values), strengths, starts=starts)
+    return found, as_ground_truth(found.places[:, None])
 
 
 def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
@@ -175,16 +185,6 @@ class LastCheckpoint(Checkpoint):
         if trainer.state.fn == "fit" and trainer.global_step not in (0, self.saved):
             trainer.save_checkpoint(Path(trainer.default_root_dir) / "checkpoints" / "last.ckpt")
             self.saved = trainer.global_step
-
-
-def best_checkpoint(trainer: pl.Trainer) -> str | None:
-    """The checkpoint that the watched figure was best at; None where none was watched."""
-    for callback in trainer.checkpoint_callbacks:
-        if isinstance(callback, ModelCheckpoint) and callback.monitor:
-            if callback.best_model_path:
-                return callback.best_model_path
-            log.warning("%s was never measured: the map is of the last step", callback.monitor)
-    return None
 
 
 def beside_untrained(
@@ -298,9 +298,6 @@ def has_bf16() -> bool:
 
     Known on Linux; False elsewhere.
     """
-    try:
-        text = CPU_FLAGS.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return False
+    text = CPU_FLAGS.read_text(encoding="utf-8", errors="replace") if CPU_FLAGS.is_file() else ""
     lines = (line for line in text.splitlines() if line.lower().startswith(("flags", "features")))
     return bool(FAST & set(next(lines, "").split()))

@@ -177,8 +177,8 @@ class RateStage(DescriptorStage):
         self.log_widths = nn.Parameter(torch.zeros(0))  # of one dimension, which weight decay leaves alone
 
     def make(self, stretches: int, dimension: int, task: Task) -> None:
+        super().make(stretches, dimension, task)
         bands = int(bands_of(stretches, getattr(task.dejavu.mapper, "transform", "dft")).max()) + 1
-        self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
         self.log_widths = nn.Parameter(torch.zeros(bands * dimension, device=task.device))
 
     def losses(self, task: Task, batch: Batch) -> Losses:
@@ -187,7 +187,8 @@ class RateStage(DescriptorStage):
         )
         place = self.losses_to(coded.proxies, task, batch)
         per_place = coded.bits / len(task.data.sets["reference"])
-        total = place.total + self.rate * task.progress * per_place
+        progress = (task.global_step - task.began) / max(1, task.stop() - task.began)
+        total = place.total + self.rate * progress * per_place
         return Losses(total, place.parts | {"bits": per_place}, place.left_out)
 
 
@@ -214,21 +215,20 @@ class CodeStage(Stage):
 
     def trained(self, task: Task) -> list[nn.Parameter]:
         features = task.dejavu.features
-        learns = task.dejavu.features.coder if has_descriptor(features) else features
+        learns = features.coder if has_descriptor(features) else features
         return [task.log_temperature, *_trainable(learns), *task.route.parameters()]
 
     def losses(self, task: Task, batch: Batch) -> Losses:
-        if task.views is None:
-            positives = batch.truth.positives
-            with own_random(task.global_step):
+        descriptors, positives = task.views or (None, batch.truth.positives)
+        if descriptors is not None:
+            drawn = own_part(torch.randint(len(descriptors), (BATCH,))).to(descriptors.device)
+            descriptors, positives = descriptors[drawn], positives[drawn]
+        with own_random(task.global_step):
+            if descriptors is None:
                 frames = task.data.augmented(batch.frames, task.data.clip)
                 features = features_of(frames, task.dejavu.describe, "the batch")
-        else:
-            n, device = len(task.views.descriptors), task.views.descriptors.device
-            drawn = own_part(torch.randint(n, (BATCH,))).to(device)
-            with own_random(task.global_step):
-                features = task.dejavu.features.code(task.views.descriptors[drawn])
-            positives = task.views.positives[drawn]
+            else:
+                features = task.dejavu.features.code(descriptors)
         distances = task.route.distances(features)
         temperature, tolerance = task.log_temperature.exp(), task.data.tolerance
         scores, objective = task.scores(distances), cast(Objective, task.losses)
@@ -240,10 +240,7 @@ class CodeStage(Stage):
 
 
 def stages_of(backbone: nn.Module, descriptor: float, made: bool = False, rate: float = 0.0) -> list[Stage]:
-    """The stages that a backbone needs: where the map is made of the descriptor, that is all that is learned;
-    for one that is trained an `Embedding` with a hidden layer learns its descriptor, for a share of the
-    steps, then its code. What is whitened or has nothing to train, and other backbones, have the last only.
-    """
+    """The stages that a backbone needs; what is whitened or has nothing to train has the last only."""
     if made:
         return [RateStage(rate)] if rate else [DescriptorStage()]
     if whitens(backbone) and _trainable(network_of(backbone)):
@@ -279,8 +276,7 @@ def _trainable(module: nn.Module) -> list[nn.Parameter]:
 
 @torch.no_grad()
 def views_of(task: Task, rounds: int, most: int) -> Iterator[Views]:
-    """Batches of descriptors of augmented training frames of known places, each shown in so many rounds, but
-    no more than `most` in all beside the first round."""
+    """Batches of augmented training frames of known places, at most `most` in all behind the first round."""
     data, describe = task.data, descriptor_of(task)
     loader = data.training_batches()
     rounds = min(rounds, most // len(loader.dataset)) if data.augmentation.acts else 1
@@ -295,10 +291,7 @@ def views_of(task: Task, rounds: int, most: int) -> Iterator[Views]:
 
 
 def check_map(task: Task, places: int, dimension: int) -> None:
-    """Refuse ahead of the training a map that could not be made behind it, as of too few bytes.
-
-    Bytes that the user did not ask for give way: what a map takes without any line comes on top of them.
-    """
+    """Refuse ahead of the training a map of too few bytes; those that nobody asked for give way."""
     whitening, mapper = task.dejavu.whitening, task.dejavu.mapper
     numbers = dimension if whitening is None else whitening.kept(places, dimension, True)
     descriptors = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0))
@@ -329,8 +322,7 @@ def place_descriptors(task: Task) -> Tensor:
 
 
 def make_map(task: Task) -> None:
-    """Learn the whitening, from the training's own views, and the map of the present descriptors. None of
-    training's random numbers are taken, and the same descriptors always give the same map."""
+    """Learn the whitening and the map of the present descriptors, with no random number of the training."""
     model, whitening = task.dejavu, task.dejavu.whitening
     with torch.random.fork_rng(), torch.no_grad(), in_mode(model, False):
         features = stored_features(task, model.describe)
@@ -345,27 +337,21 @@ def make_map(task: Task) -> None:
         model.learn_features(model.whitened(features), alone)
 
 
-def stored_features(task: Task, describe: Callable[[Tensor], Tensor], shuffled: bool = False) -> Tensor:
-    """Features of the stored reference frames, (N,D), see `in_batches`."""
-    frames = task.data.sets["reference"]
+@torch.no_grad()
+def stored_features(
+    task: Task, describe: Callable[[Tensor], Tensor], shuffled: bool = False, places: Tensor | None = None
+) -> Tensor:
+    """Features of the stored reference frames, (N,D), or codes of their descriptors; NaN is refused. Batches
+    are drawn from all over the route where running statistics are gathered from them."""
 
     def make(index: Tensor) -> Tensor:
-        return described(task, frames[index.tolist()].frames, describe)
+        if places is None:
+            return described(task, frames[index.tolist()].frames, describe)
+        with torch.autocast(task.device.type, enabled=False):
+            return describe(places[index.to(places.device)])
 
-    return in_batches(task, len(frames), make, shuffled)
-
-
-def coded_places(task: Task, shuffled: bool) -> Tensor:
-    """The same of the descriptors that are kept: the code alone is run."""
-    code, places = task.dejavu.features.code, place_descriptors(task)
-    with torch.autocast(task.device.type, enabled=False):
-        return in_batches(task, len(places), lambda index: code(places[index.to(places.device)]), shuffled)
-
-
-@torch.no_grad()
-def in_batches(task: Task, count: int, make: Callable[[Tensor], Tensor], shuffled: bool) -> Tensor:
-    """What is made of so many places, batch by batch, in their order; NaN is refused. Batches are drawn from
-    all over the route where running statistics are gathered from them."""
+    frames = task.data.sets["reference"]
+    count = len(frames)
     order = torch.randperm(count) if shuffled else torch.arange(count)
     batches = min(-(-count // task.dejavu.batch_size), count // 2)  # none of a single frame
     features = torch.cat([make(batch) for batch in order.tensor_split(batches)])

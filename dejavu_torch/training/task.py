@@ -6,7 +6,7 @@ import copy
 import logging
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -14,7 +14,7 @@ import pytorch_lightning as pl
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
-from torch.optim import AdamW, Optimizer
+from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
 from dejavu_torch.features.cnn import SmallCNN
@@ -40,9 +40,9 @@ from dejavu_torch.training.stages import (
     RateStage,
     Stage,
     Views,
-    coded_places,
     has_descriptor,
     make_map,
+    place_descriptors,
     stages_of,
     stored_features,
     whitens,
@@ -55,8 +55,6 @@ TEMPERATURE = 0.03  # of `log_posterior` at the start
 DESCRIPTOR = 0.4  # of the steps of a training whose descriptor gets a code
 MAP = "dejavu.map."  # ahead of the names of the map's tensors in a checkpoint
 WHITENING = "dejavu.whitening."
-CODE = ("linear.layers.", "standardise.")  # of an Embedding with a Coder
-NETWORK = "network."  # of any Embedding
 
 
 class PlaceRecognitionTask(pl.LightningModule):
@@ -138,16 +136,14 @@ class PlaceRecognitionTask(pl.LightningModule):
                 raise InputError(f"{name} is {value!r}; expected {expected}")
         backbone = SmallCNN() if backbone is None else backbone
         mapper = TemplateMapper(ImposedPeriods()) if mapper is None else mapper
-        if not isinstance(mapper, Mapper):
-            raise InputError(f"the mapper is {type(mapper).__name__}; expected a Mapper")
         self.made = not isinstance(mapper, TemplateMapper)
-        of_templates = {"feature_weights": feature_weights, "descriptor": descriptor != DESCRIPTOR}
-        of_templates |= {"refresh": refresh > 0, "losses": losses is not None}
-        of_made = {"whitening": isinstance(whitening, Whitening), "rate": rate > 0}
-        lost = [name for name, is_given in (of_templates if self.made else of_made).items() if is_given]
-        if lost:
+        idle = {"whitening": isinstance(whitening, Whitening), "rate": rate > 0}
+        if self.made:
+            idle = {"feature_weights": feature_weights, "descriptor": descriptor != DESCRIPTOR}
+            idle |= {"refresh": refresh > 0, "losses": losses is not None}
+        for name in (name for name, is_given in idle.items() if is_given):
             raise InputError(
-                f"{lost[0]} is given, which does nothing for the map of a {type(mapper).__name__}; expected "
+                f"{name} is given, which does nothing for the map of a {type(mapper).__name__}; expected "
                 "another mapper, or none of it"
             )
         if isinstance(whitening, Whitening) and whitening.strengths != STRENGTHS:
@@ -210,11 +206,6 @@ class PlaceRecognitionTask(pl.LightningModule):
         return self.index == len(self.stages) - 1
 
     @property
-    def progress(self) -> float:
-        """How many of the stage's steps are done, from 0 to 1."""
-        return (self.global_step - self.began) / max(1, self._stop() - self.began)
-
-    @property
     def frame_size(self) -> tuple[int, int] | None:
         """(height, width) to which the backbone resizes frames, so that they may be stored in it; None if it
         does not, or a contrast is evened before, at the frames' own size."""
@@ -233,10 +224,9 @@ class PlaceRecognitionTask(pl.LightningModule):
         """
         if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             self.trainer.strategy.checkpoint_io = CheckpointFiles()
-        reference = self.data.sets["reference"]
-        if isinstance(self.dejavu.features, SmallCNN) and reference.values.ndim == 4:
-            one = self.dejavu.preprocess(as_frames(reference.values[:1]))
-            self.dejavu.features.follow(one.shape[1])
+        values = self.data.sets["reference"].values
+        if isinstance(self.dejavu.features, SmallCNN) and values.ndim == 4:
+            self.dejavu.features.follow(self.dejavu.preprocess(as_frames(values[:1])).shape[1])
         share(self, self.trainer)
         self.metric = PlaceRecognition(self.data.tolerance)
         self.dejavu.velocity = self.data.velocity
@@ -244,7 +234,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         self._check_routes()
         if stage == "fit" and sum(self.data.lengths) < FEW:
             self._say_few()
-        if reference.values.ndim == 2 and self.made:
+        if values.ndim == 2 and self.made:
             raise InputError(
                 f"{self.data.reference.name} holds ready features, and the map of a "
                 f"{type(self.dejavu.mapper).__name__} is not trained; expected frames, or `dejavu learn`"
@@ -261,7 +251,7 @@ class PlaceRecognitionTask(pl.LightningModule):
                 "data.augmentation changes nothing and there is no data.second: nothing shows the whitening "
                 f"what two visits differ in; expected one of them{', or model.whitening none' * self.made}"
             )
-        if reference.values.ndim == 2 and list(self.dejavu.features.parameters()):
+        if values.ndim == 2 and list(self.dejavu.features.parameters()):
             log.warning("these are ready features: the backbone is left out")
             self.dejavu.features, self.frozen = HOG(), set()  # has nothing to store
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
@@ -289,10 +279,9 @@ class PlaceRecognitionTask(pl.LightningModule):
         else:
             first, weights = not self.route.places, self.route.weights
             with in_mode(self, first):  # the first are made in training mode: running statistics are gathered
-                if has_descriptor(self.dejavu.features):
-                    features = coded_places(self, shuffled=first)
-                else:
-                    features = stored_features(self, self.dejavu.describe, shuffled=first)
+                coded = has_descriptor(self.dejavu.features)
+                code: Any = self.dejavu.features.code if coded else self.dejavu.describe
+                features = stored_features(self, code, first, place_descriptors(self) if coded else None)
                 self.dejavu.learn_features(features, self.data.reference)
             if not self.route.plan:
                 name = self.data.reference.name
@@ -349,16 +338,31 @@ class PlaceRecognitionTask(pl.LightningModule):
     # training
 
     def configure_optimizers(self) -> Any:
-        """Begin the stage, or the next where it has no steps. The optimizer is of its parameters."""
+        """Begin the stage, or the next where it has no steps: AdamW of its parameters, whose learning rate
+        rises over the first tenth of its steps, then falls along a cosine to 0. Only what is multiplied with
+        something decays: matrices and kernels."""
         steps = float(self.trainer.estimated_stepping_batches)
         if not math.isfinite(steps):
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
-        if self._stop() <= self.began and not self.in_last_stage:
+        if self.stop() <= self.began and not self.in_last_stage:
             self._advance(self.began)
         self.stage.begin(self)
-        return adamw_of(self.stage.trained(self), self.lr, self.weight_decay, self._stop() - self.began)
+        trained, count = self.stage.trained(self), self.stop() - self.began
+        groups = [
+            {"params": [p for p in trained if p.ndim > 1], "weight_decay": self.weight_decay},
+            {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
+        ]
+        optimizer, rise = AdamW([group for group in groups if group["params"]], lr=self.lr), warm_up(count)
 
-    def _stop(self) -> int:
+        def height(step: int) -> float:
+            if step < rise:
+                return (step + 1) / rise
+            return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (step - rise) / max(1, count - rise)))
+
+        schedule = {"scheduler": LambdaLR(optimizer, height), "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": schedule}
+
+    def stop(self) -> int:
         """The step that ends the stage."""
         steps = int(self.trainer.estimated_stepping_batches)
         return steps if self.in_last_stage else min(self.began + round(self.stage.share * steps), steps - 1)
@@ -389,7 +393,7 @@ class PlaceRecognitionTask(pl.LightningModule):
         """Drop a map of the features before; begin the next stage if the steps of this one are over."""
         if self.made and self.map.places:
             self.dejavu.load_state_dict(self._unmade(), strict=False)
-        if not self.in_last_stage and self.global_step >= self._stop():
+        if not self.in_last_stage and self.global_step >= self.stop():
             self._advance(self.global_step)
             self.trainer.strategy.setup_optimizers(self.trainer)
             if self.in_last_stage:
@@ -401,7 +405,11 @@ class PlaceRecognitionTask(pl.LightningModule):
         if due and self.in_last_stage:
             before = self.route
             self.relearn()
-            replace(cast(Optimizer, self.optimizers(use_pl_optimizer=False)), before, self.route)
+            optimizer, new = self.trainer.optimizers[0], dict(self.route.named_parameters())
+            for name, old in before.named_parameters():  # nothing is remembered of it
+                for group in optimizer.param_groups:
+                    group["params"] = [new[name] if one is old else one for one in group["params"]]
+                optimizer.state.pop(old, None)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
@@ -414,7 +422,7 @@ class PlaceRecognitionTask(pl.LightningModule):
                 f"the loss is {float(figures[0])} at step {self.global_step} ({seen}); expected a finite "
                 "number: try a lower lr, or 32-bit precision"
             )
-        if self.global_step - self.began >= warm_up(self._stop() - self.began):
+        if self.global_step - self.began >= warm_up(self.stop() - self.began):
             self.last.add(parts)
         self.log_dict({f"train/{name}": part for name, part in parts.items()})
         several = self.trainer.world_size > 1
@@ -609,16 +617,15 @@ def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
 
 
 def start_from(backbone: nn.Module, path: str | Path) -> None:
-    """Give a backbone the weights of a map file, without the code of a whitened descriptor, which is of its
-    route; only the network if an `Embedding` gives the descriptor itself, here or there."""
+    """Give a backbone the weights of a map file, without the code of a whitened descriptor, of its route."""
     prefix = "features."
     with opened(Path(path)) as (tensors, header):
         stored = unpacked(tensors, prefix)
         check_types(stored, backbone)
     weights = {name.removeprefix(prefix): t for name, t in stored.items() if name.startswith(prefix)}
     own = backbone.state_dict()
-    code = CODE if bool(weights.get("linear.whitened", False)) else ()
-    bare = any(all(name.startswith(NETWORK) for name in one) for one in (weights, own))
+    code = ("linear.layers.", "standardise.") if weights.get("linear.whitened", False) else ()
+    bare = any(all(name.startswith("network.") for name in one) for one in (weights, own))
     if bare and isinstance(backbone, Embedding):
         code = ("linear.", "standardise.")
     weights = {name: t for name, t in weights.items() if not name.startswith(code)}
@@ -635,8 +642,7 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
 def freeze_parts(
     backbone: nn.Module, prefixes: Sequence[str], batch_norm: Literal["train", "frozen"]
 ) -> set[str]:
-    """Take the gradient from parameters; return the names of modules whose running statistics have to stay,
-    those in frozen parts at least. The arguments are the task's."""
+    """Take the gradient from parameters; return the names of modules whose running statistics stay."""
     for prefix in prefixes:
         chosen = [p for name, p in backbone.named_parameters() if name.startswith(prefix)]
         if not chosen:
@@ -658,32 +664,3 @@ def freeze_parts(
 def warm_up(steps: int) -> int:
     """Steps of a stage of so many in which the learning rate rises."""
     return max(1, round(steps / 10))
-
-
-def adamw_of(parameters: Iterable[nn.Parameter], lr: float, weight_decay: float, steps: int) -> Any:
-    """AdamW and its schedule, for Lightning: the learning rate rises over the first tenth of the steps, then
-    falls along a cosine to 0. Only what is multiplied with something decays: matrices and kernels."""
-    trained = list(parameters)
-    groups = [
-        {"params": [p for p in trained if p.ndim > 1], "weight_decay": weight_decay},
-        {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
-    ]
-    optimizer = AdamW([group for group in groups if group["params"]], lr=lr)
-    rise = warm_up(steps)
-
-    def height(step: int) -> float:
-        if step < rise:
-            return (step + 1) / rise
-        return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (step - rise) / max(1, steps - rise)))
-
-    schedule = {"scheduler": LambdaLR(optimizer, height), "interval": "step"}
-    return {"optimizer": optimizer, "lr_scheduler": schedule}
-
-
-def replace(optimizer: Optimizer, before: nn.Module, after: nn.Module) -> None:
-    """Train the parameters of `after` instead of those of `before`, with nothing remembered of the old."""
-    new = dict(after.named_parameters())
-    for name, old in before.named_parameters():
-        for group in optimizer.param_groups:
-            group["params"] = [new[name] if parameter is old else parameter for parameter in group["params"]]
-        optimizer.state.pop(old, None)

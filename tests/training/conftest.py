@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from small_training import CONFIG, MINE, footage, train
 
 from dejavu_torch.training import export
@@ -26,8 +25,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         np.save(folder / f"{name}.npy", frames.numpy())
     (folder / "train.yaml").write_text(CONFIG)
     (folder / "mine.py").write_text(MINE)
-    (folder / "a_file").write_text("not a folder, not a checkpoint")
-    torch.save({"state_dict": {"weight": torch.zeros(3)}}, folder / "foreign.ckpt")
+    (folder / "a_file").write_text("not a folder")
     (folder / "empty").mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -145,10 +145,6 @@ class Plain(nn.Module):
         self.calls += self.training
         return self.linear(frames.flatten(1))
 
-class Deep(Plain):
-    def forward(self, frames):
-        return super().forward(frames)[..., None]
-
 class Broken(nn.Module):
     def __init__(self) -> None:
         raise RuntimeError("no weights\\nto be had")

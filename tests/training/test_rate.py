@@ -167,9 +167,7 @@ def test_bits_count_for_more_and_more(tmp_path: Path) -> None:
             now = {name: float(value) for name, value in trainer.callback_metrics.items()}
             seen.append((now["train/loss"] - now["train/descriptor"]) / now["train/bits"])
 
-    fit(tmp_path, rated(2.0), data_of(), max_steps=4)
-    task = rated(2.0)
-    trainer(tmp_path, Losses(99), max_steps=4).fit(task, data_of())
+    trainer(tmp_path, Losses(99), max_steps=4).fit(rated(2.0), data_of())
     assert seen == pytest.approx([0.0, 0.5, 1.0, 1.5], abs=1e-3)
 
 

@@ -244,20 +244,20 @@ def test_settings_that_do_nothing_are_refused(settings: dict[str, Any], words: t
 
 
 @pytest.mark.parametrize(
-    "settings", [{"backbone": HOG()}, {"backbone": coded(network=HOG())}, {"freeze": [""]}], ids=str
+    ("settings", "frames", "words"),
+    [
+        ({"backbone": HOG()}, None, ("can be trained", "dejavu learn")),
+        ({"backbone": coded(network=HOG())}, None, ("can be trained", "dejavu learn")),
+        ({"freeze": [""]}, None, ("can be trained", "dejavu learn")),
+        ({}, torch.eye(FRAMES), ("ready features", "SpectralMapper is not trained", "dejavu learn")),
+        ({"mapper": SpectralMapper(0.1)}, None, ("route_bytes_per_place is 0.1",)),
+    ],
+    ids=["HOG", "code of HOG", "frozen", "features", "budget"],
 )
-def test_what_cannot_be_trained_is_refused(tmp_path: Path, settings: dict[str, Any]) -> None:
-    with refused("can be trained", "dejavu learn"):
-        trainer(tmp_path).fit(spectral(**settings), data_of())
-
-
-def test_ready_features_are_refused(tmp_path: Path) -> None:
-    with refused("ready features", "SpectralMapper is not trained", "dejavu learn"):
-        trainer(tmp_path).fit(spectral(), data_of(torch.rand(FRAMES, 6)))
-
-
-def test_a_budget_that_cannot_be_met_is_told_ahead_of_the_training(tmp_path: Path) -> None:
-    running = trainer(tmp_path, max_steps=9, **EVERY, num_sanity_val_steps=0)
-    with refused("route_bytes_per_place is 0.1"):
-        running.fit(spectral(mapper=SpectralMapper(0.1)), data_of())
+def test_what_cannot_be_trained_is_told_ahead(
+    tmp_path: Path, settings: dict[str, Any], frames: torch.Tensor | None, words: tuple[str, ...]
+) -> None:
+    running = trainer(tmp_path, num_sanity_val_steps=0)
+    with refused(*words):
+        running.fit(spectral(**settings), data_of(frames))
     assert running.global_step == 0
