@@ -248,7 +248,7 @@ def one_route(model: DejaVu, verb: str) -> SpectralMap:
     Raises:
         InputError: no map, one of another kind, or one of several routes.
     """
-    model.require_map()
+    model.require_map(f" to {verb}")
     route = model.map
     if route.routes:
         names = ", ".join(one.name for one in route.routes)
@@ -288,9 +288,13 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         raise InputError(f"{seen}; expected at least two maps, and a name for each")
     first, parts = models[0], dict[str, SpectralMap]()
     for name, model in zip(names, models, strict=True):
-        own, problem = _routes_of(model, name), _unlike(first, model)
-        if problem:
+        route = model.map
+        if not isinstance(route, SpectralMap) or not route.places:
+            seen = f"a map of kind {route.kind!r}" if route.places else "no map"
+            raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
+        if problem := _unlike(first, model):
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
+        own = [(one.name, route.part(one.name)) for one in route.routes] or [(name, route)]
         for wanted, part in own:
             parts[_another(wanted, parts)] = part
     _check_count(sum(part.places for part in parts.values()), first.step is not None)
@@ -317,15 +321,6 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     return merged.replace_map(SpectralMap.merged([*parts.values()], [*parts]))
 
 
-def _routes_of(model: DejaVu, name: str) -> list[tuple[str, SpectralMap]]:
-    """Name and map of each route of a model's map; `name` for a single one."""
-    route = model.map
-    if not isinstance(route, SpectralMap) or not route.places:
-        seen = f"a map of kind {route.kind!r}" if route.places else "no map"
-        raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
-    return [(one.name, route.part(one.name)) for one in route.routes] or [(name, route)]
-
-
 def _another(name: str, known: dict[str, SpectralMap]) -> str:
     """The name itself, or with the first free number after it."""
     return name if name not in known else next(f"{name}-{i}" for i in count(2) if f"{name}-{i}" not in known)
@@ -333,8 +328,6 @@ def _another(name: str, known: dict[str, SpectralMap]) -> str:
 
 def _unlike(first: DejaVu, other: DejaVu) -> str:
     """What of two models makes other descriptors, or other scores, in words; "" if nothing does."""
-    if other is first:
-        return ""
     for what in ("preprocess", "features", "whitening", "velocity"):
         one, two = getattr(first, what), getattr(other, what)
         if one is None and two is None:
@@ -388,19 +381,16 @@ def _check_count(places: int, resampled: bool) -> None:
 def _check_alike(model: DejaVu, added: Traverse) -> None:
     """Refuse frames that are not like those that the map was learned from."""
     if model.step is not None and not isinstance(added, ResampledTraverse):
-        seen = (
-            f"{added.name} has ready features or a single frame, whose steps along the ground nothing tells"
-        )
-        raise InputError(f"{seen}; expected frames, as the map's places are at even steps")
+        seen = f"{added.name} has ready features or a single frame, whose steps nothing tells"
+        raise InputError(f"{seen}; expected frames, as the map's places are at even steps along the ground")
     shape = added.frame_shape
     own = model.frame_shape or shape  # of a map that was learned from descriptors
-    if len(own) != len(shape):
-        kinds = {1: "ready features", 3: "frames"}
-        seen = f"{added.name} holds {kinds[len(shape)]}, the map was learned from {kinds[len(own)]}"
-        raise InputError(f"{seen}; expected the same")
     if not _alike(model, own, shape):
-        seen, known = (" x ".join(map(str, one)) for one in (shape, own))
-        raise InputError(f"{added.name} has frames of {seen}; expected {known}, as the map was learned from")
+        seen, known = (
+            "ready features" if len(one) == 1 else f"frames of {' x '.join(map(str, one))}"
+            for one in (shape, own)
+        )
+        raise InputError(f"{added.name} holds {seen}, the map was learned from {known}; expected the same")
     numbers, expected = model.describer.count_features(added), model.features_per_frame
     if numbers != expected:
         seen = f"{added.name} gives {numbers} features a frame"

@@ -112,7 +112,11 @@ class Describer(NamedTuple):
             self.warn_of_bright(frames, traverse.name)
             check_alone(self.pipeline, frames, features, traverse.name)
 
-        if learns and not (spectral and self._has_many_features(traverse)):
+        many = learns and spectral and (traverse.length is None or traverse.length > SAMPLE)
+        if many and (frames := traverse.count()):
+            one = next(self.features(Selection(traverse, torch.zeros(1, dtype=torch.int64))))
+            many = frames > SAMPLE and frames * one.nbytes > IN_MEMORY
+        if learns and not many:
             features = concatenate(self.features(traverse, progress, check_first))
             self._learn_whitening(features, traverse, second, progress)
             return concatenate(self.whitened(part.to(self.device)) for part in features.split(ROWS))
@@ -141,14 +145,6 @@ class Describer(NamedTuple):
             batches = self.features(second.traverse, progress and f"learning what changes: {looks}")
             whitening.learn(features, _with_places(batches, second.places.to(self.device)))
         whitening.to(self.device)
-
-    def _has_many_features(self, traverse: Traverse) -> bool:
-        """Whether the features of a traverse exceed the memory."""
-        if traverse.length is not None and traverse.length <= SAMPLE:
-            return False
-        one = next(self.features(Selection(traverse, torch.zeros(1, dtype=torch.int64))))
-        frames = traverse.count()
-        return frames > SAMPLE and frames * one.nbytes > IN_MEMORY
 
     def visits(self, views: Views, dimension: int, progress: str | None = None) -> tuple[Tensor, Tensor]:
         """Descriptors (n,K) of the frames that show a place, and these places (n,); others are refused."""

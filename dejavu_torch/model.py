@@ -272,9 +272,9 @@ class DejaVu(nn.Module):
         """
         if other.whitening is None or not other.whitening.learned:
             raise InputError("its map was learned without whitening; expected one that was learned with it")
-        self.preprocess, self.features, self.whitening = other.preprocess, other.features, other.whitening
-        self.weight_bits = other.weight_bits
-        self.whitening.fixed, self._made = True, ()
+        self.take_descriptor(other)
+        self.whitening, self._made = other.whitening, ()
+        self.whitening.fixed = True
 
     def take_descriptor(self, other: DejaVu) -> None:
         """Use the preprocess and features of another model, such as one trained on many routes; whitening is
@@ -625,14 +625,13 @@ class DejaVu(nn.Module):
         """
         set_state(self, checked_fields(state, STATE, "the model's state"))
 
-    def require_map(self) -> None:
-        """Refuse a model without a map."""
+    def require_map(self, purpose: str = "") -> None:
+        """Refuse a model without a map, which is needed for a purpose: " to append to"."""
         if not self.map.places:
-            raise InputError(
-                "there is no map yet; expected learn(...) or load(...) first"
-                if self.trained is None
-                else "this is a descriptor without a map; expected learn(...) of a route with it first"
-            )
+            if self.trained is None:
+                raise InputError(f"there is no map yet{purpose}; expected learn(...) or load(...) first")
+            seen = f"this is a descriptor without a map{purpose}"
+            raise InputError(f"{seen}; expected learn(...) of a route with it first")
 
 
 def own_size(features: nn.Module) -> tuple[int, int] | None:

@@ -101,7 +101,7 @@ def test_calibration_of_the_new_places(folder: Path, tmp_path: Path) -> None:
         ("d.npy --append a.npy", ["a.npy", "no map file"]),
         ("wide.npy --append f.safetensors", ["wide.npy", "5 features", "expected 8"]),
         ("a.npy --append f.safetensors", ["a.npy holds frames", "ready features"]),
-        ("a.npy --append first.safetensors", ["a.npy has frames of 1 x ", "expected 3 x "]),
+        ("a.npy --append first.safetensors", ["a.npy holds frames of 1 x ", "learned from frames of 3 x "]),
         ("d.npy --append f.safetensors --whitening first.safetensors", ["--whitening", "--append"]),
         ("d.npy --append f.safetensors --mapper.chunk 16", ["--mapper", "--append"]),
         ("d.npy --append f.safetensors --seed 4", ["--seed", "--append"]),

@@ -235,7 +235,7 @@ def image_model(chunk: int = 20, **settings: object) -> DejaVu:
     ("model", "added", "words"),
     [
         ("templates", torch.rand(40, NUMBERS), ("'templates'", "'spectral'")),
-        ("none", torch.rand(40, NUMBERS), ("no map",)),
+        ("none", torch.rand(40, NUMBERS), ("no map yet to append to",)),
         ("features", torch.rand(40, 7), ("7 features", "expected 6")),
         ("features", torch.rand(40, 1, 9, 9), ("holds frames", "ready features")),
         ("features", torch.full((40, NUMBERS), math.nan), ("NaN",)),
@@ -516,6 +516,11 @@ def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
     assert fresh.map.visit_counts.tolist() == [1] * 120
 
 
+def test_places_of_one_visit_take_no_bytes(tmp_path: Path) -> None:
+    learned(walk(100)).save(tmp_path / "m")
+    assert "map.visits" not in read_map(tmp_path / "m").tensors
+
+
 @pytest.mark.parametrize("chunk", [50, 10_000])
 def test_a_visit_is_averaged_into_a_map(chunk: int) -> None:
     route, more = walk(150), noisy(walk(60), 1)
@@ -621,7 +626,7 @@ def test_visits_that_cannot_be_averaged() -> None:
         learn_mean(templates, walk(90), good)
     with refused("'templates'", "'spectral'"):
         average(templates.learn(walk(90)), good)
-    with refused("no map"):
+    with refused("no map yet to average visits into"):
         average(DejaVu(), good)
     route = learned(walk(90)).map
     route.visits = torch.tensor([[89, 2]], dtype=torch.int32)
