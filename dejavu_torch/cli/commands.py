@@ -89,7 +89,7 @@ def run_demo(
     settings: dict[str, Any] = {"seed": seed, "second": views, "others": others, "progress": True}
     result = compare(reference, query, model=model, storage_curve=True, **settings)
     _publish(result, out, "dejavu demo: the built-in route", command)
-    kept, features = str(out / "map.safetensors"), _features_of(model, command)
+    kept, features = str(out / "map.safetensors"), features_words(model, shlex.split(command), "--features")
     for words in (
         ["localize", kept, localized, *features, "--out", "matches.csv"],
         ["compare", learned, localized, "--config", "local_maxima", "--out", "templates"],
@@ -253,8 +253,14 @@ def run_localize(
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()
+
+    def counted() -> Iterator[Match]:
+        for match in matches:
+            counts.update(probable_counts(match))
+            yield match
+
     with _searching(cluster, model):
-        total, accepted = _write_matches(out, _counted(matches, counts), query, model, top)
+        total, accepted = _write_matches(out, counted(), query, model, top)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
     elif not rule.given:
@@ -567,7 +573,7 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.map.places:
         _print_localize(map, model, command)
     else:
-        words = _features_of(model, command)
+        words = features_words(model, shlex.split(command), "--features")
         _print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
 
 
@@ -630,11 +636,6 @@ def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
         raise InputError(f"{path}: {error}") from error
     Acceptance(given.threshold, given.precision).of(model)
     return model
-
-
-def _features_of(model: DejaVu, command: str) -> list[str]:
-    """The options of a later command for features that are not this package's, or that have such parts."""
-    return features_words(model, shlex.split(command), "--features")
 
 
 def features_words(model: DejaVu, words: Sequence[str], option: str) -> list[str]:
@@ -722,7 +723,14 @@ def route_lines(route: PlaceMap) -> list[str]:
 
 
 def _print_localize(map: Path, model: DejaVu, command: str) -> None:
-    _print_next("localize", map, "QUERY", *_features_of(model, command), "--out", "matches.csv")
+    _print_next(
+        "localize",
+        map,
+        "QUERY",
+        *features_words(model, shlex.split(command), "--features"),
+        "--out",
+        "matches.csv",
+    )
 
 
 def _print_next(*words: str | Path) -> None:
@@ -775,13 +783,6 @@ def _write_matches(
         frames, source = query.frame, query.traverse
     names = source.frame_name, model.frame_name
     return write_matches(path, matches, frames, model.map.frame_of, *names, ranks, model.map.routes)
-
-
-def _counted(matches: Iterable[Match], counts: Counter[str]) -> Iterator[Match]:
-    """The matches as they are, those counted that are probably right."""
-    for match in matches:
-        counts.update(probable_counts(match))
-        yield match
 
 
 def _print_contradiction(report: Report) -> None:

@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
-from typing import NoReturn
 
 import numpy as np
 
@@ -49,7 +48,8 @@ def follow(
     """
     localizer = LiveLocalizer(model, sequence)
     shots, newest, name = shots_from(source, model, realtime, port is not None)
-    taken = Timings()
+    recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
+    frames = 0
     with ExitStack() as stack:
         page = None
         if port is not None:
@@ -58,8 +58,8 @@ def follow(
                 if model.map.routes:
                     seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
                     raise InputError(f"{seen}; expected the page without, or the map of that route")
-                frames = len(model.map.positions) or model.map.places
-                pictures = ReferencePictures(open_source(reference), frames)
+                shown = len(model.map.positions) or model.map.places
+                pictures = ReferencePictures(open_source(reference), shown)
             page = stack.enter_context(Page(port, title, pictures))
             _tell(f"the page is at {page.url}")
         feed = stack.enter_context(FrameReader(shots, newest, timeout if is_stream(source) else None, name))
@@ -69,25 +69,28 @@ def follow(
                 for shot in feed:
                     match = localizer(shot.pixels, shot.number - latest - 1)
                     latest = shot.number
-                    taken.add(match.milliseconds)
+                    recent.append(match.milliseconds)
+                    frames += 1
                     print(line_of(shot, match))
                     if reader_left():
                         break
                     if page is not None and localizer.scores is not None:
                         posterior = localizer.posterior
                         drawn = localizer.scores if posterior is None else posterior
-                        counts = (taken.frames, feed.dropped, *taken.percentiles())
+                        counts = (frames, feed.dropped, *percentiles(recent))
                         page.show(Snapshot(shot, match, drawn, posterior is not None, *counts))
                 else:
                     if page is not None and not is_stream(source):
-                        _stay(page.url)
+                        _tell(f"that was the last frame; the page stays at {page.url} until Ctrl-C")
+                        while True:
+                            time.sleep(3600)
         finally:
-            if taken.frames:
-                p50, p99 = taken.percentiles()
+            if frames:
+                p50, p99 = percentiles(recent)
                 times = f"milliseconds a frame: p50 {p50:.1f}, p99 {p99:.1f}"
                 rule = model.acceptance(sequence)
                 told = "" if rule.given else f"; {rule}"
-                _tell(f"{taken.frames} frames, {feed.dropped} dropped; {times}{told}")
+                _tell(f"{frames} frames, {feed.dropped} dropped; {times}{told}")
 
 
 def shots_from(
@@ -138,38 +141,14 @@ def line_of(shot: Frame, match: LiveMatch) -> str:
         "milliseconds": round(match.milliseconds, 3),
     }
     facts |= {"route": match.route} if match.route else {}
-    known = {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in facts.items()
-    }
-    return json.dumps(known)
+    lost = [key for key, value in facts.items() if isinstance(value, float) and not math.isfinite(value)]
+    return json.dumps(facts | dict.fromkeys(lost))
 
 
-class Timings:
-    """Milliseconds of the latest answers, and how many there were."""
-
-    def __init__(self) -> None:
-        self.frames = 0
-        self._recent: deque[float] = deque(maxlen=RECENT)
-
-    def add(self, milliseconds: float) -> None:
-        """Those of one more answer."""
-        self._recent.append(milliseconds)
-        self.frames += 1
-
-    def percentiles(self) -> tuple[float, float]:
-        """p50 and p99; NaN ahead of the first answer."""
-        if not self._recent:
-            return math.nan, math.nan
-        p50, p99 = np.percentile(np.fromiter(self._recent, float), (50, 99))
-        return float(p50), float(p99)
-
-
-def _stay(url: str) -> NoReturn:
-    """Wait for Ctrl-C."""
-    _tell(f"that was the last frame; the page stays at {url} until Ctrl-C")
-    while True:
-        time.sleep(3600)
+def percentiles(milliseconds: Iterable[float]) -> tuple[float, float]:
+    """p50 and p99 of the times of at least one answer."""
+    p50, p99 = np.percentile([*milliseconds], (50, 99))
+    return float(p50), float(p99)
 
 
 def _tell(text: str) -> None:

@@ -429,12 +429,19 @@ def _model_of(name: str, arguments: dict[str, Any], told: Sequence[str]) -> Deja
     if len(files) == 2:
         seen = f"--whitening {files['whitening']} has its own features"
         raise UsageError(f"{seen}; expected it or --descriptor {files['descriptor']}")
-    for what, path in files.items():
+    named = any(one.startswith("features") for one in told)
+    for what, path in files.items():  # features of our own come from there as well
         if what == "whitening":
-            check_not_read(
-                arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors", path
-            )
-        _take(model, path, told, what)
+            written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"
+            check_not_read(written, path)
+        known = DejaVu.load(path, model.features if named or not isinstance(model.features, HOG) else None)
+        if what == "descriptor":
+            model.take_descriptor(known)
+            continue
+        try:
+            model.take_whitening(known)
+        except InputError as error:
+            raise InputError(f"--whitening {path}: {error}") from error
     return model
 
 
@@ -444,20 +451,3 @@ def _check_own(path: Path, told: Sequence[str], what: Literal["whitening", "desc
     other = [one for one in told if one.startswith(of_file)]
     if other:
         raise UsageError(f"--{other[0]}: the {what} of {path} has its own; expected one or the other")
-
-
-def _take(model: DejaVu, path: Path, told: Sequence[str], what: Literal["whitening", "descriptor"]) -> None:
-    """Give a model the whitening or the descriptor of a file; features of our own come from there as well.
-
-    Args:
-        told: the options of the command line.
-    """
-    named = any(one.startswith("features") for one in told)
-    known = DejaVu.load(path, model.features if named or not isinstance(model.features, HOG) else None)
-    if what == "descriptor":
-        model.take_descriptor(known)
-        return
-    try:
-        model.take_whitening(known)
-    except InputError as error:
-        raise InputError(f"--whitening {path}: {error}") from error

@@ -328,17 +328,13 @@ class TrainCLI(LightningCLI):
         """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""
         chosen, last = self.config_init[self.subcommand], self._last_checkpoint()
         if chosen.get("ckpt_path") not in (None, "", "last"):
-            path = chosen["ckpt_path"]
-            if (
-                path in ("best", "hpc") or not Path(path).exists()
-            ):  # words of Lightning's, which mean none here
+            path = chosen["ckpt_path"]  # the two words are Lightning's, and mean none here
+            if path in ("best", "hpc") or not Path(path).exists():
                 raise InputError(f"{path} is not there; {EXPECTED}")
             return
         if last is None:
-            raise InputError(
-                f"there is no checkpoint in {self._checkpoints}; expected --ckpt_path, or the "
-                "trainer.default_root_dir of a training"
-            )
+            seen = f"there is no checkpoint in {Path(self.trainer.default_root_dir) / 'checkpoints'}"
+            raise InputError(f"{seen}; expected --ckpt_path, or the trainer.default_root_dir of a training")
         chosen["ckpt_path"] = str(last)
 
     before_test = before_export = before_validate
@@ -362,12 +358,8 @@ class TrainCLI(LightningCLI):
     def _written(self) -> str:
         return DESCRIPTOR if len(self.datamodule.listed["source"]) > 1 else "map.safetensors"
 
-    @property
-    def _checkpoints(self) -> Path:
-        return Path(self.trainer.default_root_dir) / "checkpoints"
-
     def _last_checkpoint(self) -> Path | None:
-        found = self._checkpoints.glob("*.ckpt")
+        found = Path(self.trainer.default_root_dir).glob("checkpoints/*.ckpt")
         return max(found, key=lambda path: path.stat().st_mtime, default=None)
 
 
