@@ -609,7 +609,10 @@ def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
 
     with Cluster(cluster) as workers:
         model.find = ClusterSearch(workers, model.map)
-        yield
+        try:
+            yield
+        finally:
+            model.find = None
 
 
 def _check_map_file(path: Path, *read: str | Path | None) -> None:
