@@ -157,6 +157,7 @@ def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | P
     Raises:
         InputError: none of these, a file that cannot be opened, or interpolation of anything but a .csv.
     """
+    truth = str(truth)  # an offset may be a number, as of YAML
     suffix = Path(truth).suffix.lower()
     said: int | float | Path | None = offset_of(truth)
     if suffix in (".csv", ".npz"):
