@@ -138,23 +138,19 @@ def baselines_of(
         match = nearest_frames(stored, query, apart, metric, text, matching)
         return Baseline(name, match, bytes + fixed, k, fixed)
 
+    size, own = partial(stride_bytes, frames, dimension), reference.element_size()
     if spectral:
         short = as_int8(reference)
         between, spaced, keys = interpolated(short, summary.route_bytes)
-        every_float = f"its descriptors of all {frames} {one}s, float"
-        every_kth = f"its descriptors of {every(coarsest, one)}, int8"
-        sizes = [stride_bytes(frames, dimension, size, k) for size, k in ((4, 1), (1, coarsest))]
+        floats, kept = f"all {frames} {one}s, float", f"{every(coarsest, one)}, int8"
         lines = f"interpolated between {every(spaced, one)}, int8"
         found = {
-            "uncompressed": nearest(every_float, reference, 1, sizes[0]),
-            "stride": nearest(
-                every_kth, short, coarsest, stride_bytes(frames, dimension, 1, coarsest), coarsest
-            ),
+            "uncompressed": nearest(f"its descriptors of {floats}", reference, 1, size(4, 1)),
+            "stride": nearest(f"its descriptors of {kept}", short, coarsest, size(1, coarsest), coarsest),
             "interpolated": nearest(lines, between, spaced, keys * dimension),
         }
     else:
-        size = partial(stride_bytes, frames, dimension, reference.element_size())
-        fair = fair_stride(frames, dimension, reference.element_size(), summary.map_bytes - fixed, tolerance)
+        fair = fair_stride(frames, dimension, own, summary.map_bytes - fixed, tolerance)
         of = "" if isinstance(model.features, HOG) else "same features, "
         skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
         names = {
@@ -162,7 +158,7 @@ def baselines_of(
             "stride": (f"{of}{every(fair, one)} (at least the map's bytes)", fair),
             "stride_coarsest": (f"{of}{every(coarsest, one)} (2 x tolerance)", coarsest),
         }
-        found = {key: nearest(name, reference, k, size(k), k) for key, (name, k) in names.items()}
+        found = {key: nearest(name, reference, k, size(own, k), k) for key, (name, k) in names.items()}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
         control, order = null_model(model, reference, seed, same_plan)
