@@ -13,7 +13,6 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -27,7 +26,8 @@ from dejavu_torch.data.output import SIGNALS
 from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
-from dejavu_torch.recognition.search import Best, empty_topk, merge_topk, search
+from dejavu_torch.recognition.coarse import MEMORY, coarse_search
+from dejavu_torch.recognition.search import Best, Search, Wanted, lowest_needed, search
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse
 
@@ -179,8 +179,9 @@ class ClusterSearch:
 
     Args:
         cluster: its workers hold the chunks; one that dies is started again.
+        method: of each worker on its part. memory: bytes that this may take on all of them together.
 
-    Shape: queries (Q,K), n -> (Q,n) scores and places.
+    Shape: queries (Q,K), wanted -> (Q,n) scores and places; see `Wanted`.
 
     Convention: places are those of a search here, scores up to rounding, which depends on the processor.
 
@@ -188,7 +189,9 @@ class ClusterSearch:
         InputError: a map of another kind; a worker that does not come back.
     """
 
-    def __init__(self, cluster: Cluster, route: PlaceMap) -> None:
+    def __init__(
+        self, cluster: Cluster, route: PlaceMap, method: Search = "auto", memory: int = MEMORY
+    ) -> None:
         if not isinstance(route, SpectralMap):
             raise InputError(
                 f"a map of kind {route.kind!r} is not divided among workers; expected a spectral one"
@@ -201,36 +204,44 @@ class ClusterSearch:
         for first, stop in pairwise([*bounds, len(starts)]):
             if first < stop:
                 self.parts.append(cluster.ray.put(route.between(first, stop).cpu()))
-                self.actors.append(actor.remote(self.parts[-1], starts[first]))
+                how = method, memory // workers
+                self.actors.append(actor.remote(self.parts[-1], starts[first], *how))
 
     @torch.no_grad()
-    def __call__(self, queries: Tensor, n: int) -> Best:
-        """The n lowest scores of queries."""
+    def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
+        """Scores and places in which the wanted candidates are."""
         try:
             answers = self.cluster.ray.get(
-                [actor.search.remote(queries.cpu().numpy(), n) for actor in self.actors]
+                [actor.search.remote(queries.cpu().numpy(), wanted) for actor in self.actors]
             )
         except self.cluster.ray.exceptions.RayError as error:
             seen = f"a worker died with its part of the map ({one_line(error)[:100]})"
             raise InputError(f"{seen}; expected workers that live, and memory for it") from error
         found = [(torch.from_numpy(score.copy()), torch.from_numpy(place.copy())) for score, place in answers]
-        return reduce(merge_topk, found[1:], merge_topk(empty_topk(queries.cpu(), n), found[0]))
+        score, place = (torch.cat(column, 1) for column in zip(*found, strict=True))
+        return score, place
 
 
 class _Searcher:
     """Holds a part of a map, whose first place is that one of the whole."""
 
-    def __init__(self, part: SpectralMap, first: int) -> None:
+    def __init__(self, part: SpectralMap, first: int, method: Search, memory: int) -> None:
         torch.set_num_threads(1)
         self.part, self.first = part, first
+        coarse = None if method == "scan" else coarse_search(part, memory)
+        self.exact, self.find = method == "exact", coarse
 
     def process(self) -> int:
         """The number of this process."""
         return os.getpid()
 
-    def search(self, queries: Any, n: int) -> tuple[Any, Any]:
-        """See `search`: scores and places as arrays."""
-        score, place = search(self.part, torch.from_numpy(queries.copy()), n, "scan")
+    def search(self, queries: Any, wanted: Wanted) -> tuple[Any, Any]:
+        """Scores and places in which the wanted candidates of the part are, as arrays."""
+        own = torch.from_numpy(queries.copy())
+        if self.find is None:
+            score, place = search(self.part, own, lowest_needed(wanted, self.part.places), scan=True)
+        else:
+            score, place = self.find(own, wanted, self.exact)
         return score.numpy(), torch.where(score.isfinite(), place + self.first, place).numpy()
 
 

@@ -6,7 +6,7 @@ import copy
 import inspect
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -53,8 +53,9 @@ from dejavu_torch.model_file import (
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.recognition.calibration import Calibration
+from dejavu_torch.recognition.coarse import MEMORY, CoarseSearch, coarse_search
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Best, Search, check_search
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.types import (
@@ -161,7 +162,11 @@ class DejaVu(nn.Module):
         self.frame_names: list[str] = []  # of the reference's frames; empty if they have none
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
-        self.find: Callable[[Tensor, int], Best] | None = None  # in place of `search`, as a cluster does
+        self.search: Search = "auto"  # how single queries are searched for, see `localize`
+        self.search_memory = MEMORY  # bytes that it may take at most beyond the map
+        self.find: Find | None = None  # in its place, as a cluster does
+        # samples for it, once they were needed, and what they are of: chunks and bytes
+        self._coarse: tuple[tuple[Tensor | None, int], CoarseSearch | None] | None = None
         self._warned: set[tuple[str, str]] = set()  # traverse and line of warnings that are logged once
 
     def settings(self) -> dict[str, Any]:
@@ -419,7 +424,7 @@ class DejaVu(nn.Module):
         queries: Traverse | Tensor,
         progress: str | None = None,
         sequence: SequenceModel | None = None,
-        search: Search = "auto",
+        search: Search | None = None,
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
@@ -429,7 +434,9 @@ class DejaVu(nn.Module):
             progress: text of a progress bar on a terminal; None is no bar.
             sequence: scores consecutive queries together, as `SequenceMatcher` and `PlaceFilter` do; None
                 matches each by itself.
-            search: how the best place of a single query is searched for, see `recognition.search`.
+            search: of single queries: "coarse" scores the places near the best samples of a long spectral
+                map, "exact" rules out all others, "scan" scores all; "auto" is coarse if that is faster. None
+                is `self.search`.
 
         Shape: -> Match of (Q,) on the CPU.
 
@@ -464,16 +471,30 @@ class DejaVu(nn.Module):
         """What matches descriptors on the map, a batch of consecutive queries after the other."""
         self.require_map()
         check_search(matching.search)
-        if matching.sequence is not None:
-            matching.sequence.check(None, self.map.places)
-        return Localizer(self.map, matching, self.find)
+        sequence, coarse = matching.sequence, None
+        if sequence is not None:
+            sequence.check(None, self.map.places)
+        searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.on_scores is None
+        if searches and self.find is None and matching.search != "scan":
+            coarse = self._coarse_search()
+        if coarse is None:
+            return Localizer(self.map, matching, self.find)
+        find = partial(coarse, exact=True) if matching.search == "exact" else coarse
+        return Localizer(self.map, matching, find, coarse.approximate)
+
+    def _coarse_search(self) -> CoarseSearch | None:
+        """Samples of the map as it is, made when they are first needed; None where it is scanned."""
+        known, key = self._coarse, (getattr(self.map, "norms", None), self.search_memory)
+        if known is None or known[0][0] is not key[0] or known[0][1] != key[1]:
+            self._coarse = known = key, coarse_search(self.map, self.search_memory)
+        return known[1]
 
     def matches(
         self,
         queries: Traverse | Tensor,
         progress: str | None = None,
         sequence: SequenceModel | None = None,
-        search: Search = "auto",
+        search: Search | None = None,
         k: int | None = None,
         apart: int = 5,
     ) -> Iterator[Match]:
@@ -501,7 +522,7 @@ class DejaVu(nn.Module):
         k: int,
         apart: int = 5,
         sequence: SequenceModel | None = None,
-        search: Search = "auto",
+        search: Search | None = None,
     ) -> Match:
         """The k best places of each query, no two of them near each other; the first is `localize`'s.
 
@@ -522,7 +543,7 @@ class DejaVu(nn.Module):
         """
         return Match.joined(self.matches(queries, None, sequence, search, k, apart))
 
-    def matching(self, sequence: SequenceModel | None = None, search: Search = "auto") -> Matching:
+    def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
         """How queries are matched, with probabilities if the map is calibrated for it.
 
         Raises:
@@ -534,7 +555,7 @@ class DejaVu(nn.Module):
             seen = f"the map is {other if self.calibration else 'not calibrated'}"
             problem = f"the precision is {self.precision}, but {seen}"
             raise InputError(f"{problem}; expected a threshold in its place")
-        return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search)
+        return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search or self.search)
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, of single queries or of a sequence (convention 4).

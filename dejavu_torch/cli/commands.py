@@ -30,6 +30,7 @@ from dejavu_torch.cli.options import (
     LiveSearches,
     Loading,
     Searches,
+    Searching,
     Sequences,
     load_map,
     truth_by,
@@ -50,7 +51,7 @@ from dejavu_torch.model_file import REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration
-from dejavu_torch.recognition.search import Search
+from dejavu_torch.recognition.coarse import plan
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, Traverse
@@ -202,7 +203,7 @@ def run_localize(
     top: int | None = None,
     corners: list[list[float]] | None = None,
     sequences: Searches,
-    search: Search = "auto",
+    searching: Searching,
     cluster: str | None = None,
     loading: Loading,
 ) -> None:
@@ -215,8 +216,6 @@ def run_localize(
         top: write so many places of each query, no two within 5 of each other, a row each with its rank; a
             probability is that of the first
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
-        search: of single queries: scan scores all places; auto also, unless the map has a faster way to the
-            same places
         cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
     """
     device_of(loading.device)
@@ -232,6 +231,7 @@ def run_localize(
             together = "--filter" if sequences.filter else f"--sequence {sequences.sequence}"
             raise InputError(f"--cluster {cluster} and {together}; expected one of them")
     model = loading.model(map)
+    searching.of(model)
     if corners is not None:
         if model.velocity is None or model.step is None:
             why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
@@ -249,7 +249,7 @@ def run_localize(
         matcher.check(None, model.map.places)
     model.matching(matcher)
     rule = model.acceptance(matcher)
-    matches = model.matches(query, "localizing", matcher, search, top, APART)
+    matches = model.matches(query, "localizing", matcher, None, top, APART)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()
@@ -279,6 +279,7 @@ def run_live(
     source: str,
     *,
     sequences: LiveSearches,
+    searching: Searching,
     acceptance: Acceptance,
     page: int | None = None,
     reference: str | None = None,
@@ -313,6 +314,7 @@ def run_live(
     matcher = sequences.matcher(APART, acceptance.threshold)
     acceptance.check(matcher)
     model = loading.model(map)
+    searching.of(model)
     acceptance.of(model)
     model.matching(matcher)
     follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
@@ -327,6 +329,7 @@ def run_compare(
     learning: Learning,
     map: Path | None = None,
     sequences: Sequences,
+    searching: Searching,
     model: DejaVu,
     command: str,
 ) -> None:
@@ -358,7 +361,7 @@ def run_compare(
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
         Acceptance(asked, given.precision).of(model)
         model.threshold = None if filter and asked is not None else model.threshold
-    model.to(where)
+    searching.of(model.to(where))
     first, queries = open_source(reference), open_source(query)
     _check_report_folder(out, COMPARED, [reference, query, learning.second], [judging.truth, *learning.files])
     beside = [open_source(one) for one in (learning.second, calibration) if one not in UNREAD]
@@ -608,7 +611,7 @@ def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
     from dejavu_torch.cluster import Cluster, ClusterSearch
 
     with Cluster(cluster) as workers:
-        model.find = ClusterSearch(workers, model.map)
+        model.find = ClusterSearch(workers, model.map, model.search, model.search_memory)
         try:
             yield
         finally:
@@ -705,6 +708,8 @@ def print_map(model: DejaVu) -> None:
     if whitening is not None:
         numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))
         print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
+    if chosen := plan(model.map, model.search_memory):
+        print(f"single queries: {chosen}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
         print(f"this route needs about {model.map.needed:.2g} bytes per place")
 

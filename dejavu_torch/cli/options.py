@@ -18,7 +18,9 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.coarse import MEMORY
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, SequenceModel, Traverse
 
@@ -91,6 +93,27 @@ class LiveSearches(Searches):
     def __post_init__(self) -> None:
         self.filter = self.filter or self.sequence is None
         self.sequence = 1 if self.sequence is None else self.sequence
+
+
+@dataclass
+class Searching:
+    """How single queries are searched for.
+
+    Args:
+        search: coarse scores the places near the best samples of a long spectral map, exact rules out all
+            others, scan scores all places; auto is coarse, or a scan where that takes no longer
+        search_memory: MB that the samples may take
+    """
+
+    search: Search = "auto"
+    search_memory: float = MEMORY / 1e6
+
+    def of(self, model: DejaVu) -> None:
+        """How a model searches from now on."""
+        if not self.search_memory > 0:
+            raise InputError(f"--search_memory {self.search_memory:g}; expected a number above 0, in MB")
+        check_search(self.search)
+        model.search, model.search_memory = self.search, int(1e6 * self.search_memory)
 
 
 @dataclass

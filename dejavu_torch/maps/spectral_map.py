@@ -310,8 +310,9 @@ class SpectralMap(PlaceMap):
         norms = self.norms[start:stop]
         return torch.where(norms > 0, 1 / norms, 0)
 
-    def products(self, queries: Tensor, chunks: range) -> Tensor:
-        """Inner products with all descriptors of equally long chunks: (Q,K) -> (Q,W G).
+    def products(self, queries: Tensor, chunks: range, samples: int = 0) -> Tensor:
+        """Inner products with all descriptors of equally long chunks: (Q,K) -> (Q,W G); or with so many
+        `samples` of each chunk, evenly spaced, of the lowest lines alone.
 
         The inverse transform is linear, so they are the inverse transform of the products with the lines:
         O(lines + W log W) for a query instead of O(W K).
@@ -329,6 +330,11 @@ class SpectralMap(PlaceMap):
         if self.routes:
             means = means[:, self._routes_of(chunks)]
         lines[..., 0] += means * (math.sqrt(length) * factor[0])
+        if 0 < samples < length:
+            lines = lines[..., : len(slots(samples, self.transform, lines.dtype, lines.device)[1])]
+            if self.transform == "dft" and samples % 2 == 0:  # so many half cycles have no sine here
+                lines = torch.cat([lines[..., :-2], torch.zeros_like(lines[..., -2:])], -1)
+            return (from_slots(lines, samples, self.transform) * math.sqrt(samples / length)).flatten(1)
         return from_slots(lines, length, self.transform).flatten(1)
 
     def _runs(self, first: int, last: int, rows: int) -> Iterator[range]:

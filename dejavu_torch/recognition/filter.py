@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -213,10 +213,13 @@ class LocalSearch:
     """A filter that between two searches scores only the likely stretch of places; keeps its state.
 
     All other places count as if they scored as the mean; mean and spread are those of the last search.
+
+    Args:
+        scores: of all places, (1,K) -> (1,N), when it searches.
     """
 
-    def __init__(self, filter: PlaceFilter, route: PlaceMap) -> None:
-        self.filter, self.route = filter, route
+    def __init__(self, filter: PlaceFilter, route: PlaceMap, scores: Callable[[Tensor], Tensor]) -> None:
+        self.filter, self.route, self.all_scores = filter, route, scores
         self.belief: Tensor | None = None  # of the places from `start` on, and of being off the map
         self.start = self.skipped = 0  # skipped: queries before the next
         self.search: Moments | None = None  # of the last search
@@ -232,7 +235,7 @@ class LocalSearch:
         for _ in range(0 if belief is None else 1 + self.skipped):
             expected = filter.moved(expected, places, start)
         if moments is None or near is None:
-            scores = self.route.scores(query)
+            scores = self.all_scores(query)
             moments = moments_of(scores)
         else:
             blocks = self.route.score_blocks(query, start, start + len(expected) - 1)

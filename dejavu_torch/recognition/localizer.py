@@ -15,7 +15,7 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, confidence, confidence_of
 from dejavu_torch.recognition.filter import LocalSearch, PlaceFilter
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Best, Search, search
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, lowest_needed, search
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel
@@ -47,7 +47,10 @@ class Localizer:
 
     Args:
         route: the map; None for scores that are made elsewhere, which only `match` takes.
-        find: finds the n lowest scores of queries in place of `search`, as the workers of a cluster do.
+        find: finds candidates of single queries in place of `search`, as a `CoarseSearch` or the workers of a
+            cluster do.
+        approximate: scores of all places, about, for a `PlaceFilter` that does not always search; None is the
+            map's own.
 
     Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
 
@@ -65,7 +68,8 @@ class Localizer:
         self,
         route: PlaceMap | None = None,
         matching: Matching = SINGLE,
-        find: Callable[[Tensor, int], Best] | None = None,
+        find: Find | None = None,
+        approximate: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         self.route, self.matching, self.find, self.track = route, matching, find, Track()
         sequence, routes = matching.sequence, () if route is None else route.routes
@@ -78,7 +82,8 @@ class Localizer:
         self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
         self.local: LocalSearch | None = None
         if route is not None and isinstance(sequence, PlaceFilter) and not matching.lengths:
-            self.local = LocalSearch(sequence, route) if sequence.search_every > 1 else None
+            every = sequence.search_every
+            self.local = LocalSearch(sequence, route, approximate or route.scores) if every > 1 else None
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor) -> Match:
@@ -90,13 +95,11 @@ class Localizer:
         wanted = [(matching.k or 1, matching.radius)]
         if matching.platt is not None:
             wanted.append((min(2, places), TOLERANCE))
-        # each candidate that is chosen rules out 2 radius + 1
-        n = min(places, max((k - 1) * (2 * radius + 1) + 1 for k, radius in wanted))
+        n = lowest_needed(wanted, places)
         few = n <= max(1, FEW * min(places, route.block_places)) or places > SCORES_AT_ONCE
         way, size = self._by_scores, places
         if matching.sequence is None and matching.on_scores is None and (few or self.find is not None):
-            find = self.find or partial(search, route, method=matching.search)
-            way, size = partial(self._by_search, find, wanted, n), LISTED * n
+            way, size = partial(self._by_search, wanted), LISTED * n
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         return Match.joined(way(part.to(route.positions.device)) for part in parts)
 
@@ -163,10 +166,13 @@ class Localizer:
             return self.match(self.route.scores(descriptors))
         return self._answer(Match.joined(map(self._locally, descriptors.split(1))))
 
-    def _by_search(
-        self, find: Callable[..., Best], wanted: list[tuple[int, int]], n: int, descriptors: Tensor
-    ) -> Match:
-        """By the n lowest scores alone, of which candidates (k, radius) are chosen."""
-        score, place = find(descriptors, n)
+    def _by_search(self, wanted: Wanted, descriptors: Tensor) -> Match:
+        """By some of the lowest scores alone, of which candidates (k, radius) are chosen."""
+        if self.find is not None:
+            score, place = self.find(descriptors, wanted)
+        else:
+            assert self.route is not None
+            n, scan = lowest_needed(wanted, self.route.places), self.matching.search == "scan"
+            score, place = search(self.route, descriptors, n, scan)
         match, *second = (best_candidates(score, *one, places=place) for one in wanted)
         return self._answer(match, *map(confidence, second))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import torch
@@ -11,8 +12,10 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.types import InputError
 
-Search = Literal["auto", "scan"]
-Best = tuple[Tensor, Tensor]  # (Q,n) scores, the lowest first, and places, of equal scores the lowest first
+Search = Literal["auto", "coarse", "exact", "scan"]
+Best = tuple[Tensor, Tensor]  # (Q,n) scores and places, of equal scores the lowest place first
+Wanted = list[tuple[int, int]]  # (k, radius): how many candidates, further than `radius` places apart
+Find = Callable[[Tensor, Wanted], Best]  # finds candidates of queries (Q,K)
 
 SCORES_AT_ONCE = 2**24  # numbers of Q x n held at a time
 
@@ -21,18 +24,23 @@ def check_search(method: str) -> None:
     """Refuse a way to search that does not exist."""
     if method not in get_args(Search):
         removed = " was removed" if method in ("bound", "ivf") else ""
-        raise InputError(f"search {method!r}{removed}; expected auto or scan")
+        raise InputError(f"search {method!r}{removed}; expected auto, coarse, exact or scan")
+
+
+def lowest_needed(wanted: Wanted, places: int) -> int:
+    """How many of the lowest scores hold all candidates: each that is chosen rules out 2 radius + 1."""
+    return min(places, max((k - 1) * (2 * radius + 1) + 1 for k, radius in wanted))
 
 
 @torch.no_grad()
-def search(route: PlaceMap, queries: Tensor, n: int, method: Search = "auto") -> Best:
-    """The n lowest scores of queries (Q,K) on a map; memory holds the scores of a block of places.
+def search(route: PlaceMap, queries: Tensor, n: int, scan: bool = False) -> Best:
+    """The n lowest scores of queries (Q,K) on a map, ascending; memory holds those of a block of places.
 
     Args:
-        method: "scan" scores all places; "auto" uses `PlaceMap.lowest` for n = 1 if the map has it.
+        scan: score all places; else `PlaceMap.lowest` is used for n = 1 if the map has it.
     """
     queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
-    own = route.lowest(queries) if n == 1 and method == "auto" else None
+    own = route.lowest(queries) if n == 1 and not scan else None
     if own is not None:
         return own[0][:, None], own[1][:, None]
     score, place = empty_topk(queries, n)
