@@ -305,14 +305,35 @@ class SpectralMap(PlaceMap):
         for some in units.split(max(1, LONG // (stop - start))):
             yield self.products(some, range(chunk, chunk + 1))
 
+    def samples(self, chunk: int, count: int) -> tuple[Tensor, Tensor]:
+        """Descriptors at so many even positions of a chunk, low-passed: the inverse transform of as many
+        lines.
+
+        Shape: -> (M,K), and the places in the chunk that are nearest to the positions, (M,) int64.
+        """
+        (start, stop), (line, feature, value) = self.chunks[chunk], self.lines(chunk)
+        slot, factor = slots(stop - start, self.transform, value.dtype, value.device)
+        size = len(slots(count, self.transform, value.dtype, value.device)[1])
+        low = value.new_zeros(self.dimension, size)
+        kept = (slot[line] < size).nonzero()[:, 0]
+        at = slot[line[kept]]
+        low[feature[kept], at] = value[kept] * factor[at]
+        mean = self.means[self._routes_of(range(chunk, chunk + 1))][0]
+        low[:, 0] += mean * (math.sqrt(stop - start) * factor[0])
+        if self.transform == "dft" and count % 2 == 0:  # so many half cycles have no sine here
+            low[:, -2:] = 0
+        rows = from_slots(low, count, self.transform).T * math.sqrt(count / (stop - start))
+        half = 0.5 if self.transform == "dct" else 0.0  # its places are in the middle of a step
+        at = (torch.arange(count, device=value.device) + half) * ((stop - start) / count) - half
+        return rows, at.round().long().clamp(max=stop - start - 1)
+
     def inverse_norms(self, start: int = 0, stop: int | None = None) -> Tensor:
         """1 / norm of the places [start, stop), 0 for a norm of 0."""
         norms = self.norms[start:stop]
         return torch.where(norms > 0, 1 / norms, 0)
 
-    def products(self, queries: Tensor, chunks: range, samples: int = 0) -> Tensor:
-        """Inner products with all descriptors of equally long chunks: (Q,K) -> (Q,W G); or with so many
-        `samples` of each chunk, evenly spaced, of the lowest lines alone.
+    def products(self, queries: Tensor, chunks: range) -> Tensor:
+        """Inner products with all descriptors of equally long chunks: (Q,K) -> (Q,W G).
 
         The inverse transform is linear, so they are the inverse transform of the products with the lines:
         O(lines + W log W) for a query instead of O(W K).
@@ -330,11 +351,6 @@ class SpectralMap(PlaceMap):
         if self.routes:
             means = means[:, self._routes_of(chunks)]
         lines[..., 0] += means * (math.sqrt(length) * factor[0])
-        if 0 < samples < length:
-            lines = lines[..., : len(slots(samples, self.transform, lines.dtype, lines.device)[1])]
-            if self.transform == "dft" and samples % 2 == 0:  # so many half cycles have no sine here
-                lines = torch.cat([lines[..., :-2], torch.zeros_like(lines[..., -2:])], -1)
-            return (from_slots(lines, samples, self.transform) * math.sqrt(samples / length)).flatten(1)
         return from_slots(lines, length, self.transform).flatten(1)
 
     def _runs(self, first: int, last: int, rows: int) -> Iterator[range]:
