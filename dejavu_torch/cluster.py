@@ -228,8 +228,7 @@ class _Searcher:
     def __init__(self, part: SpectralMap, first: int, method: Search, memory: int) -> None:
         torch.set_num_threads(1)
         self.part, self.first = part, first
-        coarse = None if method == "scan" else coarse_search(part, memory)
-        self.exact, self.find = method == "exact", coarse
+        self.find = None if method == "scan" else coarse_search(part, memory, method == "exact")
 
     def process(self) -> int:
         """The number of this process."""
@@ -241,7 +240,7 @@ class _Searcher:
         if self.find is None:
             score, place = search(self.part, own, lowest_needed(wanted, self.part.places), scan=True)
         else:
-            score, place = self.find(own, wanted, self.exact)
+            score, place = self.find(own, wanted)
         return score.numpy(), torch.where(score.isfinite(), place + self.first, place).numpy()
 
 

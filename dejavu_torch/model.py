@@ -165,8 +165,10 @@ class DejaVu(nn.Module):
         self.search: Search = "auto"  # how single queries are searched for, see `localize`
         self.search_memory = MEMORY  # bytes that it may take at most beyond the map
         self.find: Find | None = None  # in its place, as a cluster does
-        # samples for it, once they were needed, and what they are of: chunks and bytes
-        self._coarse: tuple[tuple[Tensor | None, int], CoarseSearch | None] | None = None
+        self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (
+            (),
+            None,
+        )  # its samples, and what they are of
         self._warned: set[tuple[str, str]] = set()  # traverse and line of warnings that are logged once
 
     def settings(self) -> dict[str, Any]:
@@ -476,18 +478,19 @@ class DejaVu(nn.Module):
             sequence.check(None, self.map.places)
         searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.on_scores is None
         if searches and self.find is None and matching.search != "scan":
-            coarse = self._coarse_search()
+            coarse = self._coarse_search(matching.search == "exact")
         if coarse is None:
             return Localizer(self.map, matching, self.find)
-        find = partial(coarse, exact=True) if matching.search == "exact" else coarse
-        return Localizer(self.map, matching, find, coarse.approximate)
+        return Localizer(self.map, matching, coarse, coarse.approximate)
 
-    def _coarse_search(self) -> CoarseSearch | None:
+    def _coarse_search(self, exact: bool) -> CoarseSearch | None:
         """Samples of the map as it is, made when they are first needed; None where it is scanned."""
-        known, key = self._coarse, (getattr(self.map, "norms", None), self.search_memory)
-        if known is None or known[0][0] is not key[0] or known[0][1] != key[1]:
-            self._coarse = known = key, coarse_search(self.map, self.search_memory)
-        return known[1]
+        norms = getattr(self.map, "norms", None)  # another tensor if the map is another
+        known, found = self._coarse
+        if not known or known[0] is not norms or known[1:] != (self.search_memory, exact):
+            found = coarse_search(self.map, self.search_memory, exact)
+            self._coarse = (norms, self.search_memory, exact), found
+        return found
 
     def matches(
         self,
