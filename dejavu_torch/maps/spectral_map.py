@@ -318,9 +318,9 @@ class SpectralMap(PlaceMap):
         kept = (slot[line] < size).nonzero()[:, 0]
         at = slot[line[kept]]
         low[feature[kept], at] = value[kept] * factor[at]
-        mean = self.means[self._routes_of(range(chunk, chunk + 1))][0]
+        mean = self.means[self._routes_of(range(chunk, chunk + 1))][0].to(low)
         low[:, 0] += mean * (math.sqrt(stop - start) * factor[0])
-        if self.transform == "dft" and count % 2 == 0:  # so many half cycles have no sine here
+        if self.transform == "dft" and count % 2 == 0 and count < stop - start:  # half is aliased
             low[:, -2:] = 0
         rows = from_slots(low, count, self.transform).T * math.sqrt(count / (stop - start))
         half = 0.5 if self.transform == "dct" else 0.0  # its places are in the middle of a step

@@ -23,6 +23,7 @@ from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import InputError
 
 FEWEST = 20_000  # places; a shorter map is scanned, which takes no longer
+OTHERS = 12  # bytes of a sample beside its numbers
 MEMORY = 100_000_000  # bytes of the samples at most by default
 SPACINGS = (32, 16, 12, 8, 6, 4, 3, 2)  # places from one sample to the next
 COARSE, FINE = 0.93, 0.98  # shares of the lines' energy that coarse and fine samples hold
@@ -58,12 +59,13 @@ class Plan(NamedTuple):
         )
 
 
-def plan(route: PlaceMap, limit: int = MEMORY) -> Plan | None:
+def plan(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> Plan | None:
     """The widest spacings at which samples hold enough of a map; None for what is scanned: a map of another
     kind or metric, of few places or a single chunk, or whose lines are not low.
 
     Args:
         limit: bytes. Samples that do not fit are taken further apart, and more of them refined.
+        exact: a sample of every place, whatever the limit.
 
     Raises:
         InputError: a limit below the samples of a single chunk.
@@ -73,7 +75,7 @@ def plan(route: PlaceMap, limit: int = MEMORY) -> Plan | None:
     longest = max(stop - start for start, stop in route.chunks)
 
     def size(places: int, *spacings: int) -> int:
-        return sum(-(-places // d) * (route.dimension + 12) for d in spacings)
+        return sum(-(-places // d) * (route.dimension + OTHERS) for d in spacings)
 
     least = size(longest, SPACINGS[0], SPACINGS[1])
     if limit < least:
@@ -81,6 +83,8 @@ def plan(route: PlaceMap, limit: int = MEMORY) -> Plan | None:
         raise InputError(f"{seen}; expected at least {least}, for a chunk")
     if route.places < max(FEWEST, 2 * longest):
         return None
+    if exact:
+        return Plan(1, 1, REFINED, 1.0, size(route.places, 1))
     held = energy_held(route)
     widest = next((d for d in SPACINGS if held[d] >= COARSE), 0)
     enough = next((d for d in SPACINGS if held[d] >= FINE), 2)
@@ -109,15 +113,9 @@ def energy_held(route: SpectralMap) -> dict[int, float]:
 
 
 def coarse_search(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> CoarseSearch | None:
-    """A search by samples of a map; None for what is scanned, see `plan`.
-
-    Args:
-        exact: finds what a scan finds, guaranteed. It keeps a row of every place, whatever the limit.
-    """
-    chosen = plan(route, limit)
-    if not isinstance(route, SpectralMap) or chosen is None:
-        return None
-    return CoarseSearch(route, chosen._replace(coarse=1, fine=1) if exact else chosen)
+    """A search by samples of a map; None for what is scanned, see `plan`."""
+    chosen = plan(route, limit, exact)
+    return CoarseSearch(route, chosen) if isinstance(route, SpectralMap) and chosen is not None else None
 
 
 class Samples:
@@ -195,7 +193,7 @@ class CoarseSearch:
         size = torch.linalg.vector_norm(small.float(), dim=1).clamp(min=1)
         cosines = torch.cat([*self.fine.products(small)]) / size / self.fine.norm[:, None]
         nearest = torch.cat([self._nearest(chunk) for chunk in range(len(self.starts))])
-        scores = (1 - cosines)[nearest].T.contiguous()
+        scores: Tensor = (1 - cosines)[nearest].T.contiguous()
         query, place = self._windows(units, self.coarse.best_of_groups(small), [(1, 0)])
         scores[query, place] = self._scores(units, query, place)
         return scores
@@ -204,11 +202,12 @@ class CoarseSearch:
         units = F.normalize(queries.to(torch.promote_types(queries.dtype, torch.float32))).float()
         best = self.coarse.best_of_groups(to_int8(units))
         query, place = self._windows(units, best, wanted)
-        found = self._by_query(query, place, self._scores(units, query, place), len(units))
+        shape = len(units), max(k for k, _ in wanted)
+        found = self._by_query(query, place, self._scores(units, query, place), shape)
         last = last_wanted(*found, wanted)
         if self.exact:
             last = last.masked_fill(last.isinf(), -1)  # too few were found: it is scanned
-            found = self._by_query(*self._below(units, best, last), len(units))
+            found = self._by_query(*self._below(units, best, last), shape)
             last = last_wanted(*found, wanted)
         left = last.isinf() | ~(found[0].amin(1) <= 1 - UNLIKE)
         if left.any():
@@ -222,7 +221,7 @@ class CoarseSearch:
 
     def _windows(self, units: Tensor, best: Tensor, wanted: Wanted) -> tuple[Tensor, Tensor]:
         """Pairs (P,) of a query and a place near its best fine samples, by query and place: around each as
-        many places as a candidate rules out."""
+        many places as candidates of a single peak may lie apart."""
         coarse, fine, plan = self.coarse, self.fine, self.plan
         count = max(k for k, _ in wanted)
         best, group = best.topk(min(max(plan.refined, 2 * count), best.shape[1]), 1, sorted=False)
@@ -231,9 +230,9 @@ class CoarseSearch:
         offsets = torch.arange(-reach, reach + 1, device=middle.device)
         at = (middle[:, :, None] + offsets).clamp(0, len(fine.place) - 1).flatten(1)
         cosines = torch.bmm(fine.rows[at].to(units), units[:, :, None])[..., 0] / fine.norm[at]
-        width = max(radius for _, radius in wanted) + plan.fine + 1
+        width = plan.fine + 1 + max((k - 1) * (radius + 1) for k, radius in wanted)
         windows = best_candidates(-cosines, min(count + SPARE, at.shape[1]), width, fine.place[at])
-        close = windows.score <= windows.score[:, count - 1 : count] + CLOSE
+        close = windows.score <= windows.score[:, :count].amax(1, keepdim=True) + CLOSE
         query, rank = (windows.accepted & close).nonzero().T
         around = torch.arange(-width, width + 1, device=query.device)
         place = (windows.index[query, rank, None] + around).clamp(0, self.route.places - 1)
@@ -296,11 +295,11 @@ class CoarseSearch:
         place = self.fine.place[first:last]
         return first + torch.bucketize(at, (place[1:] + place[:-1]) / 2)
 
-    def _by_query(self, query: Tensor, place: Tensor, score: Tensor, queries: int) -> Best:
-        """Pairs in order as a row for each query; +inf at no place."""
-        counts = torch.bincount(query, minlength=queries)
+    def _by_query(self, query: Tensor, place: Tensor, score: Tensor, shape: tuple[int, int]) -> Best:
+        """Pairs in order as a row for each query, of so many columns at least; +inf at no place."""
+        counts = torch.bincount(query, minlength=shape[0])
         column = torch.arange(len(query), device=query.device) - (counts.cumsum(0) - counts)[query]
-        table = score.new_full((queries, max(1, int(counts.max()))), math.inf)
+        table = score.new_full((shape[0], max(shape[1], int(counts.max()))), math.inf)
         where = torch.full_like(table, self.route.places, dtype=torch.int64)
         table[query, column], where[query, column] = score, place
         return table, where
@@ -309,7 +308,8 @@ class CoarseSearch:
 def to_int8(units: Tensor) -> Tensor:
     """Unit vectors (n,K) in integers of 8 bits, on a scale that depends on K alone."""
     scale = 127 * max(1.0, math.sqrt(units.shape[1]) / LARGE)
-    return (units * scale).round().clamp(-127, 127).to(torch.int8)
+    rounded: Tensor = (units * scale).round().clamp(-127, 127)
+    return rounded.to(torch.int8)
 
 
 @cache

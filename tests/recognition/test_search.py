@@ -107,7 +107,9 @@ def test_the_best_of_blocks_are_those_of_all_scores(
 def test_candidates_are_those_of_all_scores(places: int, k: int, radius: int, values: int, seed: int) -> None:
     scores, k = table(3, places, values, seed), min(k, places)
     route = Scored(scores, 7)
-    found = Localizer(route, Matching(k=k, radius=radius), lambda queries, n: search(route, queries, n))
+    found = Localizer(
+        route, Matching(k=k, radius=radius), lambda queries, wanted: search(route, queries, places)
+    )
     match, expected = found(rows_of(route)), best_candidates(scores, k, radius)
     assert all(map(torch.equal, match, expected))
 
@@ -165,9 +167,9 @@ def test_auto_takes_the_maps_own_way_and_finds_what_a_scan_finds() -> None:
 def test_what_cannot_be_searched_so_is_refused() -> None:
     wave = walk(128)
     model = DejaVu(whitening="none").learn(wave)
-    with refused("search 'all'", "expected auto or scan"):
+    with refused("search 'all'", "expected auto, coarse, exact or scan"):
         model.localize(wave, search="all")  # type: ignore[arg-type]
     for method in ("bound", "ivf"):
         for sequence in (None, SequenceMatcher(3), PlaceFilter()):
-            with refused(f"search '{method}' was removed", "expected auto or scan"):
+            with refused(f"search '{method}' was removed", "expected auto, coarse, exact or scan"):
                 model.localize(wave, sequence=sequence, search=method)  # type: ignore[arg-type]
