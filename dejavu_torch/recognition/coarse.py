@@ -84,7 +84,7 @@ def plan(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> Plan | No
     if route.places < max(FEWEST, 2 * longest):
         return None
     if exact:
-        return Plan(1, 1, REFINED, 1.0, size(route.places, 1))
+        return Plan(1, 1, 1, 1.0, size(route.places, 1))
     held = energy_held(route)
     widest = next((d for d in SPACINGS if held[d] >= COARSE), 0)
     enough = next((d for d in SPACINGS if held[d] >= FINE), 2)
@@ -148,10 +148,11 @@ class Samples:
     def best_of_groups(self, queries: Tensor) -> Tensor:
         """`GROUP` times the largest product in each group of rows, plus its row in the group: (Q,K) int8 ->
         (Q,G) int32. A maximum of one number is several times faster than one with its index."""
-        number, best = torch.arange(GROUP, dtype=torch.int32, device=queries.device)[:, None], []
-        for products in self.products(queries):
-            best.append(products.view(-1, GROUP, len(queries)).mul_(GROUP).add_(number).amax(1))
-        return torch.cat(best).T.contiguous()
+        number = torch.arange(GROUP, dtype=torch.int32, device=queries.device)[:, None]
+        best = number.new_empty(len(queries), len(self.rows) // GROUP)
+        for block, products in zip(best.split(BLOCK // GROUP, 1), self.products(queries), strict=True):
+            block.copy_(products.view(-1, GROUP, len(queries)).mul_(GROUP).add_(number).amax(1).T)
+        return best
 
 
 class CoarseSearch:
@@ -175,7 +176,7 @@ class CoarseSearch:
         self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
         self.fine = Samples(route, chosen.fine)
         self.coarse = self.fine if self.exact else Samples(route, chosen.coarse)
-        self.cosines = self._least_cosines() if self.exact else None
+        self.bounds = self._bounds() if self.exact else None
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
@@ -256,15 +257,19 @@ class CoarseSearch:
         For unit vectors q, s and x, the angle of q and x is at least that of q and s less that of s and x.
         Here s are the fine samples of a group, and x the places near them.
         """
-        assert self.cosines is not None
+        assert self.bounds is not None
         small = to_int8(units).float()
-        size = torch.linalg.vector_norm(small, dim=1).clamp(min=1)
-        rounded = angle((units * small).sum(1) / size)
-        reach = (angle(1 - score) + rounded).clamp(max=math.pi / 2)[:, None]
-        norm = self.fine.norm.view(-1, GROUP).amin(1)
-        cosine = best.float().clamp_(min=0).div_(GROUP * norm).div_(size[:, None])
-        least = self.cosines * reach.cos() - (1 - self.cosines.square()).sqrt() * reach.sin()
-        query, group = (cosine >= least - ROUNDING).nonzero().T
+        size = torch.linalg.vector_norm(small, dim=1)
+        reach = angle(1 - score) + angle((units * small).sum(1) / size.clamp(min=1))
+        reach = reach.clamp(max=math.pi / 2)
+        turned = GROUP * size[:, None] * torch.stack([reach.cos(), -reach.sin(), -torch.ones_like(reach)], 1)
+        parts = []
+        for start in range(0, best.shape[1], BLOCK // GROUP):  # they stay in the cache
+            # the cosine of a sum of two angles; a product below 0 is not told from 0
+            least = F.threshold(turned @ self.bounds[:, start : start + BLOCK // GROUP], 0, -math.inf)
+            pairs = (best[:, start : start + BLOCK // GROUP] >= least).nonzero()
+            parts.append(pairs + pairs.new_tensor([0, start]))
+        query, group = torch.cat(parts).T.contiguous()
         chunk = torch.bucketize(self.fine.place[group * GROUP], self.starts, right=True) - 1
         found = [(query[:0], query[:0], score[:0])]
         for g in chunk.unique().tolist():
@@ -276,8 +281,9 @@ class CoarseSearch:
         order = (query * self.route.places + place).argsort()
         return query[order], place[order], score[order]
 
-    def _least_cosines(self) -> Tensor:
-        """Of each group of fine samples the least cosine of one and a place near it, (S / GROUP,)."""
+    def _bounds(self) -> Tensor:
+        """Of each group of fine samples the least length, times the cosine and the sine of the largest angle
+        between a sample and a place near it, and of itself: (3, S / GROUP)."""
         least = torch.ones(len(self.fine.norm) // GROUP, device=self.fine.norm.device)
         for chunk, (start, stop) in enumerate(self.route.chunks):
             nearest, units = self._nearest(chunk), F.normalize(self.route.decode(chunk))
@@ -285,7 +291,9 @@ class CoarseSearch:
             cosine = cosine.where(self.route.norms[start:stop] > 0, 1)  # these score 1
             least.scatter_reduce_(0, nearest // GROUP, cosine, "amin")
         least -= ROUNDING
-        return least.where(least > 0, -1)  # from a right angle on nothing is ruled out
+        least = least.where(least > 0, -1)  # from a right angle on nothing is ruled out
+        sine, norm = (1 - least.square()).sqrt(), self.fine.norm.view(-1, GROUP).amin(1)
+        return norm * torch.stack([least, sine, torch.full_like(least, ROUNDING)])
 
     def _nearest(self, chunk: int) -> Tensor:
         """The fine sample that each place of a chunk is nearest to, (W,)."""
