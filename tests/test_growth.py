@@ -518,7 +518,7 @@ def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
 
 def test_places_of_one_visit_take_no_bytes(tmp_path: Path) -> None:
     learned(walk(100)).save(tmp_path / "m")
-    assert "map.visits" not in read_map(tmp_path / "m").tensors
+    assert "map.visits" not in read_map(tmp_path / "m")[0]
 
 
 @pytest.mark.parametrize("chunk", [50, 10_000])

@@ -15,7 +15,7 @@ from dejavu_torch import HOG, best_match, evaluate, model_file
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
-from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.place_map import Mapper, PlaceMap, require
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
@@ -44,11 +44,10 @@ class StoredMap(PlaceMap):
     def summary(self) -> MapSummary:
         return MapSummary(self.kind, self.places, self.places, 0, 0, (), {"values": self.values.nbytes}, {})
 
-    def disagreement(self) -> str:
-        fits = tuple(self.values.shape) == (self.places, self.dimension)
-        return (
-            "" if fits else f"values {tuple(self.values.shape)}; expected ({self.places}, {self.dimension})"
-        )
+    def check(self) -> None:
+        seen, expected = tuple(self.values.shape), (self.places, self.dimension)
+        require(seen == expected, f"values {seen}; expected {expected}")
+        super().check()
 
 
 class StoredMapper(Mapper):

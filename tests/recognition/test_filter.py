@@ -219,7 +219,7 @@ class Watched(PlaceMap):
     """A route that counts the places that it scores; a query is the row of scores itself."""
 
     kind = "watched"
-    settings = summary = disagreement = lambda self: {}  # type: ignore[assignment]
+    settings = summary = lambda self: {}  # type: ignore[assignment]
 
     def __init__(self, places: int) -> None:
         super().__init__(places, places)

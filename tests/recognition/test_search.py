@@ -35,7 +35,7 @@ class Scored(PlaceMap):
     """Query i scores row i of a table; blocks of `size` places."""
 
     kind = "scored"
-    settings = summary = disagreement = lambda self: {}  # type: ignore[assignment]
+    settings = summary = lambda self: {}  # type: ignore[assignment]
 
     def __init__(self, table: Tensor, size: int) -> None:
         super().__init__(table.shape[1], 1)
