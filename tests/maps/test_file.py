@@ -288,7 +288,7 @@ CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
     ({}, {MAPPER + "resolution": -1.0}, ["-1.0"]),
     ({}, {"map.dimension": 10**12}, []),
     ({}, {"map.metric": "l2"}, ["'l2'"]),
-    ({}, {"map.temperature": 1.0}, ["temperature"]),
+    ({}, {"map.temperature": 1.0}, []),
     ({}, {"names": encode_names([f"{i:05}.png" for i in range(10_000)])}, ["10000 frames; expected 64"]),
     ({"map.lengths": [10**12]}, {}, ["[1000000000000] places"]),
     ({"map.lengths": [-64]}, {}, ["[-64] places"]),

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from test_spectral import grow, levels_of
+from test_spectral import levels_of
 from torch import Tensor
 
 from dejavu_torch import DejaVu
@@ -18,7 +17,6 @@ from dejavu_torch.maps import spectral, spectral_map
 from dejavu_torch.maps.codec import encode
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap, sparse_products
-from dejavu_torch.types import InputError
 
 
 def coded(levels: Tensor) -> Chunk:
@@ -87,20 +85,9 @@ def test_a_map_takes_few_bytes_for_each_place(budget: float) -> None:
 def test_a_map_that_was_loaded_is_saved_without_coding_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    features = torch.randn(300, 5, generator=torch.Generator().manual_seed(0)) * torch.tensor(
-        [900.0, 1, 1, 1, 1]
-    )
+    features = torch.randn(300, 5) * torch.tensor([900.0, 1, 1, 1, 1])
     model = DejaVu(mapper=SpectralMapper(None, step=0.5, chunk=90), whitening="none").learn(features)
     model.save(tmp_path / "a.safetensors")
-
-    def refuse(levels: Tensor) -> Any:
-        raise InputError("coded")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(spectral, "encode", refuse)
-        again = DejaVu.load(tmp_path / "a.safetensors")
-        again.save(tmp_path / "b.safetensors")
+    monkeypatch.delattr(spectral, "encode")
+    DejaVu.load(tmp_path / "a.safetensors").save(tmp_path / "b.safetensors")
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
-    assert isinstance(again.map, SpectralMap)
-    grow(again.map, again.whitened(features[:50]))  # only these are coded
-    assert [part.places for part in again.map.coded()] == [90, 90, 90, 30, 50]
