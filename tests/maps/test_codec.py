@@ -1,13 +1,13 @@
-"""Levels as a stream, and a stream that was damaged."""
+"""Levels as a stream, by Python and compiled, and a stream that was damaged."""
 
 from __future__ import annotations
 
 import math
+import sys
 import zlib
-from collections.abc import Iterator
-from typing import Any
 from unittest import mock
 
+import numpy as np
 import pytest
 import torch
 from helpers import refused
@@ -17,19 +17,7 @@ from torch import Tensor
 
 from dejavu_torch.maps import codec
 from dejavu_torch.maps.codec import Stream, coded_bytes, decode, encode
-
-
-@pytest.fixture(scope="module", params=["python", "numba"], autouse=True)
-def coder(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Whatever is tested here, with either."""
-    if request.param == "python":
-        kernel: Any = codec._code
-    else:
-        pytest.importorskip("numba")
-        kernel = codec._compiled()
-    assert kernel is not None
-    with mock.patch.object(codec, "_kernel", return_value=kernel):
-        yield
+from dejavu_torch.types import InputError
 
 
 def levels(rows: int = 200, columns: int = 7, spread: float = 3.0) -> Tensor:
@@ -48,13 +36,6 @@ def test_a_stream_gives_the_levels_back(rows: int, columns: int, spread: float, 
     assert torch.equal(again.int(), own)
     assert again.dtype == (torch.int8 if int(own.max()) < 128 and int(own.min()) >= -128 else torch.int32)
     assert 0 <= coded_bytes(own) - len(stream.bytes) <= 1
-
-
-@pytest.mark.parametrize("value", [127, 128, -128, -129, 2**31 - 1, 1 - 2**31])
-def test_levels_that_a_byte_just_holds_or_not(value: int) -> None:
-    own = levels()
-    own[150, 3] = value
-    assert torch.equal(decode(encode(own), 200, 7).int(), own)
 
 
 def test_how_many_rows_are_coded_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,6 +106,8 @@ def test_damage_is_told() -> None:
     for rows in (199, 201):
         with refused("truncated or altered", str(rows * 7)):
             decode(stream, rows, 7)
+    with refused("altered"):  # after its last bit that counts a stream goes on in zeros
+        decode(encode(torch.zeros(10, 4, dtype=torch.int8)), 11, 4)
 
 
 def test_a_stream_of_too_many_or_too_few_bytes_is_told() -> None:
@@ -164,8 +147,36 @@ def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch
         encode(sparse)
 
 
-def test_the_shape_is_part_of_what_a_stream_says() -> None:
-    """Behind its last bit that counts a stream goes on in zeros."""
-    stream = encode(torch.zeros(10, 4, dtype=torch.int8))
-    with refused("altered"):
-        decode(stream, 11, 4)
+@given(st.integers(1, 700), st.integers(1, 12), st.integers(0, 400), st.integers(0, 2**32 - 1))
+def test_compiled_and_plain_are_one(rows: int, columns: int, spread: int, seed: int) -> None:
+    """Streams, and how an altered stream is refused."""
+    random = np.random.default_rng(seed)
+    own = (random.integers(-spread, spread + 1, (rows, columns)) * random.random((rows, 1)) ** 4).astype(int)
+    levels, told = torch.from_numpy(own).int(), []
+    for kernel in (codec._code, codec._compiled()):
+        with mock.patch.object(codec, "_kernel", return_value=kernel):
+            stream = encode(levels)
+            altered = stream.bytes.numpy().copy()
+            altered[seed // 8 % len(altered)] ^= 1 << seed % 8
+            told.append([stream.bytes.tolist(), stream.checksum])
+            for packed in (altered, altered[: len(altered) // 2]):
+                try:
+                    found = decode(Stream(torch.from_numpy(packed.copy()), stream.checksum), rows, columns)
+                    told[-1].append(found.tolist())
+                except InputError as error:
+                    told[-1].append(str(error))
+    assert told[0] == told[1]
+
+
+def test_it_is_compiled_once_it_pays_if_it_can_be(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(codec, "_coded", 0)
+    assert codec._kernel(codec.WORTH_COMPILING - 1) is codec._code
+    assert codec._kernel(1) is codec._compiled() is not codec._code
+    monkeypatch.setitem(sys.modules, "numba.extending", None)
+    codec._compiled.cache_clear()
+    with caplog.at_level("INFO", "dejavu_torch"):
+        assert codec._kernel(1) is codec._kernel(1) is codec._code
+    codec._compiled.cache_clear()
+    assert ["not by numba" in line for line in caplog.messages] == [True]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
 from dejavu_torch.maps import layer_search, template_map
-from dejavu_torch.maps.layer_search import _circles, lowest
+from dejavu_torch.maps.layer_search import _circles
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
@@ -130,15 +130,3 @@ def test_a_map_of_ten_million_places_holds_its_templates_alone() -> None:
     assert route.summary().covered == 10**7
     held = [*route.buffers(), *_circles(3164, 3163, route.layers.device)]
     assert sum(tensor.nbytes for tensor in held) < 300_000
-
-
-def test_two_rows_are_searched_beyond_their_common_period() -> None:
-    for taus in ((3, 4), (4, 3), (6, 4), (5, 5), (7, 1)):
-        generator = torch.Generator().manual_seed(sum(taus))
-        one, other = (torch.randint(0, 5, (6, tau), generator=generator).float() for tau in taus)
-        for places in (max(taus), 11, 30):
-            i = torch.arange(places)
-            sums = (one[:, i % taus[0]] + other[:, i % taus[1]]) / 3
-            score, place = lowest(one, other, places, 3)
-            assert torch.equal(score, sums.amin(1))
-            assert torch.equal(place, sums.min(1).indices)

@@ -26,7 +26,7 @@ MATRICES = arrays(np.float32, array_shapes(min_dims=2, max_dims=4, max_side=6), 
 
 
 class Net(nn.Module):
-    """A user's network: tied weights, a mask of infinities, 16 bits, a channel that is off."""
+    """A user's network: tied weights, infinities, an expanded buffer, 16 bits, a channel of 0."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class Net(nn.Module):
         self.again.weight = self.first.weight
         self.mask = nn.Parameter(torch.tensor([[0.0, -torch.inf]]))
         self.narrow = nn.Parameter(torch.rand(2, 2).half())
-        self.register_buffer("table", torch.rand(4, 4))
+        self.register_buffer("table", torch.rand(4, 1).expand(4, 4))
         with torch.no_grad():
             self.first.weight[3] = 0
 

@@ -132,7 +132,7 @@ MUTANTS = [
         "dejavu_torch/recognition/select.py",
         "torch.where(finite, index, -1)",
         "torch.where(finite | (torch.arange(k) > 0), index, -1)",
-        ("tests/recognition/test_candidates.py::test_equals_reference",),
+        ("tests/recognition/test_select.py::test_candidates_equal_reference",),
     ),
     Mutant(
         "Of a sequence, a place that nothing covers for the latest query is not reported.",
