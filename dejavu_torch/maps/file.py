@@ -83,7 +83,7 @@ def _finite(text: str) -> float:
 
 
 def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What `write_map` wrote; an InputError if the file is missing, truncated, foreign, damaged, or of another
+    """What `write_map` wrote; an InputError if the file is missing, truncated, foreign, damaged or of another
     format."""
     check_regular(path, EXPECTED)
     try:
@@ -101,8 +101,8 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             if version != FORMAT:
                 newer = isinstance(version, int) and version > FORMAT
                 cure = "a newer dejavu_torch is needed" if newer else "learn the route anew"
-                seen = f"{path} has map format {version!r:.40}"
-                raise InputError(f"{seen}; this version reads {FORMAT}: {cure}")
+                problem = f"{path} has map format {version!r:.40}; this version reads {FORMAT}"
+                raise InputError(f"{problem}: {cure}")
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
         header, sums = sealed[HEADER], dict(sealed["checksums"] or {})
         seen = checksums(tensors, header)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from functools import cache
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -55,7 +55,7 @@ class Chunk(NamedTuple):
 
 
 class SpectralState(NamedTuple):
-    """The header of a map file for a spectral map; see its arguments."""
+    """What `SpectralMap.get_extra_state` gives; see its arguments."""
 
     kind: Literal["spectral"]
     places: int
@@ -135,19 +135,14 @@ class SpectralMap(PlaceMap):
         resolution: float = 0.0,
         step: float = 0.0,
     ) -> None:
-        if metric not in get_args(SpectralMetric):
-            raise InputError(f"metric {metric!r} is none of a spectral map; expected 'cosine' or 'l2'")
-        if transform not in get_args(Transform):
-            raise InputError(f"transform {transform!r} is unknown; expected 'dft' or 'dct'")
-        if not isinstance(chunk, int) or isinstance(chunk, bool) or chunk < 2:
-            raise InputError(
-                f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000; one larger "
-                "than the route makes one chunk"
-            )
+        if type(chunk) is not int or chunk < 2:
+            raise InputError(f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000")
         if not 0 <= resolution < math.inf:
             raise InputError(f"resolution is {resolution}; expected a number of places, 0 or more")
         super().__init__(0, 0 if means is None else means.shape[1])
-        self.metric, self.transform, self.chunk, self.resolution = metric, transform, chunk, resolution
+        self.metric: SpectralMetric = checked(metric, SpectralMetric, "metric")
+        self.transform: Transform = checked(transform, Transform, "transform")
+        self.chunk, self.resolution = chunk, resolution
         self._step = step
         for name in ("counts", "feature", "level", "norms"):
             self.register_buffer(name, None, persistent=False)

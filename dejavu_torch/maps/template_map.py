@@ -12,7 +12,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.maps.distance import Metric, check_metric, phase_distances
+from dejavu_torch.maps.distance import Metric, phase_distances
+from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.place_map import Mapper, PlaceMap, require
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
@@ -110,10 +111,9 @@ class TemplateMap(PlaceMap):
         weights: Tensor | None = None,
     ) -> None:
         super().__init__(places, dimension)
-        check_metric(metric)
-        if reduction not in ("mean", "sum"):
-            raise InputError(f"reduction {reduction!r} is unknown; expected 'mean' or 'sum'")
-        self.metric, self.reduction, self.temperature = metric, reduction, temperature
+        self.metric: Metric = checked(metric, Metric, "metric")
+        self.reduction: Reduction = checked(reduction, Reduction, "reduction")
+        self.temperature = temperature
         for layer, block in zip(plan, templates, strict=True):
             shape = layer.phases, len(layer.features)
             if block.shape != shape:

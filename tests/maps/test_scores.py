@@ -251,8 +251,11 @@ def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: typ
     [
         (lambda route: route.scores(torch.rand(3, 5)), ["query features are (3, 5)", "expects (Q, 4)"]),
         (lambda route: route.scores(torch.rand(4)), ["query features are (4,)", "expects (Q, 4)"]),
-        (lambda _: TemplateMap(metric="manhattan"), ["'manhattan' is unknown; expected l1, l2, cosine"]),
-        (lambda _: TemplateMap(reduction="max"), ["'max' is unknown; expected 'mean' or 'sum'"]),
+        (
+            lambda _: TemplateMap(metric="manhattan"),
+            ["metric is 'manhattan'; expected Literal['l1', 'l2', 'cosine']"],
+        ),
+        (lambda _: TemplateMap(reduction="max"), ["reduction is 'max'", "'mean', 'sum'"]),
         (lambda _: TemplateMap(temperature=0.0), ["temperature is 0.0; expected a number above 0"]),
         (lambda _: TemplateMap(temperature=math.nan), ["temperature is nan; expected a number above 0"]),
     ],

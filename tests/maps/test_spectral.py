@@ -299,7 +299,7 @@ def test_the_map_is_exported() -> None:
         ({"chunk": 1}, ("chunk is 1", "at least 2")),
         ({"chunk": "route"}, ("'route'", "10000")),
         ({"transform": "fft"}, ("'fft'", "'dct'")),
-        ({"metric": "l1"}, ("'l1'", "'cosine' or 'l2'")),
+        ({"metric": "l1"}, ("'l1'", "'cosine', 'l2'")),
         ({"resolution": math.nan}, ("resolution is nan", "0 or more")),
         ({"route_bytes_per_place": 0.01}, ("0.01", "mean", "at most 48")),
         ({"route_bytes_per_place": 200.0}, ("200", "mean", "at most 48")),
