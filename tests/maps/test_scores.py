@@ -95,20 +95,6 @@ def test_score_is_0_exactly_at_the_common_period(periods: tuple[Fraction, ...], 
     assert torch.equal(scores <= 1e-12, (i - q) % common == 0)
 
 
-@given(route=reference.routes(), random=st.randoms(use_true_random=False))
-def test_permuting_features_changes_nothing(route: reference.Route, random: object) -> None:
-    values, plan = route
-    order = list(range(values.shape[1]))
-    random.shuffle(order)  # type: ignore[attr-defined]
-    moved = tuple(
-        FrequencyLayer(x.period, x.phases, x.start, x.stop, tuple(sorted(order.index(j) for j in x.features)))
-        for x in plan
-    )
-    before = scored(values, make(values, plan))
-    after = scored(values[:, order], make(values[:, order], moved))
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
-
-
 # ---------------------------------------------------------- coverage, reduction
 
 

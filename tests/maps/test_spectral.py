@@ -140,17 +140,6 @@ def test_positions_leave_the_lines_half_of_what_mean_and_chunks_leave(
     assert beside.lines == alone.lines > 0
 
 
-@pytest.mark.parametrize(("numbers", "share"), [(1, 0.9), (3, 0.5), (9, 1.2)])
-def test_the_budget_is_met_where_levels_are_nearly_all_different(numbers: int, share: float) -> None:
-    """Of few large levels the counts say little of what they take."""
-    budget = numbers * share + 0.4
-    for noise in (torch.randn(200, numbers), torch.randn(200, numbers) / torch.rand(200, numbers)):
-        learned = SpectralMapper(budget)(noise)
-        finest = float(learned.steps) < 0.02 * float(learned.decode(0).std())  # no finer step is tried
-        assert learned.summary().route_bytes <= budget * 200
-        assert learned.summary().route_bytes >= 0.97 * budget * 200 or finest
-
-
 @pytest.mark.parametrize(
     ("places", "numbers", "chunk"),
     [(2, 1, 10_000), (3, 6, 10_000), (8, 300, 4), (12, 2, 10_000)],
@@ -277,17 +266,6 @@ def test_noise_tells_what_half_of_its_variance_needs() -> None:
     assert 0.45 < share < 0.55
     assert SpectralMapper(0.8)(route(800, 60)).needed is None
     assert SpectralMapper(None, step=100.0)(noise).needed == pytest.approx(needed, rel=0.01)
-
-
-@pytest.mark.slow
-def test_the_map_is_exported() -> None:
-    for transform in ("dft", "dct"):
-        learned = SpectralMapper(transform=transform, chunk=150)(route())
-        program = torch.export.export(
-            learned, (route()[:4],), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}}
-        ).module()
-        for batch in (1, 8, 100):
-            assert torch.allclose(program(route()[:batch]), learned(route()[:batch]), atol=1e-5)
 
 
 @pytest.mark.parametrize(

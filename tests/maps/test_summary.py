@@ -51,13 +51,6 @@ def test_chunks_of_a_plan_made_by_hand(summary: MapSummary) -> None:
     assert (third.start, third.stop, third.common_period) == (1900, 2100, 60)
 
 
-def test_a_plan_without_layers() -> None:
-    summary = summary_of((), 50)
-    assert (summary.places, summary.covered, summary.templates, summary.chunks) == (50, 0, 0, ())
-    assert (summary.map_bytes, summary.bytes_per_place) == (8, 8 / 50)
-    assert summary_of((), 0).bytes_per_place == 8
-
-
 def test_description_tells_the_numbers(summary: MapSummary) -> None:
     assert str(summary).splitlines() == [
         "places 0-1023: 2 layers, periods 93 (3 features), 171 (2 features); together 5301 places",

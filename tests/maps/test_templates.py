@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from fractions import Fraction
 
 import pytest
@@ -33,11 +32,6 @@ def test_mask_equals_reference(route: reference.Route) -> None:
     n = len(route.values)
     mask = phase_mask(n, layer.period, layer.phases, layer.start, layer.stop)
     assert mask.tolist() == [[reference.mask(i, k, layer) for i in range(n)] for k in range(layer.phases)]
-
-
-def test_115_frames_in_23_phases_are_bins_of_5_frames() -> None:
-    phase = FrequencyLayer(Fraction(115), 23, 0, 230, (0,)).place_phases
-    assert phase.tolist() == [i % 115 // 5 for i in range(230)]
 
 
 def test_phases_of_far_frames_are_exact() -> None:
@@ -112,27 +106,3 @@ def test_templates_are_means_under_the_mask(route: reference.Route) -> None:
         mask = phase_mask(n, layer.period, layer.phases, layer.start, layer.stop, torch.float64)
         total = mask @ route.values[:, list(layer.features)]
         torch.testing.assert_close(mu, total / mask.sum(1, keepdim=True).clamp(min=1), rtol=0, atol=1e-12)
-
-
-@given(st.integers(2, 9), st.integers(1, 4), st.integers(-20, 20))
-def test_shifting_the_traverse_rolls_the_templates(period: int, turns: int, shift: int) -> None:
-    values = torch.randint(-16, 17, (period * turns, 3)).double() / 8
-    layer = whole(period, len(values), (0, 1, 2))
-    (mu,) = PhaseTemplates()(values, [layer])
-    (shifted,) = PhaseTemplates()(values.roll(shift, 0), [layer])
-    assert torch.equal(shifted, mu.roll(shift, 0))
-
-
-@given(reference.routes(), st.randoms(use_true_random=False))
-def test_permuting_features_changes_no_template(route: reference.Route, random: object) -> None:
-    dimension = route.values.shape[1]
-    order = list(range(dimension))
-    random.shuffle(order)  # type: ignore[attr-defined]
-    moved = [
-        replace(layer, features=tuple(sorted(order.index(j) for j in layer.features))) for layer in route.plan
-    ]
-    before = PhaseTemplates()(route.values, route.plan)
-    after = PhaseTemplates()(route.values[:, order], moved)
-    for layer, other, a, b in zip(route.plan, moved, before, after, strict=True):
-        columns = [other.features.index(order.index(j)) for j in layer.features]
-        assert torch.equal(a, b[:, columns])

@@ -94,14 +94,6 @@ def test_no_right_answer_is_refused_and_no_answer_has_no_probability() -> None:
     assert found == [0, pytest.approx(0.99988, abs=1e-5)]
 
 
-def test_the_error_of_a_calibration() -> None:
-    p = torch.tensor([0.05, 0.05, 0.95, 0.95, 1.0])
-    right = torch.tensor([False, True, True, True, True])
-    # bins [0, .1): .05 told, .5 seen; [.9, 1]: .9667 told, 1 seen
-    assert calibration_error(p, right) == pytest.approx((2 * 0.45 + 3 * (1 - 2.9 / 3)) / 5)
-    assert math.isnan(calibration_error(torch.zeros(0), torch.zeros(0, dtype=torch.bool)))
-
-
 # evidence
 
 
