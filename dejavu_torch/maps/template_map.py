@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from functools import reduce
-from itertools import accumulate, pairwise
+from itertools import accumulate, groupby, pairwise
+from operator import attrgetter
 from typing import Any, Literal
 
 import torch
@@ -303,19 +304,17 @@ class TemplateMap(PlaceMap):
         return torch.cat([self.templates[:0], *((block * factors[f]).flatten() for block, f in pairs)])
 
     def summary(self) -> MapSummary:
-        chunks: dict[tuple[int, int], list[FrequencyLayer]] = {}
-        for layer in self.plan:
-            chunks.setdefault((layer.start, layer.stop), []).append(layer)
-        told = tuple(
-            ChunkSummary(*span, tuple(one.period for one in own), tuple(len(one.features) for one in own))
-            for span, own in sorted(chunks.items())
+        span = attrgetter("start", "stop")
+        chunks = tuple(
+            ChunkSummary(*where, *zip(*((one.period, len(one.features)) for one in own), strict=True))
+            for where, own in groupby(sorted(self.plan, key=span), span)
         )
         covered = sum(stop - start for start, stop, layers in self.segments if layers)
         parts = {"templates": self.templates, "weights": self.weights, "positions": self.positions}
         route = {name: tensor.nbytes for name, tensor in parts.items() if len(tensor)}
         route["layers"] = self.layers.nbytes + self.feature_ptr.nbytes + self.feature_index.nbytes
         phases = sum(layer.phases for layer in self.plan)
-        return MapSummary(self.kind, self.places, covered, phases, len(self.templates), told, route, {})
+        return MapSummary(self.kind, self.places, covered, phases, len(self.templates), chunks, route, {})
 
     def extra_repr(self) -> str:
         sizes = f"places={self.places}, dimension={self.dimension}, layers={len(self.plan)}"

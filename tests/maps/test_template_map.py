@@ -11,9 +11,10 @@ import torch
 from helpers import refused, scored
 from hypothesis import given
 from hypothesis import strategies as st
+from test_scores import make
 from torch import Tensor
 
-from dejavu_torch import FrequencyLayer, InputError, PhaseTemplates, TemplateMap
+from dejavu_torch import FrequencyLayer, InputError, TemplateMap
 from dejavu_torch.types import Plan
 
 PLAN: Plan = (
@@ -22,10 +23,6 @@ PLAN: Plan = (
     FrequencyLayer(Fraction(115), 23, 100, 250, (0, 1, 3)),
 )
 PLACES, DIMENSION = 300, 4
-
-
-def make(values: Tensor, plan: Plan) -> TemplateMap:
-    return TemplateMap(plan, PhaseTemplates()(values, plan), *values.shape)
 
 
 @pytest.fixture
