@@ -428,7 +428,6 @@ class SpectralMap(PlaceMap):
 
     def loaded(self) -> None:
         """Decode the chunks of a file."""
-        self.check()
         chunks, visits = self.coded(), self.visits
         self._clear()
         self.extend(chunks)

@@ -12,6 +12,7 @@ from helpers import Stream, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from test_filter import Watched
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, open_source
@@ -30,15 +31,6 @@ from dejavu_torch.recognition.calibration import (
 
 INF = math.inf
 ROUTE, AGAIN = "sim:aerial?frames=160", "sim:aerial?frames=160&traverse=1"
-
-
-class Table:
-    """A map on which each query is the row of scores itself."""
-
-    places = 40
-
-    def scores(self, queries: Tensor) -> Tensor:
-        return queries
 
 
 def answers(seed: int, count: int = 200) -> tuple[Tensor, Tensor]:
@@ -131,21 +123,21 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
     places = torch.arange(40)
     scores = 1 + 0.1 * torch.randn(40, 40, generator=draw)
     scores[places, places] = 0.3
-    own = calibrated(Table(), [(scores[:20], places[:20]), (scores[20:], places[20:])])
+    own = calibrated(Watched(40), [(scores[:20], places[:20]), (scores[20:], places[20:])])
     assert own.single is not None
     there = own.single.probability(confidence_of(scores))
     away = own.single.probability(confidence_of(1 + 0.1 * torch.randn(40, 40, generator=draw)))
     assert float(there.mean()) > 0.9
     assert float(away.mean()) < 0.1
     known = places.where(places % 2 == 0, -1)  # what is not known does not count
-    half = calibrated(Table(), [(scores, known)])
-    assert half.single == calibrated(Table(), [(scores[::2], places[::2])]).single
-    visit = calibrated(Table(), [(scores, places)], another_visit=True)  # none was wrong
+    half = calibrated(Watched(40), [(scores, known)])
+    assert half.single == calibrated(Watched(40), [(scores[::2], places[::2])]).single
+    visit = calibrated(Watched(40), [(scores, places)], another_visit=True)  # none was wrong
     assert float(visit.single.probability(confidence_of(scores)).mean()) > float(there.mean())
     with refused("none of 80 answers"):
-        calibrated(Table(), [(scores, (places + 20) % 40)])
+        calibrated(Watched(40), [(scores, (places + 20) % 40)])
     with refused("no queries"):
-        calibrated(Table(), [])
+        calibrated(Watched(40), [])
 
 
 # frames to calibrate by
