@@ -342,9 +342,7 @@ ROUTES = {
 
 @pytest.mark.parametrize("kind", list(ROUTES))
 @given(st.integers(0, 63), st.integers(1, 64), st.integers(1, 40))
-def test_scores_of_a_stretch_are_those_of_all_places(
-    kind: str, start: int, length: int, queries: int
-) -> None:
+def test_scores_of_a_stretch_are_those_of_all(kind: str, start: int, length: int, queries: int) -> None:
     route, rows = ROUTES[kind], torch.rand(queries, 4)
     stop = min(start + length, route.places)
     found = torch.cat([scores for _, scores in route.score_blocks(rows, start, stop)], 1)

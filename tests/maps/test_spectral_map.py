@@ -129,7 +129,7 @@ def test_in_blocks_a_map_of_a_step_holds_the_same(
 
 
 @pytest.mark.usefixtures("in_blocks")
-@pytest.mark.parametrize(("budget", "settings"), zip((0.7, 4.0, 4.0), IN_BLOCKS, strict=True))
+@pytest.mark.parametrize(("budget", "settings"), [*zip((0.7, 4.0, 4.0), IN_BLOCKS, strict=True)])
 def test_in_blocks_the_route_is_within_the_budget(settings: dict[str, Any], budget: float) -> None:
     descriptors = route(2000, 24)
     learned = SpectralMapper(budget, **settings)(descriptors)
