@@ -422,7 +422,8 @@ class SpectralMap(PlaceMap):
         require(fits, f"names {', '.join(names)}; expected another one for each of {len(names)} routes")
         ends = {*accumulate(self.lengths.tolist())}
         fits = min(places) > 0 and sum(places) == self.places and ends.issuperset(accumulate(places))
-        require(fits, f"routes of {[*places]!s:.100} places; expected whole chunks, {self.places} in all")
+        told = f"expected whole chunks, {self.places} places in all"
+        require(fits, f"routes of {[*places]!s:.100} places; {told}")
         fits = sum(frames) == self.table.frames
         require(fits, f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all")
 
