@@ -31,18 +31,6 @@ def summary() -> MapSummary:
     return summary_of(PLAN, 2500).with_parts(fixed={"header": 1000, "backbone": 0})
 
 
-def test_numbers_of_a_plan_made_by_hand(summary: MapSummary) -> None:
-    assert summary.places == 2500
-    assert summary.covered == 1024 + 600  # the last two chunks overlap
-    assert summary.templates == 93 + 171 + 98 + 4 + 6 + 15
-    numbers = 93 * 3 + 171 * 2 + 98 + 4 * 2 + 6 + 15
-    assert summary.template_numbers == numbers
-    layers = 8 * 5 * 6 + 8 * 7 + 4 * 10
-    assert summary.route == {"templates": 4 * numbers, "layers": layers}
-    assert (summary.map_bytes, summary.fixed_bytes) == (4 * numbers + layers + 1000, 1000)
-    assert summary.bytes_per_place == pytest.approx(summary.map_bytes / 2500)
-
-
 def test_chunks_of_a_plan_made_by_hand(summary: MapSummary) -> None:
     first, second, third = summary.chunks
     assert (first.start, first.stop, first.periods, first.features) == (0, 1024, (93, 171), (3, 2))
@@ -57,6 +45,7 @@ def test_description_tells_the_numbers(summary: MapSummary) -> None:
         "places 1500-1999: 1 layer, periods 97.5 (1 features)",
         "places 1900-2099: 3 layers, periods 4 (2 features), 6 (1 features), 15 (1 features); together 60 "
         "places",
+        # the last two chunks overlap: 1024 + 600
         "1624 of 2500 places covered; 387 templates, 748 numbers",
         "4328 bytes, 1.7 per place: 3328 of the route, 1.33 per place (templates 2992, layers 336), and 1000 "
         "fixed (header 1000)",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import Stream, refused
+from helpers import Stream, all_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
@@ -186,18 +186,18 @@ def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.Mon
 
 def test_changed_frames_show_their_places_whatever_the_batch() -> None:
     route = open_source("sim:aerial?frames=300")
-    frames = torch.cat(list(route.batches(64)))
+    frames = all_of(route)
     nothing = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion"), 0.0)
     plain = {**nothing, "colour": [0, 0], "shift": [0, 0], "exposure": [0, 0], "noise": 0.0}
     same = augmented_segments(route, 300, plain)
-    torch.testing.assert_close(torch.cat(list(same.batches(50))), frames[same.places])
+    torch.testing.assert_close(all_of(same, 50), frames[same.places])
     changed = augmented_segments(route, 300, {**plain, "noise": 0.1})
-    once = torch.cat(list(changed.batches(7)))
-    assert torch.equal(once, torch.cat(list(changed.batches(64))))
+    once = all_of(changed, 7)
+    assert torch.equal(once, all_of(changed))
     spread = (once - frames[changed.places]).std()
     assert spread == pytest.approx(0.15 * 0.7**0.5, rel=0.3)  # 1.5 times as much
     unread = augmented_segments(Stream(frames), 300, plain)  # which cannot begin anywhere
-    torch.testing.assert_close(torch.cat(list(unread.batches(9))), frames[same.places])
+    torch.testing.assert_close(all_of(unread, 9), frames[same.places])
     with refused("ready features"):
         augmented_segments(as_traverse(torch.rand(30, 4)), 30, plain)
     for strengths in ({"noise": {}}, {"noise": float("nan")}, {"nose": 0.1}):  # of a file
@@ -227,7 +227,7 @@ def test_probabilities_hold_on_another_day_and_off_the_map(model: DejaVu) -> Non
 
 
 def test_batches_and_files_do_not_change_probabilities(model: DejaVu, tmp_path: Path) -> None:
-    queries = torch.cat(list(open_source(AGAIN).batches(64)))[:40]
+    queries = all_of(open_source(AGAIN))[:40]
     model.save(tmp_path / "map.safetensors")
     again = DejaVu.load(tmp_path / "map.safetensors")
     assert again.calibration == model.calibration
@@ -238,7 +238,7 @@ def test_batches_and_files_do_not_change_probabilities(model: DejaVu, tmp_path: 
 
 
 def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_on(model: DejaVu) -> None:
-    queries = torch.cat(list(open_source(AGAIN).batches(64)))[::2]
+    queries = all_of(open_source(AGAIN))[::2]
     queries[40:] = queries[40:].flip(-1)  # some that are hard to find
     for sequence in (None, PlaceFilter()):
         match = model.localize(queries, sequence=sequence)
@@ -265,7 +265,7 @@ def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_o
 
 
 def test_precision_accepts_what_is_probable_enough(model: DejaVu, tmp_path: Path) -> None:
-    queries = torch.cat(list(open_source(AGAIN).batches(64)))
+    queries = all_of(open_source(AGAIN))
     sure = DejaVu(**(model.settings() | {"precision": 0.99}))
     sure.load_state_dict(model.state_dict())
     match = sure.localize(queries)
@@ -321,7 +321,7 @@ def test_an_export_tells_how_to_get_probabilities(model: DejaVu, tmp_path: Path)
     from dejavu_torch.export import export_onnx, run_session, session_of
 
     facts = export_onnx(model, tmp_path / "map.onnx").facts["calibration"]
-    queries = torch.cat(list(open_source(AGAIN).batches(64)))[:20]
+    queries = all_of(open_source(AGAIN))[:20]
     scores = run_session(session_of(tmp_path / "map.onnx"), queries)
     best, index = scores.min(1)
     beyond = (torch.arange(160) - index[:, None]).abs() > facts["tolerance"]
