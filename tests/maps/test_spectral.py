@@ -16,7 +16,6 @@ from helpers import refused
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
-from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps import spectral_map
 from dejavu_torch.maps.quantisation import dead_zone, quantise
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
@@ -106,27 +105,6 @@ def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_p
         (tmp_path / "m.safetensors").stat().st_size == model.summary().map_bytes == again.summary().map_bytes
     )
     assert torch.equal(again(descriptors[:5]), model(descriptors[:5]))
-
-
-class Named(ArrayTraverse):
-    """Ready features with a random name for each frame."""
-
-    def frame_name(self, i: int) -> str:
-        return f"{torch.randint(10**9, (3,), generator=torch.Generator().manual_seed(i)).tolist()}.png"
-
-
-def test_names_are_beside_the_budget(caplog: pytest.LogCaptureFixture) -> None:
-    """The coded lines are those of no names."""
-    features = route(111, 24)
-    named, plain = (
-        DejaVu(mapper=SpectralMapper(4.0), whitening="none").learn(source).summary()
-        for source in (Named(features), features)
-    )
-    assert plain.route == named.route
-    assert named.fixed["names"] > 4.0 * 111
-    assert f"names {named.fixed['names']}" in str(named)
-    assert 0.98 * 4 <= plain.route_bytes / 111 <= 4
-    assert not caplog.text
 
 
 def test_positions_leave_the_lines_half_of_what_mean_and_chunks_leave(
