@@ -129,11 +129,11 @@ def code_on(
     cluster: Cluster,
     coder: ChunkCoder,
     traverse: Traverse,
-    first: int,
+    wanted: range,
     progress: str | None = None,
     together: int = 0,
 ) -> Iterator[Chunk]:
-    """As `encode_local`, by a cluster: the same bytes in the same order.
+    """As `ChunkCoder.chunks`, by a cluster: the same bytes in the same order.
 
     A traverse that cannot seek is read from its beginning by every worker, so that its chunks are divided
     into few tasks.
@@ -146,14 +146,12 @@ def code_on(
     """
     together = together or max(1, TASK // coder.chunk)
     if not traverse.seeks:
-        together = max(together, -(-(coder.total - first) // cluster.workers))
-    tasks = [
-        range(start, min(start + together, coder.total)) for start in range(first, coder.total, together)
-    ]
-    total = len(range(*coder.span(range(first, coder.total))))
+        together = max(together, -(-len(wanted) // cluster.workers))
+    tasks = [wanted[i : i + together] for i in range(0, len(wanted), together)]
+    total = len(range(*coder.span(wanted)))
     done: dict[int, Chunk] = {}
     failed: dict[int, tuple[range, Failure]] = {}
-    following = first
+    following = wanted.start
     with tqdm(
         total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False
     ) as bar:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Sequence
 from itertools import count
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.data.arrays import as_traverse
@@ -18,8 +20,7 @@ from dejavu_torch.learning import (
     Checkpoint,
     ChunkCoder,
     Code,
-    encode_local,
-    extend,
+    append_places,
     observation_counts,
     positions_of,
     with_visits,
@@ -44,7 +45,7 @@ def append(
     traverse: Traverse | Tensor,
     progress: bool = False,
     checkpoint: Checkpoint | None = None,
-    code: Code = encode_local,
+    code: Code = ChunkCoder.chunks,
     visits: Views | None = None,
 ) -> DejaVu:
     """Add the places of a traverse after those of a model's map, which stay as they are.
@@ -74,26 +75,26 @@ def append(
         >>> append(model, wave[400:]).localize(wave[[50, 450]]).index
         tensor([ 50, 450])
     """
-    route, describer = one_route(model, "append to"), model.describer
+    route = one_route(model, "append to")
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_alike(model, added)
     places = added.count()
     positions = positions_of(added).to(route.positions.device)
     _check_count(route.places + places, model.step is not None)
-    counts = torch.ones(places, dtype=torch.int64)
+    counts = None
     if visits is not None:
         _check_alike(model, visits.traverse)
-        counts += observation_counts(visits, places)
-    text = "learning" if progress else None
-    part = SpectralMap(route.means, **route.settings(), step=route.step)
+        counts = observation_counts(visits, places)
+    grown = copy.deepcopy(route)
+    grown.positions = route.positions[:0]  # those of all places follow when all are there
     if checkpoint is not None:
-        sums = checksums(route.packed(), route.get_extra_state())
-        key = run_key(model, added, visits=visits) | digests(map=sums)
-        checkpoint.open(key, added, part, model.whitening)
-    coder = ChunkCoder.like(route, describer, places, visits and describer.seekable(visits, text))
-    extend(part, coder, added, text, checkpoint, code)
-    grown = route.of_chunks([*route.coded(), *part.coded()])
-    grown.count_visits(torch.cat([route.visit_counts, counts.to(route.visits.device)]))
+        own = digests(map=checksums(route.packed(), route.get_extra_state()))
+        checkpoint.open(run_key(model, added, visits=visits) | own, added, grown, model.whitening)
+    text = "learning" if progress else None
+    append_places(grown, model.describer, added, route.places, visits, text, checkpoint, code)
+    if counts is not None:
+        before = grown.visit_counts
+        grown.count_visits(before + F.pad(counts.to(before), (route.places, 0)))
     if len(positions):
         grown.positions = torch.cat([route.positions, positions_behind(positions, route.places)])
     grown.check()
@@ -110,7 +111,7 @@ def learn_mean(
     progress: bool = False,
     second: Views | None = None,
     checkpoint: Checkpoint | None = None,
-    code: Code = encode_local,
+    code: Code = ChunkCoder.chunks,
 ) -> DejaVu:
     """As `DejaVu.learn`, of the mean of several visits to each place: what changes between them cancels out.
 
@@ -159,7 +160,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     route = one_route(model, "average visits into")
     _check_alike(model, visits.traverse)
     counts, seen = route.visit_counts.cpu(), observation_counts(visits, route.places)
-    described, shown = model.describer.visits(visits, route.dimension, "averaging" if progress else None)
+    described, shown = model.describer.visits(visits, "averaging" if progress else None)
 
     def averaged(g: int, chunk: Chunk) -> Chunk:
         start, stop = route.chunks[g]

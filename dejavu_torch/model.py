@@ -25,10 +25,10 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
 from dejavu_torch.learning import (
     Checkpoint,
+    ChunkCoder,
     Code,
     Describer,
     calibration_of,
-    encode_local,
     is_ready,
     learn_descriptors,
     learn_map,
@@ -175,7 +175,7 @@ class DejaVu(nn.Module):
         progress: bool = False,
         second: Views | None = None,
         checkpoint: Checkpoint | None = None,
-        code: Code = encode_local,
+        code: Code = ChunkCoder.chunks,
         visits: Views | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
@@ -187,7 +187,7 @@ class DejaVu(nn.Module):
             progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
             checkpoint: keeps the partial map of a long route, from which learning continues after a kill; it
                 is the caller's to remove.
-            code: what codes the chunks of a long route: `encode_local`, or a cluster.
+            code: what codes the chunks of a long route: this process, or a cluster.
             visits: see `growth.learn_mean`.
 
         Returns:

@@ -161,7 +161,7 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(
     began: list[int] = []
 
     def code(*work: object) -> Iterator[Chunk]:
-        began.append(work[2])  # type: ignore[arg-type]
+        began.append(work[2].start)  # type: ignore[attr-defined]
         return code_on(cluster, *work)  # type: ignore[arg-type]
 
     def learn() -> DejaVu:

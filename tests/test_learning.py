@@ -25,7 +25,7 @@ from dejavu_torch.data.source import open_source
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample, encode_local
+from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
@@ -170,10 +170,10 @@ def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
 
 
 def stopped(after: int) -> learning.Code:
-    """As `encode_local`, interrupted after so many chunks."""
+    """As `ChunkCoder.chunks`, interrupted after so many chunks."""
 
     def code(*work: object) -> Iterator[Chunk]:
-        yield from itertools.islice(encode_local(*work), after)  # type: ignore[arg-type]
+        yield from itertools.islice(ChunkCoder.chunks(*work), after)  # type: ignore[arg-type]
         raise KeyboardInterrupt
 
     return code
@@ -338,7 +338,7 @@ def test_a_route_that_ends_early_is_refused() -> None:
     model = learned(route())
     coder = ChunkCoder.like(model.map, model.describer, PLACES + 60)
     with refused("1030", "1090"):
-        list(encode_local(coder, ArrayTraverse(route()), 0))
+        list(coder.chunks(ArrayTraverse(route()), range(coder.total)))
 
 
 def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
